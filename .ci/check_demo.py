@@ -1,0 +1,55 @@
+"""Check the numbers of the demo's summary.json: is the plan feasible, and true in full dynamics?
+
+Times are printed, not checked: they are the machine's as much as ours.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+PHASES = ("swing", "collision", "follow")
+
+
+def failures(summary: dict[str, Any]) -> list[str]:
+    """What is wrong with a summary, a sentence each."""
+    wrong = []
+
+    def check(name: str, low: float, high: float) -> None:
+        value: Any = summary
+        for key in name.split("."):
+            if not isinstance(value, dict) or key not in value:
+                wrong.append(f"{name} is missing")
+                return
+            value = value[key]
+        if not isinstance(value, int | float) or not math.isfinite(value) or not low <= value <= high:
+            wrong.append(f"{name} is {value}, not in [{low:g}, {high:g}]")
+
+    if summary.get("status") not in ("solved", "acceptable"):
+        wrong.append(f"status is {summary.get('status')!r}, not 'solved' or 'acceptable'")
+    check("max_violation", 0, 1e-4)
+    check("impulse_Ns", 0, math.inf)
+    check("simulated.impulse_error_pct", -2, 2)
+    check("simulated.min_normal_force_N", 0, math.inf)
+    for phase in PHASES:
+        check(f"simulated.zmp_margin_m.{phase}", 0, math.inf)
+        check(f"simulated.torque_ratio.{phase}", 0, 1.02)
+    return wrong
+
+
+def main() -> int:
+    summary = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    wrong = failures(summary)
+    for sentence in wrong:
+        print(f"demo: {sentence}")
+    if not wrong:
+        shown = ("solver", "iterations", "solve_seconds", "build_seconds", "impulse_Ns")
+        print("demo: " + ", ".join(f"{key} {summary.get(key)}" for key in shown))
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

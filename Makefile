@@ -1,0 +1,70 @@
+# Needs python3 (3.10 or newer), pip, make and git; all else goes into .venv. `make` alone lists the targets.
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+EXTRAS := robots,validate,dev
+ARGS   ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test lint types format bench clean distclean
+
+help: ## list the targets
+	@echo "make <target>"
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1|\2/p' $(firstword $(MAKEFILE_LIST)) | awk -F'|' '{printf "%-12s %s\n", $$1, $$2}'
+	@echo "Options: ARGS='...' for test, demo and bench; PYTHON=... for the interpreter that makes .venv"
+
+venv: $(STAMP) ## make .venv with this project and what it needs
+
+# Where python3 comes without ensurepip, the pip beside it fills a venv made without one.
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+		{ echo "$(PYTHON) is older than 3.10; name a newer one: make PYTHON=python3.12 ..."; exit 1; }
+	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+		echo "== $(VENV) is there, and pyproject.toml is newer"; \
+	else \
+		echo "== making $(VENV) with $$($(PYTHON) --version)"; \
+		rm -rf $(VENV); \
+		if $(PYTHON) -c 'import ensurepip' 2>/dev/null; then \
+			$(PYTHON) -m venv $(VENV); \
+		else \
+			$(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; \
+		fi; \
+	fi
+	@echo "== installing impactopt and what it needs into $(VENV): some 400 MB to download, a few minutes the first time"
+	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[$(EXTRAS)]'
+	@touch $@
+	@echo "== $(VENV) is ready"
+
+demo: $(STAMP) ## plan a TALOS punch, replay it in full dynamics, put pictures and numbers in results/punch
+	@echo "== planning a punch (the first run compiles the robot's functions, up to two minutes)"
+	@$(BIN)/impactopt solve problems/punch.toml --out results/punch $(ARGS)
+
+test: $(STAMP) ## run the tests (ARGS='-k robot' for some of them)
+	@echo "== running the tests (the first run compiles functions)"
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP) ## check style with ruff
+	@echo "== ruff"
+	@$(BIN)/ruff check .
+
+types: $(STAMP) ## check types with mypy
+	@echo "== mypy"
+	@$(BIN)/mypy
+
+format: $(STAMP) ## rewrite the sources in the project's style
+	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
+
+bench: $(STAMP) ## run the benchmarks, one after another
+	@set -e; for file in benchmarks/bench_*.py; do \
+		[ -e "$$file" ] || { echo "no benchmarks/bench_*.py yet"; exit 0; }; \
+		echo "== $$file"; $(BIN)/python "$$file" $(ARGS); \
+	done
+
+clean: ## remove results and caches of the tools; .venv and compiled functions stay
+	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+distclean: clean ## clean, and remove .venv too
+	rm -rf $(VENV)

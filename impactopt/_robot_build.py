@@ -1,0 +1,217 @@
+"""From files and values by joint to a `pin.Model` and arrays: what `Robot`'s constructors are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt._robot_checks import check_frame
+from impactopt._robot_parts import Striker
+from impactopt.errors import InputError, check_array, did_you_mean
+
+Array = NDArray[np.float64]
+
+
+def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
+    """The model of a URDF, with an SRDF's reference configurations and rotors (as armature)."""
+    urdf = _existing(path, "URDF")
+    root = (pin.JointModelFreeFlyer(),) if floating else ()
+    try:
+        model = pin.buildModelFromUrdf(urdf, *root)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
+    if srdf is not None:
+        file = _existing(srdf, "SRDF")
+        try:
+            pin.loadReferenceConfigurations(model, file, False)
+            pin.loadRotorParameters(model, file, False)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"SRDF {file}: {error}") from error
+    return model
+
+
+def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
+    """The model without the locked joints, held at the given angles [rad] (0 for bare names)."""
+    if isinstance(locked, str):
+        raise InputError(
+            f"locked: give a list of joint names or a mapping to angles, not the text {locked!r}"
+        )
+    angles = dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+    if not angles:
+        return model
+    names = joint_names(model)
+    for name in angles:
+        joint_index(names, name, "locked")
+    q = set_joints(model, pin.neutral(model), angles, "locked")
+    return pin.buildReducedModel(model, [model.getJointId(name) for name in angles], q)
+
+
+def is_floating(model: pin.Model) -> bool:
+    return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
+
+
+def joint_names(model: pin.Model) -> tuple[str, ...]:
+    """Names of the joints in the order of v, without the free-flyer."""
+    return tuple(str(name) for name in list(model.names)[2 if is_floating(model) else 1 :])
+
+
+def joint_index(names: Sequence[str], name: str, what: str) -> int:
+    if name not in names:
+        raise InputError(
+            f"{what}: no joint {name!r}{did_you_mean(name, names)}; joints are {', '.join(names)}"
+        )
+    return list(names).index(name)
+
+
+def per_joint(
+    what: str, value: float | Mapping[str, float] | ArrayLike | None, joints: Sequence[str], default: Array
+) -> Array:
+    """(n,) numbers: `default`, or one number for all, or a mapping by joint over it, or all given."""
+    result = np.array(default, dtype=np.float64)
+    if value is None:
+        return result
+    if isinstance(value, Mapping):
+        for name, number in value.items():
+            result[joint_index(joints, name, what)] = check_array(f"{what} of joint {name!r}", number, ())
+        return result
+    if np.ndim(value) == 0:
+        result[:] = check_array(what, value, ())
+        return result
+    return check_array(what, value, (len(joints),))
+
+
+def armature(
+    model: pin.Model,
+    joints: Sequence[str],
+    value: float | Mapping[str, float] | ArrayLike | None,
+    rotor: Mapping[str, tuple[float, float]],
+) -> Array:
+    """(n,) reflected rotor inertias [kg m2]: the model's, under those of `rotor`, under `value`."""
+    reflected = {}
+    for name, pair in rotor.items():
+        inertia, gear = check_array(f"rotor of joint {name!r} (inertia [kg m2], gear ratio)", pair, (2,))
+        reflected[name] = inertia * gear**2
+    own = np.array(model.armature[model.nv - len(joints) :], dtype=np.float64)
+    result = per_joint("armature", value, joints, per_joint("rotor", reflected, joints, own))
+    for name, number in zip(joints, result, strict=True):
+        if number < 0:
+            raise InputError(
+                f"armature of joint {name!r} is {number:g} kg m2; give rotor inertia x gear^2, >= 0"
+            )
+    return result
+
+
+def effort_limit(model: pin.Model) -> Array:
+    """(nv,) largest torques [N m]; renamed in Pinocchio 4."""
+    return np.array(model.upperEffortLimit if hasattr(model, "upperEffortLimit") else model.effortLimit)
+
+
+def velocity_limit(model: pin.Model) -> Array:
+    """(nv,) largest velocities [rad/s]; renamed in Pinocchio 4."""
+    return np.array(model.upperVelocityLimit if hasattr(model, "upperVelocityLimit") else model.velocityLimit)
+
+
+def position_limit(
+    model: pin.Model, joints: Sequence[str], value: Mapping[str, tuple[float, float]] | ArrayLike | None
+) -> tuple[Array, Array]:
+    """(n,) lower and upper joint positions [rad]; infinite for continuous joints unless given."""
+    limits = np.empty((len(joints), 2))
+    for row, joint in zip(limits, _joints(model), strict=True):
+        # Pinocchio bounds cosine and sine of a continuous joint by +-1.01
+        row[:] = (
+            (-np.inf, np.inf)
+            if joint.nq == 2
+            else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
+        )
+    if isinstance(value, Mapping):
+        for name, pair in value.items():
+            limits[joint_index(joints, name, "position_limit")] = check_array(
+                f"position_limit of joint {name!r} (lower, upper)", pair, (2,), finite=False
+            )
+    elif value is not None:
+        limits = check_array("position_limit", value, (len(joints), 2), finite=False)
+    return limits[:, 0].copy(), limits[:, 1].copy()
+
+
+def add_frame(model: pin.Model, name: str, parent: str, placement: Any, what: str) -> None:
+    """Add an OP_FRAME at `placement` (pin.SE3) in the frame `parent`."""
+    if model.existFrame(name):
+        raise InputError(
+            f"{what}: the model has a frame {name!r} already; choose another name, or leave out the parent"
+        )
+    above = check_frame(model, parent, what)
+    joint = model.frames[above].parentJoint
+    at = model.frames[above].placement * placement
+    model.addFrame(pin.Frame(name, joint, above, at, pin.FrameType.OP_FRAME))
+
+
+def add_striker(model: pin.Model, striker: Striker) -> None:
+    """Add the striker's frame, or move it when there is one."""
+    placement = pin.SE3(np.eye(3), striker.point)
+    if not model.existFrame(striker.model_frame):
+        add_frame(model, striker.model_frame, striker.frame, placement, f"striker {striker.name!r}")
+        return
+    above = model.frames[check_frame(model, striker.frame, f"striker {striker.name!r}")]
+    frame = model.frames[model.getFrameId(striker.model_frame)]
+    frame.parentJoint, frame.placement = above.parentJoint, above.placement * placement
+    frame.parentFrame = model.getFrameId(striker.frame)
+
+
+def joint_positions(model: pin.Model, q: Array) -> Array:
+    """(n,) joint angles of a configuration."""
+    return np.array(
+        [
+            q[joint.idx_q] if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], q[joint.idx_q])
+            for joint in _joints(model)
+        ]
+    )
+
+
+def set_joints(model: pin.Model, q: Array, angles: Mapping[str, float], what: str) -> Array:
+    """A copy of the configuration with some joint angles set by name."""
+    q = np.array(q, dtype=np.float64)
+    names, joints = joint_names(model), _joints(model)
+    for name, value in angles.items():
+        joint = joints[joint_index(names, name, what)]
+        angle = float(check_array(f"{what}: joint {name!r}", value, ()))
+        q[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+    return q
+
+
+def reference_configurations(model: pin.Model) -> dict[str, Array]:
+    """The model's own named configurations (an SRDF's), with quaternions brought to unit norm."""
+    return {
+        str(entry.key()): pin.normalize(model, np.array(entry.data(), dtype=np.float64))
+        for entry in model.referenceConfigurations
+    }
+
+
+def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
+    """The configuration with the mean of some frames at the origin, at yaw 0, by moving the free-flyer."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    poses = [data.oMf[check_frame(model, frame, "place")] for frame in frames]
+    forward = sum(pose.rotation[:2, 0] for pose in poses)
+    yaw = np.arctan2(forward[1], forward[0])
+    mean = np.mean([pose.translation for pose in poses], axis=0)
+    turn = pin.SE3(pin.utils.rotate("z", -yaw), np.zeros(3))
+    q = q.copy()
+    q[:7] = pin.SE3ToXYZQUAT(turn * pin.SE3(np.eye(3), -mean) * pin.XYZQUATToSE3(q[:7]))
+    return q
+
+
+def _joints(model: pin.Model) -> list[Any]:
+    return list(model.joints)[2 if is_floating(model) else 1 :]
+
+
+def _existing(path: str | PathLike[str], kind: str) -> str:
+    file = Path(fspath(path)).expanduser()
+    if not file.is_file():
+        raise InputError(f"{kind} {file}: no such file")
+    return str(file)

@@ -1,0 +1,188 @@
+"""What has to hold of a robot and its configurations; every failure names the thing and the mend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import InputError, check_array, did_you_mean
+
+Array = NDArray[np.float64]
+
+# Fastest servo that makes sense [1/s]: a time constant of 33 us is below a tenth of any servo's sampling
+# time. Light wrists without armature reach 1e5.
+MAX_SERVO_RATE = 3e4
+
+
+def check_joint_types(model: pin.Model) -> None:
+    """InputError unless all joints but a free-flyer at the root have one degree of freedom."""
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        if joint.nv != 1 and not (i == 1 and joint.shortname() == "JointModelFreeFlyer"):
+            raise InputError(
+                f"joint {model.names[i]!r} is a {joint.shortname()} with {joint.nv} degrees of freedom; "
+                "besides a free-flyer at the root, joints have one: split it into such joints, or lock it"
+            )
+
+
+def check_inertias(model: pin.Model) -> None:
+    """InputError if a moving body's mass or inertia cannot be those of matter."""
+    for i in range(1, model.njoints):
+        body = model.inertias[i]
+        where = f"the link moved by joint {model.names[i]!r} (with what is fixed to it)"
+        if not np.isfinite(body.mass) or body.mass <= 0:
+            raise InputError(f"{where} has mass {body.mass:g} kg; give its <inertial> a positive mass")
+        inertia = np.array(body.inertia)
+        if not (np.isfinite(inertia).all() and np.isfinite(body.lever).all()):
+            raise InputError(f"{where} has NaN or infinity in its <inertial>; give finite numbers")
+        small, middle, large = np.linalg.eigvalsh(inertia)
+        moments = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m2"
+        if small <= 0:
+            raise InputError(
+                f"{where} has principal moments of inertia {moments}: not positive definite; "
+                "correct its <inertia>, which is about the centre of mass"
+            )
+        # moments of matter obey the triangle inequality; 1e-3 is left for rounded decimals
+        if small + middle < large * (1 - 1e-3):
+            raise InputError(
+                f"{where} has principal moments of inertia {moments}: one exceeds the sum of the others, "
+                "which no body has; correct its <inertia>"
+            )
+
+
+def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: Array, upper: Array) -> None:
+    """InputError if a limit is missing (zero or infinite in a URDF), negative or crossed."""
+    for name, value, unit, option in (
+        *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
+        *((j, x, "rad/s", "velocity_limit") for j, x in zip(joints, velocity, strict=True)),
+    ):
+        # Pinocchio writes a missing limit as infinity or the largest double
+        if not 0 < value < 1e300:
+            raise InputError(
+                f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
+                f"set it in the URDF's <limit>, or give {option}={{{name!r}: ...}}"
+            )
+    for name, low, high in zip(joints, lower, upper, strict=True):
+        if not low < high:
+            raise InputError(
+                f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
+                f"set them in the URDF's <limit>, or give position_limit={{{name!r}: (lower, upper)}}"
+            )
+
+
+def check_gains(
+    model: pin.Model, joints: Sequence[str], kp: Array, kd: Array, configurations: Iterable[Array]
+) -> None:
+    """InputError if a gain is negative, or makes a joint's servo faster than MAX_SERVO_RATE.
+
+    The inertia that joint i's servo feels is least when no other joint resists: 1 / (H^-1)_ii, with armature.
+    There a damper alone decays at Kd (H^-1)_ii [1/s], and a spring alone swings at sqrt(Kp (H^-1)_ii)
+    [rad/s].
+    """
+    for option, gains in (("kp", kp), ("kd", kd)):
+        for name, gain in zip(joints, gains, strict=True):
+            if not 0 <= gain < np.inf:
+                raise InputError(f"{option} of joint {name!r} is {gain:g}; give a finite number, 0 or more")
+    data = model.createData()
+    for q in configurations:
+        upper = np.triu(pin.crba(model, data, q))
+        mobility = np.diag(np.linalg.inv(upper + np.triu(upper, 1).T))[model.nv - len(joints) :]
+        rates = np.maximum(kd * mobility, np.sqrt(kp * np.maximum(mobility, 0)))
+        worst = int(np.argmax(rates))
+        if rates[worst] > MAX_SERVO_RATE:
+            inertia = 1 / mobility[worst]
+            armature = model.armature[model.nv - len(joints) + worst]
+            raise InputError(
+                f"servo of joint {joints[worst]!r}: Kp = {kp[worst]:g} N m/rad and Kd = {kd[worst]:g} "
+                f"N m s/rad on only {inertia:.2g} kg m2 make a rate of {rates[worst]:.2g} 1/s, and "
+                f"{MAX_SERVO_RATE:g} is the most; give the joint its armature (rotor inertia x gear^2, now "
+                f"{armature:.2g} kg m2), or lower Kd below {MAX_SERVO_RATE * inertia:.2g} and Kp below "
+                f"{MAX_SERVO_RATE**2 * inertia:.2g}"
+            )
+
+
+def check_polygon(name: str, polygon: Array) -> None:
+    """InputError unless the corners (k, 2) make a convex polygon, counter-clockwise."""
+    if len(polygon) < 3:
+        raise InputError(f"sole {name!r}: its polygon has {len(polygon)} corners; give at least 3")
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    following = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+    if np.all(turns < 0):
+        raise InputError(f"sole {name!r}: its corners run clockwise; reverse their order")
+    # the turning angles of a simple polygon add up to one turn, those of a star to more
+    angles = np.arctan2(turns, np.sum(edges * following, axis=1))
+    if not np.all(turns > 0) or angles.sum() > 3 * np.pi:
+        raise InputError(
+            f"sole {name!r}: its polygon is not convex, or repeats a corner; give the corners of its hull"
+        )
+
+
+def check_frame(model: pin.Model, frame: str, what: str) -> int:
+    """Index of a frame of the model; InputError if there is none."""
+    if not model.existFrame(frame):
+        names = [str(f.name) for f in model.frames]
+        raise InputError(
+            f"{what}: the model has no frame {frame!r}{did_you_mean(frame, names)}; "
+            "frames are the URDF's links and joints"
+        )
+    try:
+        return int(model.getFrameId(frame))
+    except (ValueError, RuntimeError):  # a link and a joint of the same name
+        return int(model.getFrameId(frame, pin.FrameType.BODY))
+
+
+def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:
+    """`q` as a float64 copy, known to be a configuration of the model."""
+    q = check_array(name, q, (model.nq,))
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        part = (
+            q[joint.idx_q + 3 : joint.idx_q + 7] if joint.nq == 7 else q[joint.idx_q : joint.idx_q + joint.nq]
+        )
+        if joint.nq > 1 and abs(np.linalg.norm(part) - 1) > 1e-6:
+            kind = "quaternion (x, y, z, w)" if joint.nq == 7 else "(cosine, sine)"
+            raise InputError(
+                f"{name}: the {kind} of joint {model.names[i]!r} has norm {np.linalg.norm(part):.6g}; "
+                "normalize it (pin.normalize(model, q))"
+            )
+    return q
+
+
+def check_positions(joints: Sequence[str], angles: Array, lower: Array, upper: Array, name: str) -> None:
+    """InputError naming the joints outside their position limits."""
+    slack = 1e-9
+    outside = [
+        f"{joint!r} at {x:.4g} (limits {low:.4g} to {high:.4g})"
+        for joint, x, low, high in zip(joints, angles, lower, upper, strict=True)
+        if not low - slack <= x <= high + slack
+    ]
+    if outside:
+        raise InputError(f"{name}: outside its position limits [rad]: {', '.join(outside)}; move it inside")
+
+
+def check_stance(
+    model: pin.Model, q: Array, soles: Sequence[tuple[str, str]], height: float, tilt: float
+) -> None:
+    """InputError unless the soles, (name, frame) each, lie flat at z = 0 within height [m] and tilt [rad]."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    for name, frame in soles:
+        pose = data.oMf[check_frame(model, frame, f"sole {name!r}")]
+        z = float(pose.translation[2])
+        normal = pose.rotation[:, 2]
+        angle = float(np.arctan2(np.linalg.norm(normal[:2]), normal[2]))
+        if angle > tilt:
+            raise InputError(
+                f"sole {name!r} is tilted by {angle:.4g} rad (at most {tilt:g}): not flat on the ground; "
+                "turn its ankle until the sole is level"
+            )
+        if abs(z) > height:
+            side = "above" if z > 0 else "below"
+            raise InputError(
+                f"sole {name!r} is {1e3 * abs(z):.3g} mm {side} the ground (at most {1e3 * height:g} mm): "
+                "move its leg's joints; if all soles are off by the same, put the robot down with Robot.place"
+            )

@@ -1,0 +1,262 @@
+"""CasADi functions compiled to C and kept on disk, safe for two processes at once and private to the user.
+
+Compiled, a rigid-body function runs 8 to 23 times faster than in CasADi's virtual machine, but compiling
+costs from a second to a minute. There are two levels of keys:
+
+* an *entry* (`<name>-<key>.json`) is found without building any graph: its key covers what the caller says it
+  built (`recipe`), this package's sources, CasADi, compiler, flags and CPU. It lists the functions and their
+  libraries;
+* a *library* (`<function>-<hash>.so`) is named after the C code in it, so that a change of the sources that
+  leaves the graph alone costs building the graph again, but no compilation.
+
+A library that someone else could have written is never loaded: see `impactopt.private_files`.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+
+from impactopt._compiler import CompileError, Compiler, find_compiler
+from impactopt._hashing import canonical, model_hash
+from impactopt.errors import CacheWarning, NoCompilerWarning
+from impactopt.private_files import (
+    UnsafePath,
+    check_private_file,
+    locked,
+    private_directory,
+    temporary_private_directory,
+    write_atomically,
+)
+
+__all__ = ["cache_directory", "cached", "model_hash"]
+
+Report = Callable[[str], None]
+
+# Sources that cannot shape a graph: a change in them leaves compiled functions valid. All others count.
+_NOT_IN_GRAPHS = frozenset(
+    ("__init__", "__main__", "cli", "errors", "ipopt", "plotting", "presets", "private_files", "program")
+) | {"report", "solution", "sqp", "sweep", "validation"}
+# gcc -O1 allocates registers in more than linear time: 6, 18, 71 s for 16, 47, 118 thousand instructions.
+# Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
+_MAX_OPTIMIZED = 60_000
+
+
+def cached(
+    name: str,
+    recipe: tuple[Any, ...],
+    build: Callable[[], Sequence[ca.Function]],
+    *,
+    report: Report | None = None,
+) -> dict[str, ca.Function]:
+    """Functions by name: loaded from the cache, or built, compiled and put there.
+
+    Derivatives have to be among the functions that `build` returns: a loaded function cannot be
+    differentiated.
+
+    Parameters
+    ----------
+    name : of the group of functions, for file names and messages.
+    recipe : everything but this package's sources that shapes the functions: numbers, text, arrays, enums,
+        dataclasses, and tuples or mappings of them; for a model, its `model_hash`.
+    build : makes the functions; only called when the cache has no valid copy.
+    report : told what is going on, one line a call, while functions are compiled.
+
+    Returns
+    -------
+    The functions by their own names, in `build`'s order. Without a C compiler, or with
+    IMPACTOPT_NO_COMPILER=1 in the environment, they run in CasADi's virtual machine and a NoCompilerWarning
+    says so once a process.
+    """
+    tell = report if report is not None else _ignore
+    compiler = find_compiler()
+    if compiler is None:
+        _warn_no_compiler()
+        return _by_name(build())
+    try:
+        directory = private_directory(cache_directory())
+    except (UnsafePath, OSError) as error:
+        directory = temporary_private_directory()
+        _warn(f"{error}; compiling into a temporary directory, for this process only")
+    entry = f"{_slug(name)}-{_entry_key(name, recipe, compiler)}"
+    functions = _load_entry(directory, entry)
+    if functions is not None:
+        return functions
+    lock = directory / f"{entry}.lock"
+    with locked(lock, on_wait=lambda: tell(f"{name}: another process is compiling, waiting")):
+        functions = _load_entry(directory, entry)
+        if functions is not None:
+            return functions
+        return _build_entry(directory, entry, name, build, compiler, tell)
+
+
+def cache_directory() -> Path:
+    """Where libraries are kept: $IMPACTOPT_CACHE, $XDG_CACHE_HOME/impactopt or ~/.cache/impactopt."""
+    own = os.environ.get("IMPACTOPT_CACHE")
+    if own:
+        return Path(own).expanduser().absolute()
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache").absolute() / "impactopt"
+
+
+def _load_entry(directory: Path, entry: str) -> dict[str, ca.Function] | None:
+    """The functions of an entry, or None when any part of it is missing, damaged or not private."""
+    try:
+        check_private_file(directory / f"{entry}.json")
+        listing = json.loads((directory / f"{entry}.json").read_text(encoding="utf-8"))
+        functions = {}
+        for function, (library, digest) in listing["functions"].items():
+            if Path(library).name != library:
+                return None
+            path = directory / library
+            check_private_file(path)
+            if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+                return None
+            functions[function] = ca.external(function, str(path))
+        return functions
+    except UnsafePath as error:
+        _warn(f"{error}; compiling again")
+        return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError):
+        return None
+
+
+def _build_entry(
+    directory: Path,
+    entry: str,
+    name: str,
+    build: Callable[[], Sequence[ca.Function]],
+    compiler: Compiler,
+    tell: Report,
+) -> dict[str, ca.Function]:
+    start = time.monotonic()
+    tell(f"{name}: building the functions")
+    functions = _by_name(build())
+    listing: dict[str, tuple[str, str]] = {}
+    pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
+    try:
+        with tempfile.TemporaryDirectory(dir=directory, prefix="tmp-") as scratch, pool:
+            jobs = {}
+            try:
+                # the longest first, so that the cores finish together; CasADi itself stays in this thread
+                for function in sorted(functions.values(), key=_longest_body, reverse=True):
+                    job = pool.submit(_library, directory, Path(scratch), *_c_code(function), compiler)
+                    jobs[job] = function.name()
+                for done, job in enumerate(as_completed(jobs), start=1):
+                    listing[jobs[job]] = job.result()
+                    seconds = time.monotonic() - start
+                    tell(f"{name}: compiled {jobs[job]} ({done} of {len(jobs)}, {seconds:.0f} s)")
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+        ordered = {"functions": {function: listing[function] for function in functions}}
+        write_atomically(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
+    except (CompileError, OSError) as error:
+        warnings.warn(
+            f"{name}: {error}; its functions run in CasADi's virtual machine, 10 to 20 times slower",
+            NoCompilerWarning,
+            stacklevel=4,
+        )
+        return functions
+    return {f: ca.external(f, str(directory / listing[f][0])) for f in functions}
+
+
+def _c_code(function: ca.Function) -> tuple[str, str, str]:
+    """Name, C code and optimization level of a function."""
+    name = str(function.name())
+    generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
+    generator.add(function)
+    level = "-O1" if _longest_body(function) <= _MAX_OPTIMIZED else "-O0"
+    return name, str(generator.dump()), level
+
+
+def _library(
+    directory: Path, scratch: Path, name: str, code: str, level: str, compiler: Compiler
+) -> tuple[str, str]:
+    """File name and hash of the library of this C code: the one that is there, or a new one."""
+    key = hashlib.sha256("\0".join([code, level, compiler.key]).encode()).hexdigest()
+    library = directory / f"{_slug(name)}-{key[:32]}.so"
+    seal = library.with_suffix(".sha256")
+    try:
+        check_private_file(library)
+        check_private_file(seal)
+        digest = hashlib.sha256(library.read_bytes()).hexdigest()
+        if seal.read_text(encoding="ascii") == digest:
+            return library.name, digest
+    except (UnsafePath, OSError, ValueError):
+        pass
+    source, made = scratch / f"{name}.c", scratch / f"{name}.so"
+    source.write_text(code, encoding="utf-8")
+    compiler.run(source, made, level)
+    content = made.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    write_atomically(library, content, mode=0o700)
+    write_atomically(seal, digest.encode())
+    return library.name, digest
+
+
+def _longest_body(function: ca.Function) -> int:
+    """Instructions in the longest of the C functions that `function` becomes."""
+    parts = [function, *function.find_functions()]
+    return max(
+        (int(f.n_instructions()) for f in parts if f.class_name() in ("SXFunction", "MXFunction")), default=0
+    )
+
+
+def _by_name(functions: Sequence[ca.Function]) -> dict[str, ca.Function]:
+    named: dict[str, ca.Function] = {}
+    for function in functions:
+        if function.name() in named:
+            raise ValueError(f"two functions of one group are named {function.name()!r}")
+        named[function.name()] = function
+    return named
+
+
+@functools.cache
+def _warn_no_compiler() -> None:
+    warnings.warn(
+        "no C compiler: functions run in CasADi's virtual machine, 10 to 20 times slower; "
+        "install gcc or clang, or name one in the environment variable CC",
+        NoCompilerWarning,
+        stacklevel=3,
+    )
+
+
+@functools.cache
+def _sources_key() -> str:
+    """Hash of this package's sources that can shape a graph."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        if parts[0] not in _NOT_IN_GRAPHS:
+            digest.update("/".join(parts).encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _entry_key(name: str, recipe: tuple[Any, ...], compiler: Compiler) -> str:
+    text = "\0".join([name, canonical(recipe), str(_MAX_OPTIMIZED), _sources_key(), compiler.key])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _warn(message: str) -> None:
+    warnings.warn(f"cache of compiled functions: {message}", CacheWarning, stacklevel=3)
+
+
+def _slug(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+
+
+def _ignore(message: str) -> None:
+    pass

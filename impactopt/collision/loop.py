@@ -1,0 +1,59 @@
+"""The time loop as a CasADi graph whose size in C is that of one step and a list of calls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+
+from .model import JointSpaceModel
+
+__all__ = ["run"]
+
+# steps in a block: a block is skipped when the contact is over before it begins
+_BLOCK = 16
+
+
+def run(
+    model: JointSpaceModel, step: Any, steps: int, data: Sequence[Any], *, record: bool
+) -> tuple[Any, Any]:
+    """(final state, states at all steps) from the state at contact, MX.
+
+    At least `steps` steps are made, rounded up to whole blocks; the states at all steps, (n_states, steps +
+    1), are in the graph only where `record` asks for them. After separation states repeat the last one.
+    """
+    block = _block(model, step, record)
+    still = _still(model, record)
+    advance = ca.Function.if_else("advance", block, still)
+    in_contact, small = (
+        _in_contact(model),
+        [x for x, name in zip(data, model.data, strict=True) if name != "A"],
+    )
+    y = ca.MX(model.start())
+    history = [y]
+    for _ in range(-(-steps // _BLOCK)):
+        out = advance.call([in_contact(y, *small), y, *data])
+        y = out[0]
+        history += out[1:]
+    return y, ca.horzcat(*history) if record else None
+
+
+def _block(model: JointSpaceModel, step: Any, record: bool) -> Any:
+    y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
+    states = [y]
+    for _ in range(_BLOCK):
+        states.append(step(states[-1], *data))
+    out = [states[-1], ca.horzcat(*states[1:])] if record else [states[-1]]
+    return ca.Function("block", [y, *data], out)
+
+
+def _still(model: JointSpaceModel, record: bool) -> Any:
+    y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
+    out = [y, ca.repmat(y, 1, _BLOCK)] if record else [y]
+    return ca.Function("still", [y, *data], out)
+
+
+def _in_contact(model: JointSpaceModel) -> Any:
+    y, data = ca.SX.sym("y", model.n_states), model.small_symbols()
+    return ca.Function("in_contact", [y, *data.values()], [model.phase(y, data)[1]])

@@ -1,0 +1,189 @@
+"""The collision in joint space: its state, and the forces in it, for one instant (paper, eqs. 9, 11, 12,
+15-17)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contact import ContactLaw, Target
+from .settings import Settings
+from .terms import Terms
+
+__all__ = ["JointSpaceModel"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSpaceModel:
+    """What happens between hand and target with the robot's frozen dynamics.
+
+    Its state y holds time integrals only, so that what is linear in them (momentum, work of constraints) is
+    kept exactly by any Runge-Kutta or Taylor method:
+
+        time [s]; penetration [m]; impulse [N s] = integral of f; target's state; and, where they are asked
+        for or needed, peak force [N], torque (n) [N m s] = integral of tau - F, deviation (n) [rad] =
+        phi_ref - phi, torque2 (n), impulse2: second integrals.
+
+    Attributes
+    ----------
+    n : number of joints.
+    terms, law, target, settings : as in `SDC`.
+    transition : [rad/s], of the joint friction.
+    peak : keep the largest force in the state.
+    second_integrals : keep torque2 and impulse2 in the state.
+    """
+
+    n: int
+    terms: Terms
+    law: ContactLaw
+    target: Target
+    settings: Settings
+    transition: float
+    peak: bool = False
+    second_integrals: bool = False
+
+    # ------------------------------------------------------------ layout of state and data
+    @cached_property
+    def layout(self) -> dict[str, slice]:
+        """Where each part of the state lies."""
+        sizes = {"time": 1, "penetration": 1, "impulse": 1, "target": self.target.n_states}
+        if self.peak:
+            sizes["peak"] = 1
+        sizes["torque"] = self.n
+        if self.terms.stiffness:
+            sizes["deviation"] = self.n
+        if self.second_integrals:
+            sizes |= {"torque2": self.n, "impulse2": 1}
+        ends = np.cumsum(list(sizes.values()))
+        return {
+            name: slice(int(end) - size, int(end))
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
+
+    @property
+    def n_states(self) -> int:
+        return max(part.stop for part in self.layout.values())
+
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """Attributes of FrozenDynamics that the model needs."""
+        names = ["A", "s", "m", "hand_speed"]
+        if self.terms.bias or self.terms.jdot:
+            names += ["d", "e"]
+        if self.terms.friction:
+            names.append("joint_velocity")
+        return tuple(names)
+
+    @cached_property
+    def data(self) -> dict[str, tuple[int, int]]:
+        """Names and shapes of what is constant during the collision."""
+        n = self.n
+        shapes = {"A": (n * (n + 1) // 2, 1), "m": (1, 1), "hand_speed": (1, 1), "e": (1, 1)}
+        out = {name: shapes.get(name, (n, 1)) for name in self.frozen}
+        if self.terms.feedforward:
+            out["feedforward"] = (n, 1)
+        return out | {name: (max(1, v.size), 1) for name, v in self.settings.items() if name != "normal"}
+
+    def symbols(self, kind: Any = ca.SX) -> dict[str, Any]:
+        """A symbol for each of the data."""
+        return {name: kind.sym(name, *shape) for name, shape in self.data.items()}
+
+    def small_symbols(self) -> dict[str, Any]:
+        """An SX symbol for each of the data but A."""
+        return {name: ca.SX.sym(name, *shape) for name, shape in self.data.items() if name != "A"}
+
+    def start(self) -> NDArray[np.float64]:
+        """The state at contact."""
+        return np.zeros(self.n_states)
+
+    def part(self, y: Any, name: str) -> Any:
+        """One part of the state; columns of y are different instants."""
+        return y[self.layout[name], :]
+
+    def join(self, parts: dict[str, Any]) -> Any:
+        """The state (or a derivative of it) from its parts."""
+        return ca.vertcat(*[parts[name] for name in self.layout])
+
+    # ------------------------------------------------------------ numbers of law and target
+    def law_numbers(self, data: dict[str, Any]) -> dict[str, Any]:
+        return {name: data[f"contact_{name}"] for name in self.law.parameters}
+
+    def target_numbers(self, data: dict[str, Any]) -> dict[str, Any]:
+        return {name: data[f"target_{name}"] for name in self.target.parameters}
+
+    # ------------------------------------------------------------ one instant, or several: one a column of y
+    def velocity_change(self, y: Any, data: dict[str, Any]) -> Any:
+        """Joint velocities less those at contact (n) [rad/s]: integral of eq. (9). Linear in y."""
+        return self.velocity_from(self.part(y, "torque"), self.part(y, "impulse"), self.part(y, "time"), data)
+
+    def velocity_from(self, torque: Any, impulse: Any, time: Any, data: dict[str, Any]) -> Any:
+        """`velocity_change` from the state's parts that it depends on."""
+        u = self._product(data["A"], torque) - ca.mtimes(data["s"], impulse)
+        return u + ca.mtimes(data["d"], time) if "d" in data else u
+
+    def _product(self, lower: Any, columns: Any) -> Any:
+        """A times columns, from A's lower triangle."""
+        if columns.size2() > 1:
+            A = ca.tril2symm(type(lower)(ca.Sparsity.lower(self.n), lower))
+            return ca.mtimes(A, columns)
+        return self._product_function(lower, columns)
+
+    @cached_property
+    def _product_function(self) -> Any:
+        """A times a vector as a function of its own, straight-line code: twice as fast as CasADi's loop,
+        and short."""
+        lower, x = ca.SX.sym("A", self.n * (self.n + 1) // 2), ca.SX.sym("x", self.n)
+        A = ca.tril2symm(ca.SX(ca.Sparsity.lower(self.n), lower))
+        return ca.Function("product", [lower, x], [ca.mtimes(A, x)])
+
+    def hand_speed_change(self, y: Any, data: dict[str, Any]) -> Any:
+        """n.v_hand less what it was at contact [m/s]: integral of eqs. (15), (16). Linear in y."""
+        w = ca.mtimes(data["s"].T, self.part(y, "torque")) - data["m"] * self.part(y, "impulse")
+        return w + data["e"] * self.part(y, "time") if "e" in data else w
+
+    def target_state(self, y: Any) -> list[Any]:
+        states = self.part(y, "target")
+        return [states[i, :] for i in range(self.target.n_states)]
+
+    def rate(self, y: Any, data: dict[str, Any]) -> Any:
+        """Rate of penetration [m/s]."""
+        hand = self.hand_speed_change(y, data) + data["hand_speed"]
+        return hand - self.target.velocity(self.target_state(y), self.target_numbers(data))
+
+    def phase(self, y: Any, data: dict[str, Any]) -> tuple[Any, Any]:
+        """(compressing, in contact), 0 or 1. Contact is over when, in restitution, no force is left."""
+        rate = self.rate(y, data)
+        force = self.law.branch(self.part(y, "penetration"), rate, False, self.law_numbers(data))
+        compressing = rate > 0
+        return compressing, ca.logic_or(compressing, force > 0)
+
+    def servo(self, y: Any, u: Any, data: dict[str, Any]) -> Any:
+        """The servo's feedback torque (n) [N m] at velocity change u (eqs. 10, 11). Linear in y and u."""
+        tau = -_spread(data["kd"], u) * u
+        return tau + _spread(data["kp"], u) * self.part(y, "deviation") if self.terms.stiffness else tau
+
+    def with_feedforward(self, tau: Any, data: dict[str, Any]) -> Any:
+        return tau + _spread(data["feedforward"], tau) if self.terms.feedforward else tau
+
+    def saturate(self, tau: Any, data: dict[str, Any]) -> Any:
+        """The servo's torque (n) [N m] (eq. 12)."""
+        if not self.terms.saturation:
+            return tau
+        limit = _spread(data["torque_limit"], tau)
+        return ca.fmax(ca.fmin(tau, limit), -limit)
+
+    def friction(self, u: Any, data: dict[str, Any]) -> Any:
+        """F (n) [N m] (eq. 5) at velocity change u."""
+        rate = _spread(data["joint_velocity"], u) + u
+        sign = ca.fmax(ca.fmin(rate / self.transition, 1.0), -1.0)
+        return _spread(data["viscous"], u) * rate + _spread(data["coulomb"], u) * sign
+
+
+def _spread(column: Any, like: Any) -> Any:
+    """A column for each of the columns of `like`."""
+    return ca.repmat(column, 1, like.size2())

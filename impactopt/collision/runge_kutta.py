@@ -1,0 +1,60 @@
+"""Steps 3b to 7b of the paper as fixed steps of the classical Runge-Kutta method, as in its section III.
+
+Phases are judged anew in each of the four stages, so a step across an event is of second order only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+from .model import JointSpaceModel
+
+__all__ = ["rate_of_change", "rk4_step"]
+
+
+def rk4_step(model: JointSpaceModel, length: float) -> Any:
+    """ca.Function step(y, *data) -> y `length` [s] later; y itself after separation."""
+    y, data, u = ca.SX.sym("y", model.n_states), model.small_symbols(), ca.SX.sym("u", model.n)
+    rate = ca.Function("rate", [y, *data.values(), u], [rate_of_change(model, y, u, data)])
+    in_contact = ca.Function("in_contact", [y, *data.values()], [model.phase(y, data)[1]])
+    Y, D = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
+    small = [D[name] for name in data]
+
+    def slope(state: Any) -> Any:
+        return rate(state, *small, model.velocity_change(state, D))
+
+    h = length * in_contact(Y, *small)
+    k1 = slope(Y)
+    k2 = slope(Y + h / 2 * k1)
+    k3 = slope(Y + h / 2 * k2)
+    k4 = slope(Y + h * k3)
+    y_next = Y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    if model.peak:
+        peak = model.layout["peak"]
+        largest = ca.fmax(Y[peak], ca.if_else(h > 0, model.part(k1, "impulse"), 0.0))
+        y_next = ca.vertcat(y_next[: peak.start], largest, y_next[peak.stop :])
+    return ca.Function("step", [Y, *D.values()], [y_next], ["y", *D], ["y_next"])
+
+
+def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any]) -> Any:
+    """dy/dt, with every phase judged at y; u is the change of the joint velocities at y."""
+    rate = model.rate(y, data)
+    force = model.law.force(model.part(y, "penetration"), rate, model.law_numbers(data))
+    tau = model.saturate(model.with_feedforward(model.servo(y, u, data), data), data)
+    if model.terms.friction:
+        tau = tau - model.friction(u, data)
+    target = model.target.derivative(model.target_state(y), force, model.target_numbers(data))
+    rates = {
+        "time": 1.0,
+        "penetration": rate,
+        "impulse": force,
+        "target": ca.vertcat(*target),
+        "peak": 0.0,
+        "torque": tau,
+        "deviation": -u,
+    }
+    if model.second_integrals:
+        rates |= {"torque2": model.part(y, "torque"), "impulse2": model.part(y, "impulse")}
+    return model.join(rates)

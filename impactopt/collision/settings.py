@@ -1,0 +1,99 @@
+"""The numbers of a collision that are inputs of its functions, so that one compiled library serves all
+values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..contact import ContactLaw, Target
+from ..errors import InputError, check_array, did_you_mean
+from ..robot import Robot
+from .terms import JointFriction, Terms
+
+__all__ = ["Settings"]
+
+Array = NDArray[np.float64]
+
+# name: whether it has to be positive, or may be zero too
+_SIGN = {"kp": ">= 0", "kd": ">= 0", "torque_limit": "> 0", "viscous": ">= 0", "coulomb": ">= 0"}
+
+
+class Settings(Mapping[str, Array]):
+    """Defaults of a collision's numbers by input name, in the order of the inputs; only those its terms need.
+
+    normal (3); contact_<number of the law>; target_<number of the target>; kd (n); kp (n) with servo
+    stiffness; torque_limit (n) with saturation; viscous, coulomb (n) with friction.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        law: ContactLaw,
+        target: Target,
+        normal: ArrayLike,
+        terms: Terms,
+        friction: JointFriction,
+    ) -> None:
+        self._law, self._target = law, target
+        values: dict[str, Any] = {"normal": normal}
+        values |= {f"contact_{name}": number for name, number in law.parameters.items()}
+        values |= {f"target_{name}": number for name, number in target.parameters.items()}
+        values["kd"] = robot.kd
+        if terms.stiffness:
+            values["kp"] = robot.kp
+        if terms.saturation:
+            values["torque_limit"] = robot.torque_limit
+        if terms.friction:
+            values["viscous"], values["coulomb"] = friction.arrays(robot.n)
+        self._values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
+        self._values = {name: self._check(name, value) for name, value in self._values.items()}
+
+    def override(self, changes: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """All values, with some of them changed; a single number for a setting of the joints goes for all.
+
+        Raises
+        ------
+        InputError : an unknown name, a wrong shape, NaN, a sign, or a normal that is not a unit vector.
+        """
+        for name in changes:
+            if name not in self._values:
+                raise InputError(
+                    f"no setting {name!r} in this collision{did_you_mean(name, self._values)}; it has "
+                    + ", ".join(self._values)
+                )
+        return {
+            name: self._check(name, changes[name]) if name in changes else v
+            for name, v in self._values.items()
+        }
+
+    def _check(self, name: str, value: ArrayLike) -> Array:
+        shape = self._values[name].shape
+        if shape and name != "normal" and np.ndim(value) == 0:
+            value = np.full(shape, value)
+        # a limit of infinity is no limit
+        array = check_array(name, value, shape, finite=name != "torque_limit")
+        if name == "normal" and abs(np.linalg.norm(array) - 1.0) > 1e-6:
+            raise InputError(
+                f"normal: not a unit vector (length {np.linalg.norm(array):.6g}); divide it by its length"
+            )
+        sign = _SIGN.get(name, "")
+        if (sign and (array < 0).any()) or (sign == "> 0" and (array == 0).any()):
+            raise InputError(f"{name}: has {array.min():g}; all must be {sign}")
+        for prefix, owner in (("contact_", self._law), ("target_", self._target)):
+            if name.startswith(prefix):
+                # the class knows the ranges of its own numbers
+                type(owner)(**{**owner.parameters, name.removeprefix(prefix): float(array)})
+        return array
+
+    def __getitem__(self, name: str) -> Array:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)

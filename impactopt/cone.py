@@ -1,0 +1,80 @@
+"""The contact wrench cone of a flat polygonal sole with Coulomb friction.
+
+A wrench (f, m) at the sole's frame can be transmitted by unilateral frictional forces at the corners if and
+only if it lies in the cone spanned by them; CoP, friction and yaw torsion are bounded *together* (torsion
+capacity vanishes as the CoP nears a corner). Source: Caron, Pham, Nakamura, "Stability of surface contacts
+for humanoid robots", ICRA 2015, whose closed form for a rectangle the tests compare with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from impactopt.errors import InputError
+
+Array = NDArray[np.float64]
+MERGED = 1e-9  # [m] corners nearer to a line than this lie on it
+
+
+def shrink(polygon: ArrayLike, margin: float) -> Array:
+    """The convex polygon (k, 2) [m], counter-clockwise, with every edge moved inwards by ``margin`` [m]."""
+    p = np.array(polygon, dtype=float)
+    if margin == 0.0:
+        return p
+    edge = np.roll(p, -1, axis=0) - p
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    offset = np.einsum("ij,ij->i", inward, p) + margin
+    for normal, least in zip(inward, offset, strict=True):  # an edge shorter than the margin may vanish
+        p = _clip(p, p @ normal - least)
+    if len(p) < 3:
+        raise InputError(
+            f"a margin of {margin:g} m leaves nothing of the sole: make it smaller than half the sole's width"
+        )
+    return p
+
+
+def _clip(corners: Array, inside: Array) -> Array:
+    """What is left of a convex polygon where its corners' signed distances ``inside`` [m] are negative."""
+    out: list[Array] = []
+    for k in range(len(corners)):
+        a, b = inside[k - 1], inside[k]
+        if min(a, b) < -MERGED and max(a, b) > MERGED:  # the edge that ends here is cut
+            out.append(corners[k - 1] + a / (a - b) * (corners[k] - corners[k - 1]))
+        if b >= -MERGED:
+            out.append(corners[k])
+    return np.array(out) if len(out) > 2 and max(inside) > MERGED else np.zeros((0, 2))
+
+
+def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 0.0) -> Array:
+    """Rows F (k, 6) with  F @ (f, m) >= 0  exactly for the wrenches that the sole can transmit.
+
+    polygon (c, 2) [m]: corners in the sole's frame, counter-clockwise; friction: coefficient of the pyramid
+    inscribed along the sole's axes (|f_x|, |f_y| <= mu f_z); margin [m]: how far the CoP stays inside. Rows
+    are scaled so that a unit normal force at the middle gives values of the order of one (forces [N], moments
+    [N m]).
+    """
+    if not friction > 0:
+        raise InputError(f"friction must be positive, not {friction}")
+    corners = shrink(polygon, margin)
+    rays = []
+    for x, y in corners:
+        for fx, fy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            f = np.array([friction * fx, friction * fy, 1.0])
+            rays.append(np.concatenate([f, np.cross([x, y, 0.0], f)]))
+    r = np.array(rays)
+    # every ray has f_z = 1, so the cone is the one over the 5-dimensional polytope of the other components
+    size = np.maximum(np.abs(np.delete(r, 2, axis=1)).max(axis=0), MERGED)
+    points = np.delete(r, 2, axis=1) / size
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:  # pragma: no cover - degenerate polygons are refused by Sole
+        raise InputError(
+            "the sole's polygon is degenerate: give at least three corners that span an area"
+        ) from error
+    facets = np.unique(np.round(hull.equations, 10), axis=0)  # one simplex per row: coplanar ones coincide
+    rows = np.zeros((len(facets), 6))
+    rows[:, [0, 1, 3, 4, 5]] = -facets[:, :5] / size
+    rows[:, 2] = -facets[:, 5]
+    return rows

@@ -1,0 +1,67 @@
+"""Errors and warnings that users see, and the small checks that raise them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["CacheWarning", "InputError", "NoCompilerWarning", "check_array", "did_you_mean"]
+
+
+class InputError(ValueError):
+    """What was asked for cannot be done; the message names the thing and the mend."""
+
+
+class NoCompilerWarning(UserWarning):
+    """No C compiler: functions run in CasADi's virtual machine, 10 to 20 times slower."""
+
+
+class CacheWarning(UserWarning):
+    """The on-disk cache of compiled functions cannot be used."""
+
+
+def did_you_mean(name: str, options: Iterable[str]) -> str:
+    """The option nearest to a misspelt name, as the tail of a message.
+
+    Returns " (did you mean 'x'?)", or "" when nothing is near.
+    """
+    candidates = {str(option).casefold(): str(option) for option in options}
+    near = difflib.get_close_matches(str(name).casefold(), list(candidates), n=1, cutoff=0.6)
+    return f" (did you mean {candidates[near[0]]!r}?)" if near else ""
+
+
+def check_array(
+    name: str, value: ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True
+) -> NDArray[np.float64]:
+    """A float64 copy of `value`, known to have the given shape.
+
+    Parameters
+    ----------
+    name : what messages call the value, for example "q [rad]".
+    value : anything NumPy can turn into numbers.
+    shape : the wanted shape; None stands for any length, () for a single number.
+    finite : refuse NaN and infinity when True, NaN alone when False.
+
+    Raises
+    ------
+    InputError : not numbers, another shape, or NaN or infinity at a named place.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected numbers, got {value!r}") from error
+    if array.ndim != len(shape) or any(
+        want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
+    ):
+        wanted = "(" + ", ".join("any" if want is None else str(want) for want in shape) + ")"
+        raise InputError(f"{name}: expected shape {wanted}, got {array.shape}")
+    bad = ~np.isfinite(array) if finite else np.isnan(array)
+    if bad.any():
+        place = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = f" at index {place[0] if len(place) == 1 else place}" if place else ""
+        allowed = "a finite number" if finite else "a number"
+        raise InputError(f"{name}: {array[place]}{where}; give {allowed}")
+    return array

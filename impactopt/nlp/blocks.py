@@ -1,0 +1,223 @@
+"""The nonlinear pieces of an impact motion's program as CasADi functions of (variables z, parameters p).
+
+Everything that is a number of the scene (normal, contact law, target, gains, limits) is a parameter, so one compiled library per robot,
+stance and striker serves every problem.  Times and rates: y' and y'' are derivatives in the phase's own s in [0, 1], so
+ydot = y'/T and yddot = y''/T^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from impactopt.contact.laws import ContactLaw
+from impactopt.coordinates import StanceCoordinates
+
+
+FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
+DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
+
+
+@dataclass(frozen=True)
+class BlockExpression:
+    """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``."""
+
+    z: Any
+    p: Any
+    out: Any
+    sizes: dict[str, int]
+
+
+def _block(z: list[Any], p: list[Any], out: dict[str, Any]) -> BlockExpression:
+    return BlockExpression(
+        ca.vertcat(*z), ca.vertcat(*p), ca.vertcat(*out.values()), {k: int(v.numel()) for k, v in out.items()}
+    )
+
+
+def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
+    """Lengths of the named slices of a block's output, in order."""
+    n, base, soles = c.robot.n, c.base, len(c.legs)
+    return {
+        "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl},
+        "contact": {"point": 3, "velocity": 3},
+        "coasting_legs": {"rate": c.nl, "acceleration": c.nl},
+        "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n},
+        "force": {"law": 1, "target": 1, "rate": 1, "penetration": 1},
+        "link": {"contact": 1, "position": 1, "rate": 1},
+    }[block]
+
+
+def node(c: StanceCoordinates) -> BlockExpression:
+    """A node of a swing or follow-through: closed legs, whole-body inverse dynamics under the soles' wrenches.
+
+    z = y, y', y'' (ny each), legs (nl), sole wrenches (6 a sole, [N, N m], in the sole's frame), T [s];
+    p = torque limits (n), leg rate limits (nl), weight [N], lever [m].
+    out = closure [m, rad], base rows of the equation of motion over weight and weight x lever, torque over limit, leg rate over limit.
+    """
+    ny, n = c.ny, c.robot.n
+    y, y1, y2 = ca.SX.sym("y", ny), ca.SX.sym("y1", ny), ca.SX.sym("y2", ny)
+    legs, w, T = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("T")
+    limit, rate_limit = ca.SX.sym("limit", n), ca.SX.sym("rate_limit", c.nl)
+    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    v, a = c.motion(y, legs, y1 / T, y2 / T**2)
+    rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
+    tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(legs, w)
+    out = {
+        "closure": c.closure(y, legs),
+        "base": tau[: c.base] / _base_scale(c, weight, lever),
+        "torque": tau[c.base :] / limit,
+        "leg_rate": _leg_part(c, v) / rate_limit,
+    }
+    return _block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever], out)
+
+
+def _base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
+    return ca.vertcat(*[weight] * 3, *[weight * lever] * 3) if c.base else ca.SX(0, 1)
+
+
+def _leg_part(c: StanceCoordinates, v: Any) -> Any:
+    return ca.vertcat(*[v[c.base + int(j)] for j in c.dependent])
+
+
+def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """The striking point when it meets the target.  z = y, y', T;  p = rotation rows (normal, two tangents: 9).
+
+    out = point [m] (world), velocity [m/s] along the normal and the two tangents.
+    """
+    y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
+    axes = ca.SX.sym("axes", 9)
+    q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
+    point, twist, _ = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))
+    return _block([y, y1, T], [axes], {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)})
+
+
+def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
+    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point, world axes."""
+    rb, frame = c.rb, f"striker:{striker}"
+    _, point = rb.frame(frame)
+    outs = [point, rb.frame_velocity(frame, rb.v)[:3], rb.frame_acceleration(frame, rb.v, rb.a)[:3]]
+    return ca.Function("striker", [rb.q, rb.v, rb.a], outs)
+
+
+def coasting_legs(c: StanceCoordinates) -> BlockExpression:
+    """Leg joint rates and accelerations of the reference that coasts from contact on.  z = y, legs, ydot; out = rates, accelerations."""
+    y, legs, u = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("u", c.ny)
+    v, a = c.motion(y, legs, u, ca.SX.zeros(c.ny))
+    return _block([y, legs, u], [], {"rate": _leg_part(c, v), "acceleration": _leg_part(c, a)})
+
+
+def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """Equation of motion (6) at one collocation point of the collision: H, J and bias frozen anew at the point (steps 1b to 6b).
+
+    The servo (equations 10, 12 as rows) follows a reference that coasts at its velocity at contact, legs to second order in time:
+    tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
+
+    z = y0, legs0, u0 (ydot) at contact; r1, r2 leg rates and accelerations of the coasting reference; feed-forward over torque limit (n);
+    d1, T1, d, T: y = y0 + T1 d1 + T d; u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
+    p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight [N], lever [m].
+    out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit.
+    """
+    ny, n, nl = c.ny, c.robot.n, c.nl
+    y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
+    legs0, r1, r2, legs = (ca.SX.sym(s, nl) for s in ("legs0", "r1", "r2", "legs"))
+    ff, w = ca.SX.sym("ff", n), ca.SX.sym("w", 6 * len(c.legs))
+    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
+    normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
+    kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
+    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    t = after * T1 + T * s
+    y = y0 + T1 * d1 + T * d
+    v, a = c.motion(y, legs, u, u1 / T)
+    rb = c.rb
+    q = c.configuration(y, legs)
+    rnea = ca.Function("rnea", [rb.q, rb.v, rb.a], [rb.rnea(rb.v, rb.a)])
+    row = ca.Function("row", [rb.q], [ca.densify(rb.jacobian(f"striker:{striker}")[:3, :])])(q)
+    tau = rnea(q, v, a) + ca.mtimes(row.T, normal) * f - c.sole_wrench_map(legs, w)
+    # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
+    ahead = c.configuration(y0 + u0 * t - y, legs0 + r1 * t + 0.5 * r2 * t**2 - legs)[c.base :]
+    faster = c.configuration(u0 - u, r1 + r2 * t)[c.base :] - c.configuration(ca.SX.zeros(ny), _leg_part(c, v))[c.base :]
+    servo = ff + (kp * ahead + kd * faster) / limit
+    out = {
+        "closure": c.closure(y, legs),
+        "base": tau[: c.base] / _base_scale(c, weight, lever),
+        "joints": tau[c.base :] / limit - servo,
+        "torque": servo,
+    }
+    z = [y0, legs0, u0, r1, r2, ff, d1, T1, d, T, u, u1, legs, f, w]
+    return _block(z, [normal, s, after, kp, kd, limit, weight, lever], out)
+
+
+def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpression:
+    """Contact law and target at one collocation point (equations 14 to 17, integrated).
+
+    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; target speed v [m/s], v' (in s), travel x, x1 as d, d1.
+    p = point (3), normal (3), 1 in restitution else 0, 1/mass [1/kg], the law's parameters.
+    out = (f - law) / 100 N, v' - T f / mass [m/s], approach speed [m/s], penetration / 1 cm.
+    """
+    ny = c.ny
+    y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
+    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
+    v, v1, x, x1 = (ca.SX.sym(s) for s in ("v", "v1", "x", "x1"))
+    point, normal = ca.SX.sym("point", 3), ca.SX.sym("n", 3)
+    after, inverse_mass = ca.SX.sym("after"), ca.SX.sym("im")
+    params = ca.SX.sym("law", len(law.parameters))
+    q, vel, _ = c.upper_motion(y0 + T1 * d1 + T * d, u, ca.SX.zeros(ny))
+    place, twist, _ = striker_kinematics(c, striker)(q, vel, ca.SX.zeros(c.rb.nv))
+    penetration = ca.dot(normal, place - point) - (T1 * x1 + T * x)
+    rate = ca.dot(normal, twist) - v
+    named = {name: params[i] for i, name in enumerate(law.parameters)}
+    compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
+    out = {
+        "law": (f - ((1 - after) * compress + after * restitute)) / FORCE_SCALE,
+        "target": v1 - T * f * inverse_mass,
+        "rate": rate,
+        "penetration": penetration / DEPTH_SCALE,
+    }
+    return _block([y0, d1, T1, d, T, u, f, v, v1, x, x1], [point, normal, after, inverse_mass, params], out)
+
+
+def link() -> BlockExpression:
+    """One coordinate's hand-over from swing to collision, and from the predicted state after contact to the follow-through.
+
+    z = follow-through's first value and y', its T; swing's last value and y', its T; T1, T2; d after each phase; u at contact and at the end.
+    """
+    names = ("yf", "yf1", "Tf", "y", "y1", "Ts", "T1", "T2", "d1", "d2", "u0", "u")
+    yf, yf1, Tf, y, y1, Ts, T1, T2, d1, d2, u0, u = z = [ca.SX.sym(s) for s in names]
+    out = {"contact": y1 / Ts - u0, "position": yf - y - T1 * d1 - T2 * d2, "rate": yf1 / Tf - u}
+    return _block(list(z), [], out)
+
+
+def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
+    """What is left after the impact: capture point [m], vertical speed of the CoM [m/s], angular momentum [N m s].
+
+    z = y, y', legs, T;  p = the support polygon's edges (inward normal, offset: 3 an edge).  out = distance of the capture point
+    c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012) from each edge, positive inside; vertical speed; angular momentum.
+    """
+    y, y1, legs, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("T")
+    rb = c.rb
+    momentum = ca.Function("momentum", [rb.q, rb.v], [rb.com(), rb.centroidal_momentum(rb.v)])
+    com, h = momentum(c.configuration(y, legs), c.velocity(y, legs, y1 / T))
+    mass = sum(i.mass for i in c.model.inertias)
+    velocity = h[:3] / mass
+    capture = com[:2] + velocity[:2] * ca.sqrt(com[2] / 9.81)
+    polygon = ca.SX.sym("polygon", 3 * edges)
+    e = ca.reshape(polygon, 3, edges).T
+    out = {"capture": ca.mtimes(e[:, :2], capture) - e[:, 2], "vertical": velocity[2], "angular": h[3:]}
+    return _block([y, y1, legs, T], [polygon], out)
+
+
+def builders(
+    c: StanceCoordinates, striker: str, law: ContactLaw, edges: int
+) -> dict[str, Callable[[], BlockExpression]]:
+    """name -> a function that builds the block's expression (slow: only called when the compiled library is not in the cache)."""
+    return {
+        "node": lambda: node(c),
+        "contact": lambda: contact(c, striker),
+        "collision": lambda: collision(c, striker),
+        "force": lambda: force(c, striker, law),
+        "link": link,
+        **({"coasting_legs": lambda: coasting_legs(c), "balance": lambda: balance(c, edges)} if c.legs else {}),
+    }

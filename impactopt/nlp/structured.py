@@ -1,0 +1,355 @@
+"""A nonlinear program made of small compiled blocks on affine lifts of the variables.
+
+Every nonlinear function is ``block(S x + c)`` with a constant sparse S, so the Jacobian's and the Hessian's
+nonzeros are a *constant* linear map of the blocks' own nonzeros.  That map is built once; an evaluation is:
+lift, call the compiled blocks without Python in the loop, and one sparse matrix-vector product.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.nlp.layout import Affine, Array, Layout, stack
+
+Index = NDArray[np.intp]
+THREADS = 2
+
+
+class BatchedFunction:
+    """A CasADi function over ``count`` columns, called through its buffer: no copies, no Python lists."""
+
+    def __init__(self, function: Any, count: int) -> None:
+        self._mapped = function.map(count, "thread", THREADS) if count > 1 else function
+        self._buffer, self._run = self._mapped.buffer()
+        self.inputs = [np.zeros((count, function.size1_in(i))) for i in range(function.n_in())]
+        self.output = np.zeros((count, function.nnz_out(0)))
+        for i, a in enumerate(self.inputs):
+            if a.size:
+                self._buffer.set_arg(i, a.data)
+        if self.output.size:
+            self._buffer.set_res(0, self.output.data)
+
+    def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
+        """Rows are instances: z (count, n_z) -> (count, nnz of the output).
+
+        The result is overwritten by the next call.
+        """
+        self.inputs[0][...] = z
+        if multipliers is not None:
+            self.inputs[2][...] = multipliers
+        self._run()
+        return self.output
+
+
+def pattern(sparsity: Any) -> tuple[Index, Index]:
+    """Rows and columns of a CasADi sparsity's nonzeros, in its (column-major) order."""
+    start = np.array(sparsity.colind(), dtype=np.intp)
+    columns = np.repeat(np.arange(sparsity.size2()), start[1:] - start[:-1])
+    return np.array(sparsity.row(), dtype=np.intp), columns
+
+
+@dataclass
+class Block:
+    """``count`` instances of a compiled function  out = f(z), its Jacobian and the Hessian of lambda.out."""
+
+    name: str
+    value: BatchedFunction
+    jacobian: BatchedFunction
+    hessian: BatchedFunction
+    n_in: int
+    n_out: int
+    count: int
+    lift: Affine  # (count * n_in)
+    jac_pattern: tuple[Index, Index]
+    hess_pattern: tuple[Index, Index]
+
+    @classmethod
+    def make(
+        cls,
+        name: str,
+        functions: dict[str, Any],
+        instances: Sequence[Sequence[Affine]],
+        parameters: ArrayLike,
+    ) -> Block:
+        """``instances``: the slots that make up z, one list an instance.
+
+        ``parameters``: (n_p,) for all or (count, n_p).
+        """
+        f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
+        n_in, n_out = f.size1_in(0), f.size1_out(0)
+        lifts = [stack(slots) for slots in instances]
+        for lift in lifts:
+            if lift.size != n_in:
+                raise ValueError(f"block {name} takes {n_in} inputs, was given {lift.size}")
+        count = len(lifts)
+        p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))
+        value, jacobian, hessian = (BatchedFunction(function, count) for function in (f, j, h))
+        for batched in (value, jacobian, hessian):
+            batched.inputs[1][...] = p
+        return cls(
+            name=name,
+            value=value,
+            jacobian=jacobian,
+            hessian=hessian,
+            n_in=n_in,
+            n_out=n_out,
+            count=count,
+            lift=stack(lifts),
+            jac_pattern=pattern(j.sparsity_out(0)),
+            hess_pattern=pattern(h.sparsity_out(0)),
+        )
+
+
+@dataclass(frozen=True)
+class Row:
+    """A constraint's origin: term, phase, place and component, and the time it belongs to."""
+
+    term: str
+    place: str
+    component: str
+
+    def __str__(self) -> str:
+        return ", ".join(p for p in (self.term, self.place, self.component) if p)
+
+
+@dataclass
+class Rows:
+    """Constraints under construction: each is at most one block output plus an affine expression of x."""
+
+    outputs: list[Index] = field(default_factory=list)
+    affine: list[Affine] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+    origins: list[Row] = field(default_factory=list)
+
+    def add(
+        self,
+        *,
+        term: str,
+        place: str = "",
+        components: Sequence[str],
+        outputs: Index | None = None,
+        affine: Affine | None = None,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+    ) -> None:
+        """Append ``len(components)`` rows  lower <= out[outputs] + affine <= upper.
+
+        Rows that are unbounded on both sides are dropped.
+        """
+        n = len(components)
+        lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
+        hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
+        keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
+        if not keep.size:
+            return
+        out = np.full(n, -1, dtype=np.intp) if outputs is None else np.asarray(outputs, dtype=np.intp)
+        lin = Affine.zeros(n) if affine is None else affine
+        if keep.size < n:
+            out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
+        self.outputs.append(out)
+        self.affine.append(lin)
+        self.lower.append(lo)
+        self.upper.append(hi)
+        self.origins.extend(Row(term, place, components[int(k)]) for k in keep)
+
+
+class StructuredProgram:
+    """The assembled program; implements :class:`impactopt.program.NonlinearProgram`."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        blocks: Sequence[Block],
+        rows: Rows,
+        *,
+        objective: Affine,
+        quadratic: sp.spmatrix | sp.sparray,
+        linear: Array,
+    ) -> None:
+        """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds."""
+        self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)
+        n = self.n = layout.n
+        self.x_lower, self.x_upper = layout.lower, layout.upper
+        lift = stack([b.lift for b in blocks])
+        self._lift, self._lift_const = lift.matrix(n), lift.const
+        self._z_offset = np.cumsum([0] + [b.count * b.n_in for b in blocks])
+        self._out_offset = np.cumsum([0] + [b.count * b.n_out for b in blocks])
+        linear_rows = stack(rows.affine)
+        self._row_out = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
+        self._nonlinear = np.flatnonzero(self._row_out >= 0)
+        self.m = len(self._row_out)
+        self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
+        self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
+        self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
+        self._c = np.zeros(n)
+        np.add.at(self._c, objective.cols, objective.vals)
+        self._c += linear
+        self._c0 = float(objective.const.sum())
+        self._Q = sp.csc_array(quadratic)
+        self._build_jacobian()
+        self._build_hessian()
+        self.seconds = 0.0
+        self._x: Array | None = None
+
+    # ------------------------------------------------------------------ constant maps
+    def _expand(self, z_index: Index) -> tuple[Index, Index, Array]:
+        """For lifted indices z: (position in z_index, x column, coefficient) of every term."""
+        S = self._lift
+        count = S.indptr[z_index + 1] - S.indptr[z_index]
+        owner = np.repeat(np.arange(len(z_index)), count)
+        start = np.repeat(S.indptr[z_index] - np.concatenate([[0], np.cumsum(count)[:-1]]), count)
+        where = start + np.arange(len(owner))
+        return owner, S.indices[where].astype(np.intp), S.data[where]
+
+    def _build_jacobian(self) -> None:
+        n_out = int(self._out_offset[-1])
+        row_of_out = np.full(n_out, -1, dtype=np.intp)
+        row_of_out[self._row_out[self._nonlinear]] = self._nonlinear
+        r_all, c_all, e_all, s_all, start = [], [], [], [], 0
+        for b, z0, o0 in zip(self.blocks, self._z_offset, self._out_offset, strict=False):
+            jr, jc = b.jac_pattern
+            inst = np.repeat(np.arange(b.count), len(jr))
+            out = o0 + inst * b.n_out + np.tile(jr, b.count)
+            z = z0 + inst * b.n_in + np.tile(jc, b.count)
+            entry = start + np.arange(len(out))
+            start += len(out)
+            keep = row_of_out[out] >= 0
+            owner, col, coef = self._expand(z[keep])
+            r_all.append(row_of_out[out[keep]][owner])
+            c_all.append(col)
+            e_all.append(entry[keep][owner])
+            s_all.append(coef)
+        lin = self._rows_matrix.tocoo()
+        r = np.concatenate([*r_all, lin.coords[0]])
+        c = np.concatenate([*c_all, lin.coords[1]])
+        nonlinear = sum(len(x) for x in r_all)
+        key, slot = np.unique(c.astype(np.int64) * self.m + r, return_inverse=True)
+        self._jac_rows, jac_cols = (key % self.m).astype(np.int32), key // self.m
+        self._jac_indptr = np.searchsorted(jac_cols, np.arange(self.n + 1)).astype(np.int32)
+        self._jac_map = sp.csr_array(
+            (
+                np.concatenate(s_all or [np.zeros(0)]),
+                (slot[:nonlinear], np.concatenate(e_all or [np.zeros(0, int)])),
+            ),
+            shape=(len(key), start),
+        )
+        self._jac_const = np.bincount(slot[nonlinear:], lin.data, len(key))
+
+    def _build_hessian(self) -> None:
+        r_all, c_all, e_all, s_all, start = [], [], [], [], 0
+        for b, z0 in zip(self.blocks, self._z_offset, strict=False):
+            hr, hc = b.hess_pattern  # lower triangle
+            inst = np.repeat(np.arange(b.count), len(hr))
+            zr, zc = z0 + inst * b.n_in + np.tile(hr, b.count), z0 + inst * b.n_in + np.tile(hc, b.count)
+            entry = start + np.arange(len(zr))
+            start += len(zr)
+            # rows' terms, then for each of them the columns' terms
+            o1, i1, s1 = self._expand(zr)
+            o2, i2, s2 = self._expand(zc[o1])
+            r, c, s, e = i1[o2], i2, s1[o2] * s2, entry[o1[o2]]
+            off = (zr != zc)[o1[o2]]
+            r_all += [r, c[off]]
+            c_all += [c, r[off]]
+            e_all += [e, e[off]]
+            s_all += [s, s[off]]
+        q = self._Q.tocoo()
+        r = np.concatenate([*r_all, q.coords[0]])
+        c = np.concatenate([*c_all, q.coords[1]])
+        nonlinear = sum(len(x) for x in r_all)
+        key, slot = np.unique(c.astype(np.int64) * self.n + r, return_inverse=True)
+        self._hess_rows, hess_cols = (key % self.n).astype(np.int32), key // self.n
+        self._hess_indptr = np.searchsorted(hess_cols, np.arange(self.n + 1)).astype(np.int32)
+        self._hess_map = sp.csr_array(
+            (
+                np.concatenate(s_all or [np.zeros(0)]),
+                (slot[:nonlinear], np.concatenate(e_all or [np.zeros(0, int)])),
+            ),
+            shape=(len(key), start),
+        )
+        self._hess_const = np.bincount(slot[nonlinear:], q.data, len(key))
+
+    # ------------------------------------------------------------------ evaluation
+    def _lifted(self, x: Array) -> list[Array]:
+        z = self._lift @ x + self._lift_const
+        return [
+            z[a : a + b.count * b.n_in].reshape(b.count, b.n_in)
+            for a, b in zip(self._z_offset, self.blocks, strict=False)
+        ]
+
+    def outputs(self, x: Array) -> dict[str, Array]:
+        """Every block's outputs, name -> (count, n_out)."""
+        return {b.name: b.value(z).copy() for b, z in zip(self.blocks, self._lifted(x), strict=True)}
+
+    def objective(self, x: Array) -> float:
+        return float(self._c0 + self._c @ x + 0.5 * (x @ (self._Q @ x)))
+
+    def gradient(self, x: Array) -> Array:
+        return self._c + self._Q @ x
+
+    def constraints(self, x: Array) -> Array:
+        t = time.perf_counter()
+        g = self._rows_matrix @ x + self._rows_const
+        if self.blocks:
+            out = np.concatenate(
+                [b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)]
+            )
+            g[self._nonlinear] += out[self._row_out[self._nonlinear]]
+        self.seconds += time.perf_counter() - t
+        return g
+
+    def jacobian(self, x: Array) -> sp.csc_array:
+        t = time.perf_counter()
+        data = self._jac_const.copy()
+        if self.blocks:
+            data += self._jac_map @ np.concatenate(
+                [b.jacobian(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)]
+            )
+        self.seconds += time.perf_counter() - t
+        return sp.csc_array((data, self._jac_rows, self._jac_indptr), shape=(self.m, self.n))
+
+    def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
+        t = time.perf_counter()
+        data = sigma * self._hess_const
+        if self.blocks:
+            lam = np.zeros(int(self._out_offset[-1]))
+            lam[self._row_out[self._nonlinear]] = multipliers[self._nonlinear]
+            parts = []
+            for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
+                parts.append(b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out)).ravel())
+            data = data + self._hess_map @ np.concatenate(parts)
+        self.seconds += time.perf_counter() - t
+        return sp.csc_array((data, self._hess_rows, self._hess_indptr), shape=(self.n, self.n))
+
+    # ------------------------------------------------------------------ names
+    def row_name(self, i: int) -> str:
+        return str(self.origins[i])
+
+    def variable_name(self, j: int) -> str:
+        return self.layout.name(j)
+
+
+def derivative_functions(name: str, z: Any, p: Any, out: Any) -> list[Any]:
+    """A block's three functions of (z, p).
+
+    ``name`` (z, p) -> out, ``name_jac`` (z, p) -> d out/dz,
+    ``name_hess`` (z, p, lam) -> lower triangle of d2(lam.out)/dz2.
+    """
+    lam = ca.SX.sym("lam", out.numel())
+    out = ca.densify(out)
+    jac = ca.jacobian(out, z)
+    hess = ca.tril(ca.jacobian(ca.gradient(ca.dot(lam, out), z), z))
+    opts = {"cse": True}
+    return [
+        ca.Function(name, [z, p], [out], opts),
+        ca.Function(f"{name}_jac", [z, p], [jac], opts),
+        ca.Function(f"{name}_hess", [z, p, lam], [hess], opts),
+    ]

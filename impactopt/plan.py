@@ -1,0 +1,216 @@
+"""The planned motion as numbers: references for the robot's servo, and what the plan predicts.
+
+This is the border to everything that checks, draws or executes a plan: arrays only, no CasADi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.coordinates import StanceCoordinates
+from impactopt.motion import CubicSpline
+from impactopt.problem import ImpactProblem
+from impactopt.support import margin, support_polygon, zmp
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """What the servo is given: nothing else of the plan reaches a simulation.
+
+    time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2 follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n) feed-forward [N m];
+    ground (k, 6) total ground wrench about the world's origin that the feed-forward assumes [N, N m].
+    contact_start, contact_end, end [s]: when the plan expects contact to begin and to end, and the motion to be over.
+    """
+
+    time: Array
+    phase: NDArray[np.intp]
+    q: Array
+    v: Array
+    a: Array
+    torque: Array
+    ground: Array
+    contact_start: float
+    contact_end: float
+    end: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedCollision:
+    """The collision that the plan predicts, at its m collocation points.
+
+    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s]; torque (m + 1, n) [N m], servo and
+    feed-forward; ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each sole's frame.
+    """
+
+    time: Array
+    force: Array
+    target_speed: Array
+    torque: Array
+    ground: Array
+    sole_wrench: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """A planned impact motion.
+
+    swing, follow : splines in the independent coordinates; compression, restitution [s].
+    swing_nodes (k,), swing_wrench (k, 6 a sole): where on [0, 1] the program had nodes, and the wrenches there, in each sole's frame [N, N m];
+    follow_nodes, follow_wrench likewise. The reference that coasts through the collision keeps the swing's last wrench.
+    hand_speed [m/s] along the normal at contact; impulse [N s] to the target.
+    """
+
+    problem: ImpactProblem
+    swing: CubicSpline
+    follow: CubicSpline
+    compression: float
+    restitution: float
+    swing_nodes: Array
+    swing_wrench: Array
+    follow_nodes: Array
+    follow_wrench: Array
+    collision: PlannedCollision
+    hand_speed: float
+    impulse: float
+
+    @property
+    def coordinates(self) -> StanceCoordinates:
+        return self.problem.coordinates
+
+    @property
+    def contact_start(self) -> float:
+        return self.swing.duration
+
+    @property
+    def contact_end(self) -> float:
+        return self.swing.duration + self.compression + self.restitution
+
+    @property
+    def duration(self) -> float:
+        """Start to rest [s]."""
+        return self.contact_end + self.follow.duration
+
+    @cached_property
+    def polygon(self) -> Array:
+        """Support polygon (k, 2) [m]."""
+        return support_polygon(self.problem.robot, self.coordinates)
+
+    def independent(self, phase: int, time: Array) -> tuple[Array, Array, Array, Array]:
+        """Reference y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) of a phase at times (k,) [s] since the motion's start.
+
+        phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through, then rest.
+        """
+        ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
+        if phase == 1:
+            end, rate, _ = self.swing.sample(self.contact_start)
+            y = end + rate * (ts[:, None] - self.contact_start)
+            return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), np.tile(self.swing_wrench[-1], (len(ts), 1))
+        curve, start, nodes, wrench = (
+            (self.swing, 0.0, self.swing_nodes, self.swing_wrench)
+            if phase == 0
+            else (self.follow, self.contact_end, self.follow_nodes, self.follow_wrench)
+        )
+        local = np.clip(ts - start, 0.0, curve.duration)
+        y, yd, ydd = curve.sample(local)
+        at = nodes * curve.duration
+        w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
+        return y, yd, ydd, w
+
+    def trajectory(self, *, step: float = 1e-3, hold: float = 0.5) -> Trajectory:
+        """The servo's reference about every ``step`` [s] from the start until ``hold`` [s] after the motion's end.
+
+        Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse dynamics under the planned
+        sole wrenches, corrected to balance the base exactly between the nodes.  The instants of contact and of its end are
+        there twice: the reference jumps from the coasting one to the predicted state.
+        """
+        t0, t1, end = self.contact_start, self.contact_end, self.duration + hold
+        legs = self.coordinates.split(self.problem.start_posture)[1]
+        parts = []
+        for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
+            times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
+            parts.append((phase, times, *complete_reference(self.problem, *self.independent(phase, times), legs)))
+            legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
+        phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
+        time, q, v, a_, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(1, 7))
+        # while in contact the feed-forward is held: the collision model counts on what makes the robot coast at contact
+        torque[phases == 1] = self.collision.torque[0]
+        return Trajectory(
+            time=time,
+            phase=phases,
+            q=q,
+            v=v,
+            a=a_,
+            torque=torque,
+            ground=ground,
+            contact_start=t0,
+            contact_end=t1,
+            end=self.duration,
+        )
+
+    def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:
+        """Planned ZMP margin [m] and torque demand over limit, each in swing, collision and follow-through."""
+        ref = self.trajectory() if trajectory is None else trajectory
+        limit = self.problem.robot.torque_limit
+        phase = ref.phase
+        grounds = [ref.ground[phase == 0], self.collision.ground, ref.ground[phase == 2]]
+        torques = [ref.torque[phase == 0], self.collision.torque, ref.torque[phase == 2]]
+        names = ("swing", "collision", "follow")
+        ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True)}
+        out = {"torque_ratio": ratio}
+        if len(self.polygon):
+            out["zmp_margin_m"] = {
+                n: float(margin(self.polygon, zmp(g)).min()) for n, g in zip(names, grounds, strict=True)
+            }
+        return out
+
+
+def complete_reference(
+    problem: ImpactProblem, y: Array, yd: Array, ydd: Array, wrench: Array, legs: Array
+) -> tuple[Array, ...]:
+    """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6) from independent coordinates and rates.
+
+    wrench (k, 6 a sole) is corrected as little as it takes to balance the base; legs (nl,) starts their inverse kinematics.
+    """
+    c, robot = problem.coordinates, problem.robot
+    model, data = robot.model, robot.model.createData()
+    n = len(y)
+    q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
+    torque, ground = np.zeros((n, robot.n)), np.zeros((n, 6))
+    # least correction of the interpolated wrenches, moments dear: the share between the soles stays the planned one
+    scale = np.array([1, 1, 1, 10, 10, 10] * len(c.legs))
+    for k in range(n):
+        legs = c.solve_legs(y[k], legs)
+        q[k], v[k], a[k] = c.complete_motion(y[k], yd[k], ydd[k], legs)
+        tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
+        if c.legs:
+            jac, place = c.sole_jacobians(q[k])
+            base = jac[:, :6].T / scale
+            miss = tau[:6] - jac[:, :6].T @ wrench[k]
+            w = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / scale
+            tau = tau - jac.T @ w
+            ground[k] = _about_origin(place, w)
+        torque[k] = tau[c.base :]
+    return q, v, a, torque, ground
+
+
+def _about_origin(placements: list[pin.SE3], wrenches: Array) -> Array:
+    """Sum of sole wrenches (each in its sole's frame) as one wrench about the world's origin, world axes."""
+    total = np.zeros(6)
+    for k, m in enumerate(placements):
+        f = m.rotation @ wrenches[6 * k : 6 * k + 3]
+        total[:3] += f
+        total[3:] += m.rotation @ wrenches[6 * k + 3 : 6 * k + 6] + np.cross(m.translation, f)
+    return total
+
+
+def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
+    """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches, soles where they are held."""
+    placements = [leg.placement for leg in coordinates.legs]
+    return np.array([_about_origin(placements, w) for w in wrenches])

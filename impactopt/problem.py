@@ -1,0 +1,165 @@
+"""The declarative problem: which robot hits what, where, and what it must respect meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import FreeMass
+from impactopt.coordinates import StanceCoordinates
+from impactopt.errors import InputError, check_array
+from impactopt.reach import reach
+from impactopt.robot import Robot
+from impactopt.stance import BothSoles, Stance
+from impactopt.terms import DEFAULT_TERMS, Term
+
+Array = NDArray[np.float64]
+AnyTerm = TypeVar("AnyTerm", bound=Term)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """A phase of the motion: its duration and its spline.
+
+    ``duration`` [s] : (shortest, longest) or one number.  ``intervals`` : of the spline.
+    ``grading``: longest over shortest interval, the short ones at the contact. The program's nodes are the
+    intervals' ends and middles.
+    """
+
+    duration: tuple[float, float]
+    intervals: int = 14
+    grading: float = 3.0
+
+    def __post_init__(self) -> None:
+        duration = (self.duration,) * 2 if isinstance(self.duration, (int, float)) else tuple(self.duration)
+        if len(duration) != 2 or not 0 < duration[0] <= duration[1]:
+            raise InputError(
+                f"a phase's duration [s] is one positive number or (shortest, longest), not {self.duration}"
+            )
+        object.__setattr__(self, "duration", tuple(float(d) for d in duration))
+        if not self.grading >= 1:
+            raise InputError(f"a phase's grading must be at least 1, not {self.grading}")
+        if self.intervals < 6:
+            raise InputError(f"a phase needs at least 6 spline intervals, not {self.intervals}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImpactProblem:
+    """Maximize the impulse that ``robot`` gives to ``target`` with ``striker``.
+
+    Attributes
+    ----------
+    robot, striker : who hits, and with which of its strikers.
+    point (3,) [m] : where the striking point meets the target, world; the ground is z = 0 and the start
+        posture's soles are centred on the origin.
+    normal (3,) : unit vector of the blow, world: the target is pushed along it.
+    law, target : contact law and target body.
+    stance : which soles are held.
+    start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
+        configuration (nq,).
+    swing, follow : wind-up and strike; follow-through to rest.
+    contact_duration : bounds [s] of each of compression and restitution.
+    collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
+        sum to 1.
+    terms : what must hold; kinds that are not given take their defaults.
+    smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches. Both only
+        make the optimum unique.
+
+    Raises
+    ------
+    InputError : one clear message for a NaN, a wrong shape, an unknown striker or posture, a normal that is
+        not a unit vector, a start posture outside its limits or off the ground, a point out of reach.
+    """
+
+    robot: Robot
+    striker: str
+    point: Array
+    normal: Array
+    law: ContactLaw
+    target: FreeMass
+    stance: Stance = field(default_factory=BothSoles)
+    start: str | Array = "half_sitting"
+    swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
+    follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
+    contact_duration: tuple[float, float] = (0.002, 0.2)
+    collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.15, 0.35, 0.5), (0.3, 0.3, 0.4))
+    collision_stages: int = 2
+    terms: tuple[Term, ...] = ()
+    smoothness: float = 2e-6
+    wrench_price: float = 1e-3
+    name: str = "impact"
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        self.robot.striker(self.striker)
+        put(self, "point", check_array("point", self.point, (3,)))
+        normal = check_array("normal", self.normal, (3,))
+        if abs(np.linalg.norm(normal) - 1) > 1e-6:
+            unit = normal / max(float(np.linalg.norm(normal)), 1e-300)
+            raise InputError(
+                f"normal must be a unit vector, its length is {np.linalg.norm(normal):.6g}: did you mean "
+                f"{np.round(unit, 6).tolist()}?"
+            )
+        put(self, "normal", normal / np.linalg.norm(normal))
+        for lengths in self.collision_elements:
+            if not lengths or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
+                raise InputError(
+                    f"collision_elements must be positive fractions that sum to 1, not {lengths}"
+                )
+        lo, hi = self.contact_duration
+        if not 0 < lo <= hi:
+            raise InputError(
+                f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
+            )
+        kinds = [type(t) for t in self.terms]
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise InputError(f"two terms of kind {kind.__name__}: give one")
+        posture = self.start_posture
+        self.robot.check_limits(posture, name="the start posture")
+        self.robot.check_stance(posture, self.stance.sole_names(self.robot))
+        _ = self.contact_posture
+
+    def term(self, kind: type[AnyTerm]) -> AnyTerm:
+        """The term of a kind: the problem's own, or the default."""
+        for t in (*self.terms, *DEFAULT_TERMS):
+            if isinstance(t, kind):
+                return t
+        raise InputError(f"unknown kind of term {kind.__name__}")
+
+    @cached_property
+    def start_posture(self) -> Array:
+        """pin configuration (nq,) of the start."""
+        if isinstance(self.start, str):
+            return np.array(self.robot.posture(self.start))
+        return self.robot.check_configuration(self.start, name="the start posture")
+
+    @cached_property
+    def coordinates(self) -> StanceCoordinates:
+        """Independent coordinates of the stance at the start posture."""
+        return StanceCoordinates(self.robot, self.stance.soles(self.robot), self.start_posture)
+
+    @cached_property
+    def contact_posture(self) -> Array:
+        """Some posture (nq,) with the striking point at ``point`` and the soles in place.
+
+        Raises InputError if none is found: the point is out of reach.
+        """
+        return reach(self.coordinates, self.striker, self.point, self.start_posture)
+
+    def describe(self) -> dict[str, Any]:
+        """The problem in a few plain words and numbers, for reports."""
+        return {
+            "name": self.name,
+            "robot": self.robot.name,
+            "striker": self.striker,
+            "point_m": self.point.tolist(),
+            "normal": self.normal.tolist(),
+            "target": repr(self.target),
+            "law": repr(self.law),
+        }

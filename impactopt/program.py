@@ -1,0 +1,298 @@
+"""What a nonlinear program is to our solvers, and what a solver gives back.
+
+The border between the symbolic and the numeric half of the package: everything below it is NumPy and SciPy.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from impactopt.errors import InputError, check_array
+
+Vector = npt.NDArray[np.float64]
+Matrix = Any  # scipy.sparse.csc_array; SciPy ships no types
+
+
+@runtime_checkable
+class NonlinearProgram(Protocol):
+    """Minimize f(x) subject to g_lower <= g(x) <= g_upper and x_lower <= x <= x_upper.
+
+    Equal bounds make an equality; +-inf means no bound. Shapes: x (n,), g (m,). The Lagrangian is
+    L = f + multipliers . g + bound_multipliers . x, so that a multiplier is positive where an upper bound
+    holds and negative where a lower one does.
+
+    Attributes
+    ----------
+    n, m : number of variables and of rows.
+    x_lower, x_upper : bounds of the variables (n,).
+    g_lower, g_upper : bounds of the rows (m,).
+    """
+
+    n: int
+    m: int
+    x_lower: Vector
+    x_upper: Vector
+    g_lower: Vector
+    g_upper: Vector
+
+    def objective(self, x: Vector) -> float:
+        """f(x)."""
+        ...
+
+    def gradient(self, x: Vector) -> Vector:
+        """df/dx, (n,)."""
+        ...
+
+    def constraints(self, x: Vector) -> Vector:
+        """g(x), (m,)."""
+        ...
+
+    def jacobian(self, x: Vector) -> Matrix:
+        """dg/dx as scipy.sparse.csc_array (m, n), with the same pattern at every x."""
+        ...
+
+    def hessian(self, x: Vector, sigma: float, multipliers: Vector) -> Matrix:
+        """Hessian of sigma f + multipliers . g, full symmetric csc_array (n, n), always the same pattern."""
+        ...
+
+    def row_name(self, i: int) -> str:
+        """What row i of g is to the reader: "torque limit, swing, node 7, arm_right_4_joint"."""
+        ...
+
+    def variable_name(self, j: int) -> str:
+        """What entry j of x is to the reader."""
+        ...
+
+
+class Status(enum.Enum):
+    """How a solver ended."""
+
+    SOLVED = "solved"
+    ACCEPTABLE = "acceptable"
+    ITERATION_LIMIT = "iteration_limit"
+    TIME_LIMIT = "time_limit"
+    INFEASIBLE = "infeasible"
+    INTERRUPTED = "interrupted"
+    FAILED = "failed"
+
+    @property
+    def message(self) -> str:
+        """The status as a sentence."""
+        return _MESSAGES[self]
+
+    @property
+    def usable(self) -> bool:
+        """Whether the iterate meets the solver's tolerances, or nearly so (SOLVED, ACCEPTABLE)."""
+        return self in (Status.SOLVED, Status.ACCEPTABLE)
+
+
+_MESSAGES = {
+    Status.SOLVED: "Solved: a local optimum within the tolerances.",
+    Status.ACCEPTABLE: "Solved to an acceptable level: near a local optimum, not within the tolerances.",
+    Status.ITERATION_LIMIT: "Stopped at the iteration limit; the best iterate so far is returned.",
+    Status.TIME_LIMIT: "Stopped at the time limit; the best iterate so far is returned.",
+    Status.INFEASIBLE: "Infeasible: no point near by meets all rows; the least violation is returned.",
+    Status.INTERRUPTED: "Interrupted; the best iterate so far is returned.",
+    Status.FAILED: "The solver gave up; the best iterate so far is returned.",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class IterationRecord:
+    """One iteration of a solver, as given to progress callbacks and kept in the history.
+
+    Attributes
+    ----------
+    iteration : number, from 0 (the start).
+    objective : f(x).
+    max_violation : largest violation of a row or a bound, in the units of the rows.
+    kkt : scaled stationarity (see `stationarity`); nan where the solver does not know it.
+    step : largest absolute entry of the step that led here.
+    seconds : time since the start of the solve [s].
+    note : a few words of the solver's own: trust region, QP iterations, second-order correction.
+    """
+
+    iteration: int
+    objective: float
+    max_violation: float
+    kkt: float
+    step: float
+    seconds: float
+    note: str = ""
+
+
+Callback = Callable[[IterationRecord], Any]
+"""Called once an iteration; True or KeyboardInterrupt from it stops the solver with its best iterate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverResult:
+    """The iterate a solver ended with; the best one if it did not converge.
+
+    Attributes
+    ----------
+    x : variables (n,).
+    multipliers : of the rows (m,), positive where an upper bound holds.
+    bound_multipliers : of the variables' bounds (n,), likewise.
+    objective : f(x).
+    status : how it ended.
+    iterations : number of iterations.
+    seconds : wall time; seconds_functions: of that in the program's functions; seconds_qp: of that in the QP
+        solver.
+    max_violation : largest violation of a row or a bound, in the units of the rows.
+    kkt : scaled stationarity (see `stationarity`).
+    message : a sentence, with the rows that cannot be met by name where there are any.
+    history : one record an iteration.
+    """
+
+    x: Vector
+    multipliers: Vector
+    bound_multipliers: Vector
+    objective: float
+    status: Status
+    iterations: int
+    seconds: float
+    seconds_functions: float
+    seconds_qp: float
+    max_violation: float
+    kkt: float
+    message: str
+    history: tuple[IterationRecord, ...] = field(default=(), repr=False)
+
+
+def check_program(program: NonlinearProgram, x0: npt.ArrayLike) -> Vector:
+    """Check bounds and start once, before a solver sees them, and give the start as float64 (n,).
+
+    Raises
+    ------
+    InputError : wrong shapes, NaN, crossing bounds; the message names the row or variable.
+    """
+    n, m = program.n, program.m
+    sides = (("x", n, program.variable_name), ("g", m, program.row_name))
+    for kind, size, name in sides:
+        lower = check_array(f"{kind}_lower", getattr(program, f"{kind}_lower"), (size,), finite=False)
+        upper = check_array(f"{kind}_upper", getattr(program, f"{kind}_upper"), (size,), finite=False)
+        # The comparison is written so that NaN fails it too.
+        bad = np.flatnonzero(~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
+        if bad.size:
+            i = int(bad[0])
+            raise InputError(
+                f"the bounds of '{name(i)}' ({kind}[{i}]) leave no value: "
+                f"lower {lower[i]:g}, upper {upper[i]:g}; the lower bound must not exceed the upper"
+            )
+    return check_array("x0", x0, (n,))
+
+
+def row_violations(program: NonlinearProgram, g: Vector) -> Vector:
+    """By how much each row is outside its bounds, (m,), >= 0; nan where g is nan."""
+    return np.maximum(np.maximum(program.g_lower - g, g - program.g_upper), 0.0)
+
+
+def bound_violations(program: NonlinearProgram, x: Vector) -> Vector:
+    """By how much each variable is outside its bounds, (n,), >= 0."""
+    return np.maximum(np.maximum(program.x_lower - x, x - program.x_upper), 0.0)
+
+
+def max_violation(program: NonlinearProgram, x: Vector, g: Vector) -> float:
+    """Largest violation of a row or a bound at x with g = g(x); inf if any is nan."""
+    rows, bounds = row_violations(program, g), bound_violations(program, x)
+    worst = max(float(np.max(rows, initial=0.0)), float(np.max(bounds, initial=0.0)))
+    finite = not (np.isnan(rows).any() or np.isnan(bounds).any())
+    return worst if finite else np.inf
+
+
+def stationarity(gradient: Vector, jacobian: Matrix, multipliers: Vector, bound_multipliers: Vector) -> float:
+    """Scaled stationarity |grad f + J' y + z|_inf / s, s = max(100, mean |(y, z)|) / 100.
+
+    The scale is IPOPT's (Waechter and Biegler 2006, eq. 6): large multipliers would else make the tolerance
+    unreachable.
+    """
+    total = multipliers.size + bound_multipliers.size
+    mean = (np.abs(multipliers).sum() + np.abs(bound_multipliers).sum()) / max(total, 1)
+    residual = gradient + jacobian.T @ multipliers + bound_multipliers
+    return float(np.max(np.abs(residual), initial=0.0) / (max(100.0, mean) / 100.0))
+
+
+def complementarity(
+    program: NonlinearProgram, x: Vector, g: Vector, multipliers: Vector, bound_multipliers: Vector
+) -> float:
+    """Largest |multiplier| x distance to the bound it belongs to; inf where that bound does not exist."""
+    value = np.concatenate([g, x])
+    lower = np.concatenate([program.g_lower, program.x_lower])
+    upper = np.concatenate([program.g_upper, program.x_upper])
+    y = np.concatenate([multipliers, bound_multipliers])
+    gap = np.where(y > 0, np.abs(upper - value), np.abs(value - lower))
+    return float(np.max(np.abs(y[y != 0]) * gap[y != 0], initial=0.0))
+
+
+def is_stationary_violation(
+    program: NonlinearProgram, x: Vector, g: Vector, jacobian: Matrix, tolerance: float = 1e-3
+) -> bool:
+    """Whether no small step lessens the violation 1/2 |v|^2 of the rows: a locally infeasible point.
+
+    True if the gradient J' v, without the part that only the variables' bounds hold, is small beside |J||v|.
+    """
+    v = np.maximum(g - program.g_upper, 0.0) - np.maximum(program.g_lower - g, 0.0)
+    slope = jacobian.T @ v
+    margin = 1e-6 * (1.0 + np.abs(x))
+    held = ((x >= program.x_upper - margin) & (slope < 0)) | ((x <= program.x_lower + margin) & (slope > 0))
+    slope = np.where(held, 0.0, slope)
+    row_norms = np.sqrt(np.asarray(jacobian.multiply(jacobian).sum(axis=1)).ravel())
+    return bool(np.linalg.norm(slope) <= tolerance * max(float(row_norms @ np.abs(v)), 1e-300))
+
+
+def worst_rows(
+    program: NonlinearProgram, x: Vector, g: Vector, *, tolerance: float, count: int = 5
+) -> list[tuple[str, float]]:
+    """Names and violations of what is violated by more than the tolerance, largest first."""
+    violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
+    violations = np.where(np.isnan(violations), np.inf, violations)
+    order = [int(i) for i in np.argsort(-violations, kind="stable")[:count] if violations[i] > tolerance]
+    m = program.m
+    return [
+        (program.row_name(i) if i < m else f"bound of {program.variable_name(i - m)}", float(violations[i]))
+        for i in order
+    ]
+
+
+def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
+    """The status as a sentence, followed by the violated rows by name."""
+    rows = worst_rows(program, x, g, tolerance=tolerance)
+    if not rows:
+        return status.message
+    listed = "; ".join(f"{name} (by {violation:.3g})" for name, violation in rows)
+    heading = "Rows that cannot be met" if status is Status.INFEASIBLE else "Rows not met"
+    more = int(
+        np.sum(~(row_violations(program, g) <= tolerance))
+        + np.sum(~(bound_violations(program, x) <= tolerance))
+    )
+    tail = f"; and {more - len(rows)} more" if more > len(rows) else ""
+    return f"{status.message} {heading}: {listed}{tail}."
+
+
+class BestIterate:
+    """Keeps the best point a solver has seen: least violation; among points that meet the rows, least f."""
+
+    def __init__(self, program: NonlinearProgram, tolerance: float):
+        self._program, self._tolerance = program, tolerance
+        self.x: Vector | None = None
+        self.g: Vector | None = None
+        self.objective = np.inf
+        self.violation = np.inf
+
+    def consider(self, x: Vector, objective: float, g: Vector) -> bool:
+        """Keep (x, f, g) if it is better than what is kept; points that are not finite never are."""
+        if not (np.isfinite(objective) and np.isfinite(g).all()):
+            return False
+        violation = max_violation(self._program, x, g)
+        rank = (max(violation, self._tolerance), objective)
+        if self.x is not None and rank >= (max(self.violation, self._tolerance), self.objective):
+            return False
+        self.x, self.g, self.objective, self.violation = x.copy(), g.copy(), objective, violation
+        return True

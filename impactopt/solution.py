@@ -1,0 +1,103 @@
+"""What a solve gives back, and the record that it leaves on disk."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt import __version__
+from impactopt.errors import InputError
+from impactopt.plan import Plan, Trajectory
+from impactopt.problem import ImpactProblem
+from impactopt.program import SolverResult, Status
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """A solved (or stopped) impact problem.
+
+    plan : the motion; for a status that is not usable, that of the best iterate.
+    result : the solver's own record, its history included.
+    build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver.
+    violations : named rows that are not met, worst first, as (name, amount).
+    """
+
+    problem: ImpactProblem
+    plan: Plan
+    result: SolverResult
+    solver: str
+    build_seconds: float
+    solve_seconds: float
+    violations: tuple[tuple[str, float], ...]
+
+    @property
+    def status(self) -> Status:
+        return self.result.status
+
+    @property
+    def impulse(self) -> float:
+        """Planned impulse to the target [N s]."""
+        return self.plan.impulse
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The servo's reference, sampled."""
+        return self.plan.trajectory()
+
+    def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
+        """Re-simulate the plan in full dynamics; a :class:`impactopt.validation.Simulation`.
+
+        options : of the engine, such as ``step`` [s].
+
+        Raises
+        ------
+        InputError : an unknown engine; a contact law or target that the engine does not have.
+        """
+        from impactopt.validation import scene_of, simulate_pinocchio
+
+        if engine != "pinocchio":
+            raise InputError(f"unknown engine {engine!r}: there is 'pinocchio'")
+        return simulate_pinocchio(self.problem.robot, self.trajectory, scene_of(self.problem), **options)
+
+    def summary(self, simulation: Any | None = None) -> dict[str, Any]:
+        """The numbers of ``summary.json``; ``simulated`` is there when a simulation is given."""
+        plan = self.plan
+        out: dict[str, Any] = {
+            "status": self.status.value,
+            "message": self.result.message,
+            "solver": self.solver,
+            "iterations": self.result.iterations,
+            "solve_seconds": self.solve_seconds,
+            "build_seconds": self.build_seconds,
+            "max_violation": self.result.max_violation,
+            "violations": [{"row": name, "amount": amount} for name, amount in self.violations],
+            "impulse_Ns": plan.impulse,
+            "peak_force_N": float(plan.collision.force.max()),
+            "contact_ms": 1e3 * (plan.compression + plan.restitution),
+            "hand_speed_m_s": plan.hand_speed,
+            "duration_s": plan.duration,
+            **plan.margins(self.trajectory),
+            "problem": self.problem.describe(),
+            "versions": versions(),
+        }
+        if simulation is not None:
+            out["simulated"] = simulation.summary(
+                torque_limit=self.problem.robot.torque_limit,
+                polygon=plan.polygon,
+                planned_impulse=plan.impulse,
+            )
+        return out
+
+
+def versions() -> dict[str, str]:
+    """Versions of what made the numbers."""
+    names = ("casadi", "pin", "numpy", "scipy", "osqp")
+    return {"impactopt": __version__, "python": platform.python_version(), **{n: version(n) for n in names}}

@@ -1,0 +1,16 @@
+"""Our SQP: a nonlinear program by a sequence of quadratic ones; NumPy, SciPy and a QP solver only."""
+
+from impactopt.sqp.loop import solve_sqp
+from impactopt.sqp.options import SQPOptions
+from impactopt.sqp.qp import QP_SOLVERS, QPSolution, QPSolver, QPStatus, QuadraticProgram, make_qp_solver
+
+__all__ = [
+    "QP_SOLVERS",
+    "QPSolution",
+    "QPSolver",
+    "QPStatus",
+    "QuadraticProgram",
+    "SQPOptions",
+    "make_qp_solver",
+    "solve_sqp",
+]

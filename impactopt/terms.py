@@ -1,0 +1,111 @@
+"""What a plan must respect, as named terms with units.  A problem holds one of each kind at most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+from impactopt.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Term:
+    """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its rows."""
+
+    name: ClassVar[str] = ""
+    unit: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, (int, float)) and not value >= 0:
+                raise InputError(f"{type(self).__name__}.{f.name} must not be negative, it is {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueLimit(Term):
+    """|torque| <= fraction x the joint's limit: headroom for the servo.
+
+    ``collision`` : the fraction while in contact.
+    """
+
+    name: ClassVar[str] = "torque limit"
+    unit: ClassVar[str] = "of limit"
+    fraction: float = 0.85
+    collision: float = 0.85
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityLimit(Term):
+    """|joint velocity| <= fraction x limit, everywhere.
+
+    On the spline's velocity control points; the legs at the nodes.
+    """
+
+    name: ClassVar[str] = "velocity limit"
+    unit: ClassVar[str] = "of limit"
+    fraction: float = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionLimit(Term):
+    """Joint positions stay ``margin`` [rad] inside their limits, everywhere.
+
+    On the spline's control points; the legs at the nodes.
+    """
+
+    name: ClassVar[str] = "position limit"
+    unit: ClassVar[str] = "rad"
+    margin: float = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactWrenchCone(Term):
+    """Each sole's wrench lies in the cone of its corners: CoP, friction and torsion together.
+
+    Source: Caron et al. 2015, see :mod:`impactopt.cone`.
+
+    friction: coefficient that the plan may use; margin [m]: distance of the CoP from the sole's edges;
+    minimum_force [N] a sole.
+    """
+
+    name: ClassVar[str] = "contact wrench cone"
+    unit: ClassVar[str] = "of weight"
+    friction: float = 0.6
+    margin: float = 0.02
+    collision_margin: float = 0.02
+    minimum_force: float = 50.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balance(Term):
+    """What may be left after the impact.
+
+    capture_margin [m]: distance of the capture point from the support polygon's edges; vertical_speed [m/s]
+    of the centre of mass; angular_momentum [N m s] about each axis through the centre of mass.
+    """
+
+    name: ClassVar[str] = "balance after impact"
+    unit: ClassVar[str] = "m, m/s, N m s"
+    capture_margin: float = 0.02
+    vertical_speed: float = 0.2
+    angular_momentum: float = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Incidence(Term):
+    """The striking point's speed across the normal at contact is at most ``speed`` [m/s]."""
+
+    name: ClassVar[str] = "incidence"
+    unit: ClassVar[str] = "m/s"
+    speed: float = 0.05
+
+
+DEFAULT_TERMS: tuple[Term, ...] = (
+    TorqueLimit(),
+    VelocityLimit(),
+    PositionLimit(),
+    ContactWrenchCone(),
+    Balance(),
+    Incidence(),
+)

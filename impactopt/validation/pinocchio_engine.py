@@ -1,0 +1,217 @@
+"""Full dynamics in numeric Pinocchio.
+
+Soles are bilateral constraints, the servo saturates, contact with a free mass is a spring-damper. Shares no
+code with the planner: it reads a reference (times, positions, velocities, feed-forward), the
+robot's numbers and the scene's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robot import Robot
+from impactopt.validation.result import Scene, Simulation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _State:
+    q: Array
+    v: Array
+    x: float  # the target's travel [m]
+    vt: float  # and speed [m/s]
+
+
+@dataclass(frozen=True)
+class _Rates:
+    v: Array
+    a: Array
+    vt: float
+    at: float
+    force: float
+    hand_speed: float
+    demand: Array
+    torque: Array
+
+
+class _World:
+    def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
+        self.robot, self.scene = robot, scene
+        self.model, self.data = robot.model, robot.model.createData()
+        self.base = robot.model.nv - robot.n
+        self.hand = self.model.getFrameId(scene.striker)
+        self.time = np.asarray(reference.time)
+        joints = list(self.model.joints)[-robot.n :]
+        self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
+        # a continuous joint's angle is kept as (cosine, sine)
+        self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
+        angles = np.array([self.angles(q) for q in reference.q])
+        angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
+        self.reference = np.hstack([angles, reference.v[:, -robot.n :], reference.torque])
+        self.contacts = pin.StdVec_RigidConstraintModel()
+        for name in scene.soles:
+            frame = self.model.frames[self.model.getFrameId(name)]
+            self.contacts.append(
+                pin.RigidConstraintModel(
+                    pin.ContactType.CONTACT_6D,
+                    self.model,
+                    frame.parentJoint,
+                    frame.placement,
+                    0,
+                    pin.SE3.Identity(),
+                    pin.LOCAL,
+                )
+            )
+        self.contact_data = pin.StdVec_RigidConstraintData()
+        for contact in self.contacts:
+            self.contact_data.append(contact.createData())
+        pin.initConstraintDynamics(self.model, self.data, self.contacts, self.contact_data)
+        self.proximal = pin.ProximalSettings(1e-12, 1e-12, 1)
+        self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
+        self.touched = self.released = False
+
+    def angles(self, q: Array) -> Array:
+        """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""
+        out = q[self.place]
+        for k in self.continuous:
+            out[k] = np.arctan2(q[self.place[k] + 1], q[self.place[k]])
+        return out
+
+    def servo(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Torque demand and the torque after saturation."""
+        # an instant that stands twice is a jump of the reference; "right" takes what comes after it
+        i = min(max(int(np.searchsorted(self.time, t, side="right")) - 1, 0), len(self.time) - 2)
+        f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
+        row = (1 - f) * self.reference[i] + f * self.reference[i + 1]
+        n, r = self.robot.n, self.robot
+        error = row[:n] - self.angles(q)
+        error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
+        demand = row[2 * n :] + r.kp * error + r.kd * (row[n : 2 * n] - v[-n:])
+        return demand, np.clip(demand, -r.torque_limit, r.torque_limit)
+
+    def rates(self, t: float, s: _State) -> _Rates:
+        model, data, scene = self.model, self.data, self.scene
+        pin.computeJointJacobians(model, data, s.q)
+        jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)[:3]
+        point = pin.updateFramePlacement(model, data, self.hand).translation
+        row = scene.normal @ jac
+        speed = float(row @ s.v)
+        depth = float(scene.normal @ (point - scene.point)) - s.x
+        approach = speed - s.vt
+        force = (
+            scene.stiffness * depth + scene.damping * max(approach, 0.0)
+            if depth > 0 and not self.released
+            else 0.0
+        )
+        demand, torque = self.servo(t, s.q, s.v)
+        tau = -row * force
+        tau[self.base :] += torque
+        if self.sole_ids:
+            a = pin.constraintDynamics(
+                model, data, s.q, s.v, tau, self.contacts, self.contact_data, self.proximal
+            )
+        else:
+            a = pin.aba(model, data, s.q, s.v, tau)
+        return _Rates(s.v.copy(), np.array(a), s.vt, force / scene.mass, force, speed, demand, torque)
+
+    def ground(self) -> Array:
+        """Ground wrench about the world's origin of the last call of ``rates``."""
+        total = np.zeros(6)
+        for k, i in enumerate(self.sole_ids):
+            m = pin.updateFramePlacement(self.model, self.data, i)
+            wrench = self.data.lambda_c[6 * k : 6 * k + 6]
+            force = m.rotation @ wrench[:3]
+            total[:3] += force
+            total[3:] += m.rotation @ wrench[3:] + np.cross(m.translation, force)
+        return total
+
+    def soles(self) -> Array:
+        return np.array(
+            [pin.updateFramePlacement(self.model, self.data, i).translation for i in self.sole_ids]
+        )
+
+    def advance(self, s: _State, r: _Rates, h: float) -> _State:
+        return _State(pin.integrate(self.model, s.q, h * r.v), s.v + h * r.a, s.x + h * r.vt, s.vt + h * r.at)
+
+
+def simulate_pinocchio(
+    robot: Robot, reference: Any, scene: Scene, *, step: float = 1e-4, settle: float = 0.3, record: int = 5
+) -> Simulation:
+    """The whole motion from the reference's first posture at rest, in constrained forward dynamics.
+
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of :class:`impactopt.plan.Trajectory`.
+    step [s] : of the explicit midpoint rule (second order).  settle [s] : simulated beyond the end of the
+        reference's motion.
+    record : steps between recorded instants; every step is recorded in contact.
+
+    Raises
+    ------
+    InputError : the simulation diverges (with the time at which it did).
+    """
+    world = _World(robot, scene, reference)
+    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, 0.0)
+    end = float(reference.end) + settle
+    rows: list[tuple[Any, ...]] = []
+    start_soles: Array | None = None
+    contact_start = contact_end = np.nan
+    for k in range(round(end / step)):
+        t = k * step
+        first = world.rates(t, state)
+        ground, soles = world.ground(), world.soles()
+        start_soles = soles if start_soles is None else start_soles
+        if first.force > 0 and not world.touched:
+            world.touched, contact_start = True, t
+        if world.touched and not world.released and first.force <= 0 and t > contact_start + 2 * step:
+            world.released, contact_end = True, t
+        in_contact = world.touched and not world.released
+        if in_contact or k % record == 0:
+            drift = float(np.linalg.norm(soles - start_soles, axis=1).max()) if len(soles) else 0.0
+            rows.append(
+                (
+                    t,
+                    state.q,
+                    first.force,
+                    state.vt,
+                    first.hand_speed,
+                    first.demand,
+                    first.torque,
+                    ground,
+                    drift,
+                )
+            )
+        middle = world.rates(t + step / 2, world.advance(state, first, step / 2))
+        state = _State(
+            pin.integrate(robot.model, state.q, step * middle.v),
+            state.v + step * middle.a,
+            state.x + step * middle.vt,
+            state.vt + step * middle.at,
+        )
+        if not np.all(np.isfinite(state.v)) or np.abs(state.v).max() > 1e4:
+            raise InputError(
+                f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or softer "
+                "gains"
+            )
+    columns = [np.array(c) for c in zip(*rows, strict=True)]
+    time, q, force, vt, hand, demand, torque, ground, drifts = columns
+    return Simulation(
+        engine="pinocchio",
+        time=time,
+        q=q,
+        force=force,
+        target_speed=vt,
+        hand_speed=hand,
+        demand=demand,
+        torque=torque,
+        ground=ground,
+        drift=drifts,
+        contact_start=contact_start,
+        contact_end=contact_end,
+        mass=scene.mass,
+    )

@@ -1,0 +1,115 @@
+"""Small robots made in memory: quick to build functions for, and simple enough for closed forms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from impactopt.robot import Robot, Sole, Striker
+
+HALF_SITTING = {"hip pitch": -0.4, "knee": 0.8, "ankle pitch": -0.4}
+
+
+def _placement(x: float, y: float, z: float) -> Any:
+    return pin.SE3(np.eye(3), np.array([x, y, z]))
+
+
+def _body(mass: float, *size: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Any:
+    inertia = pin.Inertia.FromBox(mass, *size)
+    return pin.Inertia(mass, np.array(at), inertia.inertia)
+
+
+def biped() -> Robot:
+    """A 40 kg biped: two legs of six joints with box soles, one arm of three joints; 15 joints, 21 velocities."""
+    model = pin.Model()
+    model.name = "small biped"
+    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
+    model.appendBodyToJoint(root, _body(22.0, 0.2, 0.3, 0.5, at=(0.01, -0.01, 0.25)), pin.SE3.Identity())
+    x, y, z = pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ
+    leg: list[tuple[str, Any, tuple[float, float, float], Any]] = [
+        ("hip yaw", z, (0.0, 0.1, -0.05), _body(0.5, 0.1, 0.1, 0.1)),
+        ("hip roll", x, (0.0, 0.0, -0.02), _body(0.5, 0.1, 0.1, 0.1)),
+        ("hip pitch", y, (0.02, 0.0, 0.0), _body(3.0, 0.1, 0.1, 0.35, at=(0.01, 0.0, -0.17))),
+        ("knee", y, (0.0, 0.0, -0.35), _body(2.0, 0.08, 0.08, 0.35, at=(0.0, 0.01, -0.16))),
+        ("ankle pitch", y, (0.0, 0.0, -0.35), _body(0.4, 0.08, 0.08, 0.08)),
+        ("ankle roll", x, (0.0, 0.0, -0.01), _body(1.0, 0.2, 0.1, 0.05, at=(0.03, 0.0, -0.03))),
+    ]
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        parent = root
+        for name, kind, (a, b, c), body in leg:
+            parent = model.addJoint(parent, kind(), _placement(a, sign * b, c), f"{side} {name}")
+            model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+        frame = pin.Frame(f"{side} sole", parent, _placement(0.02, 0.0, -0.06), pin.FrameType.OP_FRAME)
+        model.addFrame(frame)
+    parent = root
+    for name, kind, at, body in (
+        ("shoulder pitch", y, (0.0, -0.2, 0.45), _body(1.0, 0.1, 0.1, 0.1)),
+        ("shoulder yaw", z, (0.0, 0.0, 0.0), _body(1.5, 0.3, 0.08, 0.08, at=(0.15, 0.0, 0.0))),
+        ("elbow", z, (0.3, 0.0, 0.0), _body(1.2, 0.25, 0.06, 0.06, at=(0.12, 0.0, 0.01))),
+    ):
+        parent = model.addJoint(parent, kind(), _placement(*at), name)
+        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+    model.addFrame(pin.Frame("fist", parent, _placement(0.3, 0.0, 0.0), pin.FrameType.OP_FRAME))
+    names = list(model.names)[2:]
+    angles = {f"{side} {name}": angle for side in ("left", "right") for name, angle in HALF_SITTING.items()}
+    soles = [Sole.box(name=s, frame=f"{s} sole", length=0.22, width=0.12) for s in ("left", "right")]
+    return Robot.from_model(
+        model,
+        armature=0.05,
+        torque_limit=150.0,
+        velocity_limit=6.0,
+        # knees do not straighten: there the legs are singular
+        position_limit={name: (0.1, 2.2) if "knee" in name else (-2.2, 2.2) for name in names},
+        soles=soles,
+        strikers=[Striker(name="fist", frame="fist", point=np.array([0.02, 0.0, 0.0]))],
+        postures={
+            "half_sitting": {**angles, "shoulder pitch": 0.3, "shoulder yaw": -0.7, "elbow": 1.4},
+            "upright": {"left knee": 0.1, "right knee": 0.1},
+        },
+    )
+
+
+def arm(**options: Any) -> Robot:
+    """A fixed arm of four joints, the first of which is continuous."""
+    model = pin.Model()
+    model.name = "small arm"
+    parent = 0
+    for name, kind, at, body in (
+        ("turn", pin.JointModelRUBZ, (0.0, 0.0, 0.3), _body(3.0, 0.1, 0.1, 0.2)),
+        ("shoulder", pin.JointModelRY, (0.0, 0.0, 0.1), _body(2.0, 0.1, 0.1, 0.4, at=(0.0, 0.0, 0.2))),
+        ("elbow", pin.JointModelRY, (0.0, 0.0, 0.4), _body(1.5, 0.1, 0.1, 0.3, at=(0.0, 0.0, 0.15))),
+        ("wrist", pin.JointModelRY, (0.0, 0.0, 0.3), _body(0.5, 0.1, 0.1, 0.1, at=(0.0, 0.0, 0.05))),
+    ):
+        parent = model.addJoint(parent, kind(), _placement(*at), name)
+        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+    model.addFrame(pin.Frame("hand", parent, _placement(0.0, 0.0, 0.1), pin.FrameType.OP_FRAME))
+    settings = {
+        "armature": 0.05,
+        "torque_limit": np.array([60.0, 80.0, 60.0, 40.0]),
+        "velocity_limit": 5.0,
+        "position_limit": {name: (-2.5, 2.5) for name in ("shoulder", "elbow", "wrist")},
+        "strikers": [Striker(name="hand", frame="hand", point=np.zeros(3))],
+        "postures": {"start": {"turn": 0.4, "shoulder": 0.3, "elbow": 1.2, "wrist": 0.3}},
+        **options,
+    }
+    return Robot.from_model(model, **settings)
+
+
+def slider(mass: float, **options: Any) -> Robot:
+    """A point mass [kg] on a horizontal rail along x, fixed base: one prismatic joint, no servo gains."""
+    model = pin.Model()
+    model.name = "slider"
+    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "rail")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.05), pin.SE3.Identity())
+    settings = {
+        "kp": 0.0,
+        "kd": 0.0,
+        "torque_limit": 1e4,
+        "velocity_limit": 10.0,
+        "position_limit": {"rail": (-5.0, 5.0)},
+        "strikers": [Striker(name="tip", frame="rail", point=np.zeros(3))],
+        **options,
+    }
+    return Robot.from_model(model, **settings)

@@ -1,0 +1,163 @@
+"""The QP solvers, against the optimality conditions written out anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from impactopt.errors import InputError
+from impactopt.sqp import QP_SOLVERS, QPStatus, QuadraticProgram, make_qp_solver
+from impactopt.sqp.osqp_solver import OsqpSolver
+
+INF = np.inf
+SOLVERS = sorted(QP_SOLVERS)
+
+
+def qp(P, q, A=None, lower=(), upper=(), x_lower=-INF, x_upper=INF):
+    n = len(q)
+    A = np.zeros((0, n)) if A is None else np.atleast_2d(np.array(A, float))
+    return QuadraticProgram(
+        P=sp.csc_array(np.array(P, float)),
+        q=np.array(q, float),
+        A=sp.csc_array(A),
+        lower=np.array(lower, float),
+        upper=np.array(upper, float),
+        x_lower=np.broadcast_to(np.array(x_lower, float), n).copy(),
+        x_upper=np.broadcast_to(np.array(x_upper, float), n).copy(),
+    )
+
+
+def random_qp(seed, n, rows, equalities):
+    """A feasible QP with rows of very different norms, some without a lower or an upper bound, some equal."""
+    rng = np.random.default_rng(seed)
+    F = rng.normal(size=(n, n))
+    A = rng.normal(size=(rows, n)) * 10 ** rng.uniform(-2, 2, size=(rows, 1))
+    inside = rng.normal(size=n)
+    v = A @ inside
+    span = np.abs(v) + 1e-3
+    lower = np.where(rng.random(rows) < 0.3, -INF, v - rng.random(rows) * span)
+    upper = np.where(rng.random(rows) < 0.3, INF, v + rng.random(rows) * span)
+    equal = np.arange(rows) < min(equalities, n - 1, rows)
+    lower, upper = np.where(equal, v, lower), np.where(equal, v, upper)
+    x_lower = np.where(rng.random(n) < 0.5, -INF, inside - rng.random(n))
+    x_upper = np.where(rng.random(n) < 0.5, INF, inside + rng.random(n))
+    return qp(F @ F.T + 0.1 * np.eye(n), rng.normal(size=n) * 5, A, lower, upper, x_lower, x_upper)
+
+
+def assert_solves(problem, solution, tolerance=1e-5):
+    x, y, z = solution.x, solution.y, solution.z
+    A, P = problem.A.toarray(), problem.P.toarray()
+    norms = np.concatenate([np.linalg.norm(A, axis=1), np.ones(x.size)])
+    v, multipliers = np.concatenate([A @ x, x]) / norms, np.concatenate([y, z]) * norms
+    lower = np.concatenate([problem.lower, problem.x_lower]) / norms
+    upper = np.concatenate([problem.upper, problem.x_upper]) / norms
+    scale = 1 + np.abs(problem.q).max() + np.abs(multipliers).max()
+    assert (v >= lower - tolerance).all()
+    assert (v <= upper + tolerance).all()
+    assert np.abs(P @ x + problem.q + A.T @ y + z).max() <= tolerance * scale
+    assert (v[multipliers > tolerance * scale] >= (upper - 1e-3)[multipliers > tolerance * scale]).all()
+    assert (v[multipliers < -tolerance * scale] <= (lower + 1e-3)[multipliers < -tolerance * scale]).all()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 8), rows=st.integers(0, 12), equalities=st.integers(0, 4))
+def test_random_qps_are_solved(name, seed, n, rows, equalities):
+    problem = random_qp(seed, n, rows, equalities)
+    solution = make_qp_solver(name).solve(problem)
+    assert solution.status is QPStatus.SOLVED
+    assert_solves(problem, solution)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), wrong=st.integers(0, 10**6))
+def test_the_guess_does_not_change_the_answer(seed, wrong):
+    problem = random_qp(seed, 6, 8, 2)
+    rng = np.random.default_rng(wrong)
+    guess = tuple(rng.normal(size=k) * (rng.random(k) < 0.5) for k in (6, 8, 6))
+    solver = make_qp_solver("active_set")
+    cold, warm = solver.solve(problem), solver.solve(problem, start=guess)
+    assert warm.status is QPStatus.SOLVED
+    np.testing.assert_allclose(warm.x, cold.x, atol=1e-6 * (1 + np.abs(cold.x).max()))
+
+
+def test_the_right_guess_needs_no_iteration():
+    problem = random_qp(3, 6, 8, 2)
+    solver = make_qp_solver("active_set")
+    first = solver.solve(problem)
+    assert np.count_nonzero(first.y) + np.count_nonzero(first.z) > 2
+    assert solver.solve(problem, start=(first.x, first.y, first.z)).iterations == 0
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(
+    "problem",
+    [
+        qp(np.eye(2), [1, 1], [[1, 1], [1, 1]], [1, -INF], [INF, 0]),
+        qp(np.eye(2), [1, 1], [[1, 0], [0, 1], [1, 1]], [1, 1, -INF], [INF, INF, 1.5]),
+        qp(np.eye(2), [0, 0], [[1, 1]], [3], [INF], x_upper=1),
+        qp(np.eye(3), [0, 0, 0], [[1, 1, 0], [2, 2, 0]], [1, 3], [1, 3]),
+    ],
+    ids=["parallel rows", "three rows", "row and bounds", "equalities"],
+)
+def test_infeasible_qps_are_a_status(name, problem):
+    assert make_qp_solver(name).solve(problem).status is QPStatus.INFEASIBLE
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_dependent_rows(name):
+    problem = qp(np.eye(3), [-1, -2, -3], [[1, 1, 0], [2, 2, 0], [1, 1, 0]], [1, 2, -INF], [1, 2, 1])
+    solution = make_qp_solver(name).solve(problem)
+    assert solution.status is QPStatus.SOLVED
+    np.testing.assert_allclose(solution.x, [0, 1, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_nonconvex_qps_fail_without_an_exception(name):
+    assert not make_qp_solver(name).solve(qp(np.diag([1, -1]), [0, 0], [[1, 1]], [0], [0])).usable
+
+
+def test_osqp_is_updated_in_place_while_the_pattern_stays():
+    solver = OsqpSolver()
+    for seed in range(4):
+        problem = random_qp(seed, 6, 8, 0)
+        assert_solves(problem, solver.solve(problem))
+    assert solver.setups == 1
+    assert_solves(other := random_qp(0, 5, 8, 0), solver.solve(other))
+    assert solver.setups == 2
+
+
+def test_large_sparse_qps_are_refined_to_the_tolerance():
+    n = 400  # beyond the dense method
+    rng = np.random.default_rng(0)
+    D = sp.diags_array([np.ones(n - 1), -np.ones(n - 1)], offsets=[1, 0], shape=(n - 1, n))
+    problem = QuadraticProgram(
+        P=sp.csc_array(D.T @ D + 0.01 * sp.diags_array(np.ones(n))),
+        q=rng.normal(size=n),
+        A=sp.csc_array(D),
+        lower=np.full(n - 1, -0.5),
+        upper=np.full(n - 1, 0.5),
+        x_lower=np.full(n, -2.0),
+        x_upper=np.full(n, 2.0),
+    )
+    solution = OsqpSolver().solve(problem)
+    assert solution.status is QPStatus.SOLVED
+    assert np.count_nonzero(solution.y) > 20
+    assert_solves(problem, solution, tolerance=1e-7)
+
+
+def test_residuals_are_those_of_the_kkt_conditions():
+    problem = qp([[2, 0], [0, 2]], [1, 0], [[3, 4]], [-INF], [5], x_lower=-1)
+    # 3*1 + 4*1 = 7 is 2 above 5: 0.4 of a unit row; P x + q + A'y + z = (2 + 1 + 3, 2 + 4 - 1)
+    primal, dual, gap = problem.residuals(np.ones(2), np.array([1.0]), np.array([0.0, -1.0]))
+    assert primal == pytest.approx(0.4)
+    assert dual == pytest.approx(6)
+    assert gap == pytest.approx(2)  # both: 5 (per unit row) * 0.4, and 1 * 2
+
+
+def test_unknown_solvers_are_named():
+    with pytest.raises(InputError, match=r"'osqq' \(did you mean 'osqp'\?\)"):
+        make_qp_solver("osqq")

@@ -235,6 +235,13 @@ class StanceCoordinates:
             accs.append(solve_in_order(jac, -acc, leg.order))
         return v, self._embed(a_base, ydd[6:], ca.vertcat(*accs))
 
+    def sole_twists(self, y: Any, legs: Any, yd: Any, rates: Any) -> Any:
+        """Twists (6 a held sole) [m/s, rad/s] in the base's own frame for leg rates (nl,) that need not be right, SX."""
+        still, nothing = ca.SX.zeros(self.nl), ca.SX.zeros(self.rb.nv)
+        base = self._base_motion(self.configuration(y, still), self._embed(yd[:6], yd[6:], still), nothing)[0]
+        v = self._embed(base, ca.SX.zeros(len(self.independent)), rates)
+        return ca.vertcat(*[self._sole_terms(k, legs, v, nothing)[3] for k in range(len(self.legs))])
+
     def upper_motion(self, y: Any, yd: Any, ydd: Any) -> tuple[Any, Any, Any]:
         """q, v, a (SX) with the leg joints left out (zero): enough for frames that no stance leg carries."""
         still = ca.SX.zeros(self.nl)

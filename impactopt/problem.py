@@ -32,20 +32,23 @@ class Phase:
     """
 
     duration: tuple[float, float]
-    intervals: int = 14
+    intervals: int = 12
     grading: float = 3.0
 
     def __post_init__(self) -> None:
         duration = (self.duration,) * 2 if isinstance(self.duration, (int, float)) else tuple(self.duration)
-        if len(duration) != 2 or not 0 < duration[0] <= duration[1]:
+        if len(duration) != 2 or not 0 < duration[0] <= duration[1] < np.inf:
             raise InputError(
                 f"a phase's duration [s] is one positive number or (shortest, longest), not {self.duration}"
             )
         object.__setattr__(self, "duration", tuple(float(d) for d in duration))
         if not self.grading >= 1:
             raise InputError(f"a phase's grading must be at least 1, not {self.grading}")
-        if self.intervals < 6:
-            raise InputError(f"a phase needs at least 6 spline intervals, not {self.intervals}")
+        if self.intervals != int(self.intervals) or self.intervals < 6:
+            raise InputError(
+                f"a phase needs at least 6 spline intervals, a whole number, not {self.intervals}"
+            )
+        object.__setattr__(self, "intervals", int(self.intervals))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,21 +103,32 @@ class ImpactProblem:
         put(self, "point", check_array("point", self.point, (3,)))
         normal = check_array("normal", self.normal, (3,))
         if abs(np.linalg.norm(normal) - 1) > 1e-6:
-            unit = normal / max(float(np.linalg.norm(normal)), 1e-300)
-            raise InputError(
-                f"normal must be a unit vector, its length is {np.linalg.norm(normal):.6g}: did you mean "
-                f"{np.round(unit, 6).tolist()}?"
-            )
+            length = float(np.linalg.norm(normal))
+            unit = f": did you mean {np.round(normal / length, 6).tolist()}?" if length > 0 else ""
+            raise InputError(f"normal must be a unit vector, its length is {length:.6g}{unit}")
         put(self, "normal", normal / np.linalg.norm(normal))
+        if len(self.collision_elements) != 2:
+            raise InputError(
+                "collision_elements are those of compression and those of restitution, two tuples, not "
+                f"{self.collision_elements}"
+            )
         for lengths in self.collision_elements:
             if not lengths or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
                 raise InputError(
                     f"collision_elements must be positive fractions that sum to 1, not {lengths}"
                 )
-        lo, hi = self.contact_duration
+        lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,))
         if not 0 < lo <= hi:
             raise InputError(
                 f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
+            )
+        for name in ("smoothness", "wrench_price"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"{name} must be a number >= 0, not {getattr(self, name)}")
+        if np.any(self.stance.compliance > 0):
+            raise InputError(
+                f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
+                "(base_mass, base_inertia), which is for collision models"
             )
         kinds = [type(t) for t in self.terms]
         for kind in kinds:

@@ -62,7 +62,8 @@ def reach(
                 jacs.append(pin.getFrameJacobian(model, data, f, pin.LOCAL))
             gap = point - data.oMf[fid].translation
             errors.append(gap)
-            jacs.append(pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)[:3])
+            hand = pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)
+            jacs.append(np.reshape(hand, (6, model.nv))[:3])  # pin drops an axis where nv is 1
             e, jac = np.concatenate(errors), np.vstack(jacs)
             off = float(np.abs(e).max())
             best_gap = min(best_gap, off)

@@ -21,12 +21,24 @@ def _body(mass: float, *size: float, at: tuple[float, float, float] = (0.0, 0.0,
     return pin.Inertia(mass, np.array(at), inertia.inertia)
 
 
+def _add(model: Any, parent: int, kind: Any, at: Any, name: str, body: Any) -> int:
+    joint = model.addJoint(parent, kind(), _placement(*at), name)
+    model.addJointFrame(joint)
+    model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    return int(joint)
+
+
+def _mark(model: Any, joint: int, at: tuple[float, float, float], name: str) -> None:
+    above = model.getFrameId(model.names[joint])
+    model.addFrame(pin.Frame(name, joint, above, _placement(*at), pin.FrameType.OP_FRAME))
+
+
 def biped() -> Robot:
-    """A 40 kg biped: two legs of six joints with box soles, one arm of three joints; 15 joints, 21 velocities."""
+    """A 40 kg biped: two legs of six joints on box soles and an arm of three; 21 velocities."""
     model = pin.Model()
     model.name = "small biped"
-    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
-    model.appendBodyToJoint(root, _body(22.0, 0.2, 0.3, 0.5, at=(0.01, -0.01, 0.25)), pin.SE3.Identity())
+    trunk = _body(22.0, 0.2, 0.3, 0.5, at=(0.01, -0.01, 0.25))
+    root = _add(model, 0, pin.JointModelFreeFlyer, (0.0, 0.0, 0.0), "root", trunk)
     x, y, z = pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ
     leg: list[tuple[str, Any, tuple[float, float, float], Any]] = [
         ("hip yaw", z, (0.0, 0.1, -0.05), _body(0.5, 0.1, 0.1, 0.1)),
@@ -39,19 +51,16 @@ def biped() -> Robot:
     for side, sign in (("left", 1.0), ("right", -1.0)):
         parent = root
         for name, kind, (a, b, c), body in leg:
-            parent = model.addJoint(parent, kind(), _placement(a, sign * b, c), f"{side} {name}")
-            model.appendBodyToJoint(parent, body, pin.SE3.Identity())
-        frame = pin.Frame(f"{side} sole", parent, _placement(0.02, 0.0, -0.06), pin.FrameType.OP_FRAME)
-        model.addFrame(frame)
+            parent = _add(model, parent, kind, (a, sign * b, c), f"{side} {name}", body)
+        _mark(model, parent, (0.02, 0.0, -0.06), f"{side} sole")
     parent = root
     for name, kind, at, body in (
         ("shoulder pitch", y, (0.0, -0.2, 0.45), _body(1.0, 0.1, 0.1, 0.1)),
         ("shoulder yaw", z, (0.0, 0.0, 0.0), _body(1.5, 0.3, 0.08, 0.08, at=(0.15, 0.0, 0.0))),
         ("elbow", z, (0.3, 0.0, 0.0), _body(1.2, 0.25, 0.06, 0.06, at=(0.12, 0.0, 0.01))),
     ):
-        parent = model.addJoint(parent, kind(), _placement(*at), name)
-        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
-    model.addFrame(pin.Frame("fist", parent, _placement(0.3, 0.0, 0.0), pin.FrameType.OP_FRAME))
+        parent = _add(model, parent, kind, at, name, body)
+    _mark(model, parent, (0.3, 0.0, 0.0), "fist")
     names = list(model.names)[2:]
     angles = {f"{side} {name}": angle for side in ("left", "right") for name, angle in HALF_SITTING.items()}
     soles = [Sole.box(name=s, frame=f"{s} sole", length=0.22, width=0.12) for s in ("left", "right")]
@@ -82,14 +91,13 @@ def arm(**options: Any) -> Robot:
         ("elbow", pin.JointModelRY, (0.0, 0.0, 0.4), _body(1.5, 0.1, 0.1, 0.3, at=(0.0, 0.0, 0.15))),
         ("wrist", pin.JointModelRY, (0.0, 0.0, 0.3), _body(0.5, 0.1, 0.1, 0.1, at=(0.0, 0.0, 0.05))),
     ):
-        parent = model.addJoint(parent, kind(), _placement(*at), name)
-        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
-    model.addFrame(pin.Frame("hand", parent, _placement(0.0, 0.0, 0.1), pin.FrameType.OP_FRAME))
+        parent = _add(model, parent, kind, at, name, body)
+    _mark(model, parent, (0.0, 0.0, 0.1), "hand")
     settings = {
         "armature": 0.05,
         "torque_limit": np.array([60.0, 80.0, 60.0, 40.0]),
         "velocity_limit": 5.0,
-        "position_limit": {name: (-2.5, 2.5) for name in ("shoulder", "elbow", "wrist")},
+        "position_limit": dict.fromkeys(("shoulder", "elbow", "wrist"), (-2.5, 2.5)),
         "strikers": [Striker(name="hand", frame="hand", point=np.zeros(3))],
         "postures": {"start": {"turn": 0.4, "shoulder": 0.3, "elbow": 1.2, "wrist": 0.3}},
         **options,
@@ -101,8 +109,7 @@ def slider(mass: float, **options: Any) -> Robot:
     """A point mass [kg] on a horizontal rail along x, fixed base: one prismatic joint, no servo gains."""
     model = pin.Model()
     model.name = "slider"
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "rail")
-    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, 0.05), pin.SE3.Identity())
+    _add(model, 0, pin.JointModelPX, (0.0, 0.0, 0.0), "rail", pin.Inertia.FromSphere(mass, 0.05))
     settings = {
         "kp": 0.0,
         "kd": 0.0,

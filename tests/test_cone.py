@@ -1,4 +1,4 @@
-"""The contact wrench cone against Caron's closed form and against corner forces; margins; support polygon and ZMP."""
+"""The contact wrench cone against Caron and against corner forces; margins; support polygon and ZMP."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def depth(polygon: Array, points: Array) -> Array:
 @given(seeds)
 @settings(max_examples=30, deadline=None)
 def test_torsion_and_cop_bounds_are_carons_closed_form_for_a_rectangle(seed: int) -> None:
-    """For given (f, m_x, m_y) the cone leaves exactly the interval of m_z of Caron et al. 2015, eqs. 18 to 22."""
+    """For given (f, m_x, m_y) the cone leaves exactly the interval of m_z of Caron et al. 2015."""
     rng = np.random.default_rng(seed)
     long, wide, mu = rng.uniform(0.05, 0.15), rng.uniform(0.03, 0.08), rng.uniform(0.2, 1.2)
     rows = contact_wrench_cone([[long, wide], [-long, wide], [-long, -wide], [long, -wide]], mu)

@@ -1,20 +1,22 @@
-"""The simplified dynamics computation against closed forms, an independent integration, balances and differences.
+"""The simplified dynamics computation against closed forms, an independent integration, balances and
+differences.
 
-The reference below shares no code with the package: NumPy, Pinocchio's own algorithms, a full KKT matrix in place of
-factorizations, SciPy's integrator with located events.
+The reference below shares no code with the package: NumPy, Pinocchio's own algorithms, a full KKT matrix in
+place of factorizations, SciPy's integrator with located events.
 """
 
 import dataclasses
 import functools
+import shutil
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import solve_ivp, trapezoid
 from scipy.linalg import lu_factor, lu_solve
 
 from impactopt.collision import SDC, JointFriction, Terms, effective_mass
-from impactopt.contact import FreeMass, SpringDamper
+from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.errors import InputError
 from impactopt.presets import g1, talos
 from impactopt.robot import Robot, Striker
@@ -32,7 +34,7 @@ def _virtual_machine(monkeypatch):
     monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
 
 
-# ------------------------------------------------------------------------------------------ robots and situations
+# ------------------------------------------------------------ robots and situations
 @functools.cache
 def robot_named(name):
     return {"talos": talos, "g1": g1, "talos_fixed": lambda: talos(floating=False)}[name]()
@@ -58,7 +60,8 @@ def slider(mass):
 
 
 def situation(robot, *, seed=0, speed=1.0, soles=None, striker="right_hand", normal=X):
-    """(q, v, torque): a random posture about half sitting, a motion that holds the soles and hits at `speed`."""
+    """(q, v, torque): a random posture about half sitting, a motion that holds the soles and hits at
+    `speed`."""
     rng = np.random.default_rng(seed)
     soles = robot.soles if soles is None and robot.floating else (soles or ())
     q = robot.posture("half_sitting") if robot.floating else pin.neutral(robot.model)
@@ -69,7 +72,7 @@ def situation(robot, *, seed=0, speed=1.0, soles=None, striker="right_hand", nor
     k = Kinematics(robot, q, np.zeros(robot.nv), [s.frame for s in soles], striker, normal)
     rows, wanted = np.vstack([k.Jc, k.j]), np.zeros(len(k.Jc) + 1)
     wanted[-1] = speed
-    v = rng.normal(scale=0.3 * speed, size=robot.nv)
+    v = 0.3 * speed * rng.normal(size=robot.nv)
     v += np.linalg.pinv(rows) @ (wanted - rows @ v)
     torque = rng.normal(scale=0.2, size=robot.n) * robot.torque_limit
     return q, v, torque
@@ -103,7 +106,8 @@ class Kinematics:
 
 
 def reference(sdc, q, v0, feedforward=None, *, rtol=1e-11, **changes):
-    """The frozen collision by solve_ivp, phase by phase: impulse, duration, number of phases, velocity, displacement."""
+    """The frozen collision by solve_ivp, phase by phase: impulse, duration, number of phases, velocity,
+    displacement."""
     robot, terms = sdc.robot, sdc.terms
     n, nv = robot.n, robot.nv
     k = Kinematics(robot, q, v0, sdc.held_by.constraint_frames(robot), sdc.striker, np.asarray(sdc.normal))
@@ -161,7 +165,9 @@ def reference(sdc, q, v0, feedforward=None, *, rtol=1e-11, **changes):
             out = np.where(np.isinf(limit), 1.0, out)
             slide = np.where(sliding == 0, band - np.abs(v), sliding * v - band) if friction else np.ones(n)
             rate = speed - target
-            return np.concatenate([out, slide, [rate if compressing else -rate, 1.0 if compressing else force(y, False)]])
+            return np.concatenate(
+                [out, slide, [rate if compressing else -rate, 1.0 if compressing else force(y, False)]]
+            )
 
         return flow, margins
 
@@ -211,9 +217,10 @@ def make(robot, **options):
     return SDC(robot=robot, striker="right_hand", normal=X, law=LAW, target=TARGET, **options)
 
 
-# ------------------------------------------------------------------------------------------ closed forms
+# ------------------------------------------------------------ closed forms
 def two_masses(mass, target, stiffness, damping, speed):
-    """Impulse and duration of two free masses: damped oscillator up to the end of compression, then undamped."""
+    """Impulse and duration of two free masses: damped oscillator up to the end of compression, then
+    undamped."""
     reduced = mass * target / (mass + target)
     a = damping / (2 * reduced)
     root = np.sqrt(complex(a**2 - stiffness / reduced))
@@ -226,7 +233,12 @@ def two_masses(mass, target, stiffness, damping, speed):
 
 @pytest.mark.parametrize(
     "mass, target, stiffness, damping, speed",
-    [(4.0, 5.0, 1e4, 300.0, 0.4), (8.0, 2.0, 3e4, 40.0, 1.5), (1.0, 50.0, 1e3, 500.0, 2.0), (6.0, 5.0, 1e4, 0.0, 1.0)],
+    [
+        (4.0, 5.0, 1e4, 300.0, 0.4),
+        (8.0, 2.0, 3e4, 40.0, 1.5),
+        (1.0, 50.0, 1e3, 500.0, 2.0),
+        (6.0, 5.0, 1e4, 0.0, 1.0),
+    ],
 )
 def test_two_free_masses_in_closed_form(mass, target, stiffness, damping, speed):
     sdc = SDC(
@@ -258,7 +270,7 @@ def test_two_free_masses_give_the_papers_table_iii():
             assert result.peak_force == pytest.approx(300.0 * speed, rel=0.01)
 
 
-# ------------------------------------------------------------------------------------------ independent integration
+# ------------------------------------------------------------ independent integration
 ALL = Terms(friction=True)
 FRICTION = JointFriction(viscous=2.0, coulomb=1.5, transition=0.05)
 PAPER = Terms.paper()
@@ -287,8 +299,8 @@ def test_each_term_against_an_independent_integration(terms):
     expected = reference(sdc, q, v, torque)
     result = sdc.collide(q, v, torque if terms.feedforward else None)
     assert result.separated
-    assert result.impulse == pytest.approx(expected["impulse"], rel=1e-6)
-    assert result.duration == pytest.approx(expected["duration"], rel=1e-5)
+    assert result.impulse == pytest.approx(expected["impulse"], rel=1e-7)
+    assert result.duration == pytest.approx(expected["duration"], rel=1e-6)
     np.testing.assert_allclose(result.velocity, expected["velocity"], atol=1e-5)
     np.testing.assert_allclose(result.displacement, expected["displacement"], atol=1e-6)
 
@@ -304,7 +316,16 @@ def test_impulse_over_postures_speeds_and_gains(speed, gain, seed):
     expected = reference(sdc, q, v, torque, **gains)
     if speed == 3.0 and gain > 20.0:
         assert expected["phases"] > 6, "the case was meant to saturate several joints"
-    assert sdc.collide(q, v, torque, **gains).impulse == pytest.approx(expected["impulse"], rel=1e-6)
+    assert sdc.collide(q, v, torque, **gains).impulse == pytest.approx(expected["impulse"], rel=1e-7)
+
+
+def test_infinite_torque_limits_are_no_limits():
+    robot, sdc = robot_named("talos"), default_sdc("talos")
+    q, v, torque = situation(robot, seed=15, speed=2.0)
+    unlimited = make(robot, terms=Terms(saturation=False)).collide(q, v, torque)
+    result = sdc.collide(q, v, torque, torque_limit=np.inf)
+    assert result.impulse == pytest.approx(unlimited.impulse, rel=1e-10)
+    assert abs(result.impulse / sdc.collide(q, v, torque).impulse - 1.0) > 1e-5
 
 
 @functools.cache
@@ -314,7 +335,12 @@ def default_sdc(name):
 
 @pytest.mark.parametrize(
     "name, stance",
-    [("g1", BothSoles()), ("g1", OneSole("left")), ("g1", BothSoles(base_mass=1e3, base_inertia=50.0)), ("talos_fixed", None)],
+    [
+        ("g1", BothSoles()),
+        ("g1", OneSole("left")),
+        ("g1", BothSoles(base_mass=1e3, base_inertia=50.0)),
+        ("talos_fixed", None),
+    ],
     ids=["both soles", "one sole", "virtual base", "fixed base"],
 )
 def test_stances_against_an_independent_integration(name, stance):
@@ -330,7 +356,79 @@ def test_stances_against_an_independent_integration(name, stance):
     np.testing.assert_allclose(result.velocity, expected["velocity"], atol=1e-5)
 
 
-# ------------------------------------------------------------------------------------------ balances
+# ------------------------------------------------------------ laws and targets of one's own
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HardeningSpring(ContactLaw):
+    stiffness: float
+    hardening: float
+    damping: float
+
+    def branch(self, penetration, rate, compressing, parameters=None):
+        p = parameters or self.parameters
+        f = p["stiffness"] * penetration + p["hardening"] * penetration**3
+        return f + p["damping"] * penetration * rate if compressing else f
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SprungMass(Target):
+    mass: float
+    stiffness: float
+    drag: float
+
+    n_states = 2
+
+    def velocity(self, state, parameters=None):
+        return state[1]
+
+    def derivative(self, state, force, parameters=None):
+        p = parameters or self.parameters
+        push = force - p["stiffness"] * state[0] - p["drag"] * state[1] * state[1]
+        return [state[1], push / p["mass"]]
+
+    def energy(self, state, parameters=None):
+        p = parameters or self.parameters
+        return 0.5 * (p["mass"] * state[1] ** 2 + p["stiffness"] * state[0] ** 2)
+
+
+def test_a_nonlinear_law_and_target_against_an_independent_integration():
+    law = HardeningSpring(stiffness=1e4, hardening=4e8, damping=2e4)
+    target = SprungMass(mass=2.0, stiffness=500.0, drag=3.0)
+    sdc = SDC(robot=slider(3.0), striker="tip", normal=X, law=law, target=target)
+
+    def flow(compressing, t, y):
+        hand, x, place, speed, _ = y
+        f = 1e4 * x + 4e8 * x**3 + (2e4 * x * (hand - speed) if compressing else 0.0)
+        return [-f / 3.0, hand - speed, speed, (f - 500.0 * place - 3.0 * speed**2) / 2.0, f]
+
+    def turning(t, y):
+        return y[0] - y[3]
+
+    def leaving(t, y):
+        return y[1]
+
+    turning.terminal = leaving.terminal = True
+    turning.direction = leaving.direction = -1
+    y, t = [1.5, 0.0, 0.0, 0.0, 0.0], 0.0
+    for compressing, event in ((True, turning), (False, leaving)):
+        run = solve_ivp(
+            functools.partial(flow, compressing),
+            (t, 1.0),
+            y,
+            method="DOP853",
+            rtol=1e-11,
+            atol=1e-13,
+            events=event,
+        )
+        t, y = run.t[-1], run.y[:, -1]
+    result = sdc.collide([0.0], [1.5], [0.0])
+    assert result.impulse == pytest.approx(y[4], rel=1e-6)
+    assert result.duration == pytest.approx(t, rel=1e-5)
+    assert result.energy == pytest.approx(0.5 * (2.0 * y[3] ** 2 + 500.0 * y[2] ** 2), rel=1e-6)
+    plain = dataclasses.replace(sdc, method="rk4", step=2e-5).collide([0.0], [1.5], [0.0])
+    assert plain.impulse == pytest.approx(y[4], rel=1e-6)
+
+
+# ------------------------------------------------------------ balances
 @pytest.mark.parametrize("terms", [PAPER, Terms(), ALL], ids=["paper", "default", "all"])
 def test_ground_wrench_is_what_the_robots_momentum_needs(terms):
     """d/dt of the centroidal momentum (Pinocchio) = ground + weight + reaction at the hand, at every step."""
@@ -382,10 +480,10 @@ def test_impulse_is_the_targets_gain_and_the_robots_loss_to_it():
     drift = pin.computeCentroidalMomentumTimeVariation(model, data, q, v, np.zeros(model.nv)).linear
     change = momentum(result.velocity) - momentum(v) + drift * result.duration
     weight = pin.computeTotalMass(model) * model.gravity.linear * result.duration
-    ground = np.trapezoid(result.ground_wrench[:, :3], result.time, axis=0)
+    ground = trapezoid(result.ground_wrench[:, :3], result.time, axis=0)
     # the trapezoidal rule on the histories is what limits this
     np.testing.assert_allclose(change, ground + weight - result.impulse * X, atol=2e-3)
-    assert np.trapezoid(result.force, result.time) == pytest.approx(result.impulse, rel=1e-4)
+    assert trapezoid(result.force, result.time) == pytest.approx(result.impulse, rel=2e-3)
 
 
 def test_histories_hang_together():
@@ -398,7 +496,9 @@ def test_histories_hang_together():
     assert result.torque.shape == (k, robot.n) and result.sole_wrench.shape == (k, 2, 6)
     assert (np.abs(result.torque) <= robot.torque_limit * (1 + 1e-12)).all()
     assert (np.abs(result.demand) > robot.torque_limit).any(), "the case was meant to saturate"
-    np.testing.assert_array_equal(result.torque, np.clip(result.demand, -robot.torque_limit, robot.torque_limit))
+    np.testing.assert_array_equal(
+        result.torque, np.clip(result.demand, -robot.torque_limit, robot.torque_limit)
+    )
     np.testing.assert_allclose(result.demand[0], torque)
     np.testing.assert_allclose(result.joint_velocity[0], v[6:])
     np.testing.assert_allclose(result.joint_velocity[-1], result.velocity[6:])
@@ -421,7 +521,7 @@ def test_every_keeps_every_so_many_steps_and_the_last():
         np.testing.assert_array_equal(b[-1], a[-1])
 
 
-# ------------------------------------------------------------------------------------------ gradient
+# ------------------------------------------------------------ gradient
 @pytest.mark.parametrize("seed, speed", [(9, 0.6), (10, 2.5)])
 def test_gradient_against_central_differences(seed, speed):
     robot, sdc = robot_named("talos"), default_sdc("talos")
@@ -434,11 +534,11 @@ def test_gradient_against_central_differences(seed, speed):
         d = rng.normal(size=robot.nv)
         along_q = [float(impulse(pin.integrate(robot.model, q, s * h * d), v, torque)) for s in (1, -1)]
         along_v = [float(impulse(q, v + s * h * d, torque)) for s in (1, -1)]
-        assert by_q @ d == pytest.approx((along_q[0] - along_q[1]) / (2 * h), rel=1e-4, abs=1e-4)
-        assert by_v @ d == pytest.approx((along_v[0] - along_v[1]) / (2 * h), rel=1e-4, abs=1e-4)
+        assert by_q @ d == pytest.approx((along_q[0] - along_q[1]) / (2 * h), rel=1e-6)
+        assert by_v @ d == pytest.approx((along_v[0] - along_v[1]) / (2 * h), rel=1e-6)
 
 
-# ------------------------------------------------------------------------------------------ the virtual base
+# ------------------------------------------------------------ the virtual base
 def with_heavy_feet(robot, mass, inertia):
     model = robot.model.copy()
     for sole in robot.soles:
@@ -455,7 +555,9 @@ def test_virtual_base_is_masses_added_to_the_feet_and_tends_to_the_exact_constra
     exact = float(effective_mass(robot, striker="right_hand", normal=X)(q))
     Y = np.linalg.solve(k.H, np.vstack([k.Jc, k.j]).T)
     G = k.Jc @ Y[:, :12]
-    assert 1 / exact == pytest.approx(k.j @ (Y[:, 12] - Y[:, :12] @ np.linalg.solve(G, k.Jc @ Y[:, 12])), rel=1e-9)
+    assert 1 / exact == pytest.approx(
+        k.j @ (Y[:, 12] - Y[:, :12] @ np.linalg.solve(G, k.Jc @ Y[:, 12])), rel=1e-9
+    )
     errors = []
     for mass in (1e2, 1e3, 1e4):
         stance = BothSoles(base_mass=mass, base_inertia=mass)
@@ -469,9 +571,10 @@ def test_virtual_base_is_masses_added_to_the_feet_and_tends_to_the_exact_constra
     assert errors[1] / errors[2] == pytest.approx(10.0, rel=0.2)
 
 
-# ------------------------------------------------------------------------------------------ the paper's own steps
+# ------------------------------------------------------------ the paper's own steps
 def test_paper_is_its_steps_1b_to_8b_word_for_word():
-    """Virtual base in H, LU before the loop, Runge-Kutta at 1e-4 s; eqs. (9), (11), (12), (15), (16), (17)."""
+    """Virtual base in H, LU before the loop, Runge-Kutta at 1e-4 s; eqs. (9), (11), (12), (15), (16),
+    (17)."""
     robot = robot_named("talos")
     q, v, _ = situation(robot, seed=12, speed=3.0)
     k = Kinematics(robot, q, v, [s.frame for s in robot.soles], "right_hand", X)
@@ -505,7 +608,30 @@ def test_paper_is_its_steps_1b_to_8b_word_for_word():
     assert result.duration == pytest.approx(h * len(forces))
 
 
-# ------------------------------------------------------------------------------------------ phases that do not come
+# ------------------------------------------------------------ compiled
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_compiled_functions_give_what_the_graphs_give(tmp_path, monkeypatch):
+    arguments = ([0.0], [1.3], [0.2])
+
+    def results():
+        sdc = SDC(robot=slider(2.5), striker="tip", normal=X, law=LAW, target=TARGET, horizon=0.1)
+        gradient = sdc.gradient_function()(*arguments)
+        return [
+            *gradient,
+            sdc.function(("impulse", "peak_force", "duration"), parameters=("kd",))(*arguments, [2.0])[0],
+        ]
+
+    interpreted = results()
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("IMPACTOPT_CACHE", str(tmp_path))
+    monkeypatch.delenv("IMPACTOPT_NO_COMPILER")
+    compiled = results()
+    assert list(tmp_path.glob("*.so"))
+    for a, b in zip(interpreted, compiled, strict=True):
+        np.testing.assert_allclose(np.array(b), np.array(a), rtol=1e-12)
+
+
+# ------------------------------------------------------------ phases that do not come
 def test_a_hand_that_moves_away_gives_nothing():
     robot, sdc = robot_named("talos"), default_sdc("talos")
     q, v, torque = situation(robot, seed=13, speed=-1.0)
@@ -540,13 +666,13 @@ def test_stable_step_is_where_the_method_turns_unstable():
         make(robot, step=1.05 * longest).collide(q, v, torque, kd=kd)
 
 
-# ------------------------------------------------------------------------------------------ bad input
+# ------------------------------------------------------------ bad input
 @pytest.mark.parametrize(
     "options, message",
     [
         ({"striker": "right_hnad"}, r"did you mean 'right_hand'"),
         ({"normal": [1.0, 1.0, 0.0]}, r"normal: not a unit vector"),
-        ({"normal": [1.0, 0.0]}, r"normal: expected shape \(3,\)"),
+        ({"normal": [1.0, 0.0]}, r"normal: expected shape"),
         ({"normal": [np.nan, 0.0, 1.0]}, r"normal: nan"),
         ({"stance": FixedBase()}, r"free-flyer"),
         ({"method": "rk5"}, r"method 'rk5' \(did you mean 'rk4'"),

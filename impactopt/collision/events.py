@@ -17,15 +17,13 @@ _BEYOND = 1e-5
 
 
 def level_jet(jet: Jet, level: Any, length: float) -> list[Any]:
-    """A jet that crosses zero where |value| crosses `level`, on the side where the value is, or else is
-    going."""
+    """A jet that is zero where |value| is at `level`, on the side where the value is, or else is going."""
     side = ca.sign(ca.if_else(ca.fabs(jet[0]) > level, jet[0], value_at(jet, length)))
     return [side * jet[0] - level, *[side * x for x in jet[1:]]]
 
 
 def first_event(jets: Sequence[Jet], length: float) -> tuple[Any, Any]:
-    """(time [s] of the first sign change of any of the jets within `length`, 1 at this jet and 0 at the
-    others).
+    """(time [s] of the first sign change of any jet within `length`, 1 at this jet and 0 at the others).
 
     Sign changes are those between the polynomials' ends; one that is undone within the step goes unseen,
     and has next to no effect. Where there is none, the time is `length` and all are 0.

@@ -1,5 +1,4 @@
-"""Steps 1b and 2b of the paper: what is computed once, at the configuration of contact, and then kept
-constant.
+"""Steps 1b and 2b of the paper: what is computed once, at the moment of contact, and then kept constant.
 
 With H the generalized inertia, J_c the held soles' Jacobians (c rows), Gamma the diagonal compliance of a
 virtual base (zero for exactly held soles) and S the selection of the n joints out of the nv velocities,
@@ -8,8 +7,8 @@ virtual base (zero for exactly held soles) and S the selection of the n joints o
 
 is the inverse inertia of the robot as held. In place of the paper's H*, J* with the base eliminated, which
 lose the contact force from the base's momentum balance, H is factorized whole and the soles enter by their
-(c, c) Delassus matrix. All that the time loop needs then lives in joint space and at the hand, with j = n'
-J_hand:
+(c, c) Delassus matrix. All that the time loop needs then lives in joint space and at the hand; with
+j = n' J_hand,
 
     du/dt = A tau - s f + d,    A = S P S', s = S P j'
     dw/dt = s' tau - m f + e,   m = j P j' = 1 / effective mass
@@ -31,8 +30,7 @@ __all__ = ["FrozenDynamics"]
 
 
 class FrozenDynamics:
-    """The frozen quantities as MX expressions of q, v and the contact normal; each is built when first
-    asked for.
+    """The frozen quantities as MX expressions of q, v and the normal; each is built when first asked for.
 
     Tree-shaped algebra is done in SX, dense algebra in MX, which keeps the code short.
 
@@ -84,9 +82,7 @@ class FrozenDynamics:
     def _roots(self) -> dict[str, Any]:
         root = self._tree.inverse_root(self._call("mass_matrix"))
         roots = {"hand": ca.mtimes(root, self._call("hand_row").T), "joints": root[:, -self.robot.n :]}
-        roots["soles"] = (
-            ca.mtimes(root, self._call("sole_jacobian").T) if self.soles else ca.MX(self.robot.nv, 0)
-        )
+        roots["soles"] = ca.mtimes(root, self._call("sole_jacobian").T)
         if self.bias:
             roots["bias"] = ca.mtimes(root, self._call("bias_force"))
         return roots
@@ -106,8 +102,7 @@ class FrozenDynamics:
 
     @cached_property
     def A(self) -> Any:
-        """S P S' [1/(kg m2)]: joint accelerations per joint torque; its lower triangle, column by column (n
-        (n + 1) / 2)."""
+        """Lower triangle, by columns, of S P S' [1/(kg m2)]: joint accelerations per joint torque."""
         dense = ca.densify(self._form("joints", "joints"))
         return ca.project(dense, ca.Sparsity.lower(self.robot.n)).nz[:]
 
@@ -167,16 +162,14 @@ class FrozenDynamics:
 
     @cached_property
     def unmodelled_wrench(self) -> Any:
-        """(6) about the world's origin: what carries weight, Coriolis and centrifugal forces where `bias`
-        leaves them out.
+        """(6) about the world's origin: what carries the weight where `bias` is left out.
 
-        The momentum balance of the whole robot needs them whatever the joints do.
+        The whole robot's momentum balance has gravity, Coriolis and centrifugal forces in any case.
         """
         return ca.MX.zeros(6) if self.bias else self._call("carrying_wrench")
 
     def velocity_change(self, torque: Any, force: Any, wrench: Any, time: Any) -> Any:
-        """Change of v (nv) from the time integrals of torque (n), contact force and sole wrenches (c), and
-        from time.
+        """Change of v (nv) from integrals of torque (n), contact force and sole wrenches (c), and from time.
 
         With double integrals in the arguments' place and time^2 / 2, the change of position.
         """
@@ -218,7 +211,7 @@ class _TreeQuantities:
     @cached_property
     def sole_jacobian(self) -> Any:
         """J_c (c, nv), LOCAL_WORLD_ALIGNED at the sole frames."""
-        return ca.vertcat(*[self.rb.jacobian(frame) for frame in self.soles])
+        return ca.vertcat(ca.SX(0, self.rb.nv), *[self.rb.jacobian(frame) for frame in self.soles])
 
     @cached_property
     def bias_force(self) -> Any:
@@ -236,7 +229,7 @@ class _TreeQuantities:
     @property
     def sole_drift(self) -> Any:
         drifts = [self.rb.frame_acceleration(frame, self.rb.v, None) for frame in self.soles]
-        return ca.vertcat(*drifts) if drifts else ca.SX(0, 1)
+        return ca.vertcat(ca.SX(0, 1), *drifts)
 
     @property
     def sole_positions(self) -> Any:
@@ -254,11 +247,8 @@ class _TreeQuantities:
     def velocity_change(self) -> Any:
         torque, force, weight = ca.SX.sym("torque", self.robot.n), ca.SX.sym("force"), ca.SX.sym("weight")
         wrench = ca.SX.sym("wrench", 6 * len(self.soles))
-        push = (
-            ca.vertcat(ca.SX.zeros(self.base, 1), torque) - self.hand_row.T * force - self.bias_force * weight
-        )
-        if self.soles:
-            push += ca.mtimes(self.sole_jacobian.T, wrench)
+        push = ca.vertcat(ca.SX.zeros(self.base, 1), torque) - self.hand_row.T * force
+        push += ca.mtimes(self.sole_jacobian.T, wrench) - self.bias_force * weight
         change = ca.densify(self.rb.factorize().solve(push))
         inputs = [self.rb.q, self.rb.v, self.normal, torque, force, wrench, weight]
         return ca.Function("velocity_change", inputs, [change])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -50,9 +51,8 @@ def frozen_dynamics(sdc: SDC) -> FrozenDynamics:
 
 
 def number_of_steps(sdc: SDC) -> int:
-    """Steps that reach the horizon; with events located, each joint may leave and come back once on the
-    way."""
-    steps = round(sdc.horizon / sdc.step + 0.5 - 1e-9)
+    """Steps that reach the horizon; where they end on events, with two events a joint on the way."""
+    steps = ceil(sdc.horizon / sdc.step - 1e-9)
     return steps + (2 * sdc.robot.n + 4 if sdc.method == "events" else 0)
 
 
@@ -63,8 +63,7 @@ def collision_graph(sdc: SDC, outputs: tuple[str, ...], *, every: int = 1) -> An
 
 
 def gradient_graph(sdc: SDC, output: str) -> Any:
-    """ca.Function (q, v[, feedforward], *settings) -> (output, d/dq (nv), d/dv (nv)), q's in the basis of
-    v."""
+    """ca.Function (q, v[, feedforward], *settings) -> (output, d/dq (nv), d/dv (nv)), both in v's basis."""
     inputs, (value,) = _expressions(sdc, (output,), 1)
     rb = RigidBody(sdc.robot.model)
     tangent = ca.Function("tangent", [rb.q], [rb.tangent_map()])

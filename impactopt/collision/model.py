@@ -1,5 +1,4 @@
-"""The collision in joint space: its state, and the forces in it, for one instant (paper, eqs. 9, 11, 12,
-15-17)."""
+"""The collision in joint space: its state, and the forces in it, at one instant (paper, eqs. 9-12, 15-17)."""
 
 from __future__ import annotations
 
@@ -135,8 +134,7 @@ class JointSpaceModel:
 
     @cached_property
     def _product_function(self) -> Any:
-        """A times a vector as a function of its own, straight-line code: twice as fast as CasADi's loop,
-        and short."""
+        """A times a vector: as straight-line code of its own twice as fast as CasADi's loop."""
         lower, x = ca.SX.sym("A", self.n * (self.n + 1) // 2), ca.SX.sym("x", self.n)
         A = ca.tril2symm(ca.SX(ca.Sparsity.lower(self.n), lower))
         return ca.Function("product", [lower, x], [ca.mtimes(A, x)])

@@ -53,8 +53,8 @@ class SDC:
     stance : what holds the robot; None: all soles, or the fixed base.
     terms : effects that are taken into account.
     friction : of the joints, with terms.friction.
-    method : "events", Taylor steps of order 4 that end on events (impulse within 1e-9 relative of the exact
-        solution); or "rk4", the paper's fixed Runge-Kutta steps (1e-6).
+    method : "events", Taylor steps of order six that end on events (impulse within 1e-6 relative of the exact
+        solution, most often within 1e-9); or "rk4", the paper's fixed Runge-Kutta steps.
     step : [s] length of a step, below `stable_step(q)`; the fastest mode of the servo limits it, accuracy
         does not.
     horizon : [s] the contact should end before this; a contact that ends sooner costs no more for it.
@@ -75,7 +75,7 @@ class SDC:
     terms: Terms = field(default_factory=Terms)
     friction: JointFriction | None = None
     method: str = "events"
-    step: float = 2e-4
+    step: float = 2.5e-4
     horizon: float = 0.2
     report: Callable[[str], None] | None = None
     _functions: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
@@ -115,10 +115,11 @@ class SDC:
         horizon: float = 0.1,
         report: Callable[[str], None] | None = None,
     ) -> SDC:
-        """The paper's model: servo damping and saturation (eqs. 11, 12), friction where given, Runge-Kutta
-        at 1e-4 s.
+        """The paper's model: servo damping and saturation (eqs. 11, 12), and friction where it is given.
 
-        Law, target and stance are those of its section III unless given: k = 1e4 N/m, d = 300 N s/m, a free
+        Runge-Kutta steps of 1e-4 s, as in its section III.
+
+        Law, target and stance are the paper's unless given: k = 1e4 N/m, d = 300 N s/m, a free
         mass of 5 kg, and virtual bases of 1e5 kg and 1e5 kg m2.
         """
         if stance is None:
@@ -203,23 +204,10 @@ class SDC:
     @cached_property
     def _recipe(self) -> tuple[Any, ...]:
         model = model_hash(self.robot.model)
-        parts = (
-            _source(self.law),
-            _source(self.target),
-            repr(self.held_by),
-            self.held_by.constraint_frames(self.robot),
-        )
+        stance = (repr(self.held_by), self.held_by.constraint_frames(self.robot))
         transition = self.joint_friction.transition if self.terms.friction else None
-        return (
-            model,
-            self.striker,
-            *parts,
-            self.terms,
-            transition,
-            self.method,
-            self.step,
-            number_of_steps(self),
-        )
+        kinds = (_source(self.law), _source(self.target), self.terms, transition)
+        return (model, self.striker, *stance, *kinds, self.method, self.step, number_of_steps(self))
 
     def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
         for name in parameters:
@@ -293,23 +281,24 @@ class SDC:
         return result
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
-        """[s] that the step has to stay below at q: 2.785 over the fastest mode's rate, no joint saturated."""
+        """[s] that the step has to stay below at q: 2.6 over the fastest mode's rate, no joint saturated."""
         q = self.robot.check_configuration(q)
         values = self.settings.override(overrides)
-        names = ("A", "s", "m")
-        frozen = self._compiled("frozen", names, lambda: frozen_dynamics(self).function("frozen", names))
-        data = dict(zip(names, frozen(q, np.zeros(self.robot.nv), values["normal"]), strict=True)) | values
+        frozen, slope = self._stability
+        found = frozen(q, np.zeros(self.robot.nv), values["normal"])
+        data = dict(zip(frozen.name_out(), found, strict=True)) | values
         if self.terms.bias or self.terms.jdot:
             data |= {"d": np.zeros(self.robot.n), "e": 0.0}
-        return longest_stable_step(joint_space_model(self), self._slope, data)
+        return longest_stable_step(joint_space_model(self), slope, data)
 
     @cached_property
-    def _slope(self) -> Any:
-        return slope_function(joint_space_model(self))
+    def _stability(self) -> tuple[Any, Any]:
+        frozen = frozen_dynamics(self).function("frozen", ("A", "s", "m"))
+        return frozen, slope_function(joint_space_model(self))
 
 
 def _source(thing: Any) -> str:
-    """What tells two laws or two targets apart besides their numbers: the class, and the text of a user's own."""
+    """What tells two laws, or two targets, apart besides their numbers: the class, and a user's text."""
     kind = type(thing)
     name = f"{kind.__module__}.{kind.__qualname__}"
     if kind.__module__.startswith("impactopt."):

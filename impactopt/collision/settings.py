@@ -1,5 +1,4 @@
-"""The numbers of a collision that are inputs of its functions, so that one compiled library serves all
-values."""
+"""The numbers of a collision that are inputs of its functions: one compiled library serves all values."""
 
 from __future__ import annotations
 
@@ -20,6 +19,10 @@ Array = NDArray[np.float64]
 
 # name: whether it has to be positive, or may be zero too
 _SIGN = {"kp": ">= 0", "kd": ">= 0", "torque_limit": "> 0", "viscous": ">= 0", "coulomb": ">= 0"}
+
+
+# infinity would make 0 x infinity out of a limit that is not reached
+_NO_LIMIT = 1e12  # [N m]
 
 
 class Settings(Mapping[str, Array]):
@@ -71,11 +74,12 @@ class Settings(Mapping[str, Array]):
         }
 
     def _check(self, name: str, value: ArrayLike) -> Array:
-        shape = self._values[name].shape
+        shape = (3,) if name == "normal" else self._values[name].shape
         if shape and name != "normal" and np.ndim(value) == 0:
             value = np.full(shape, value)
-        # a limit of infinity is no limit
         array = check_array(name, value, shape, finite=name != "torque_limit")
+        if name == "torque_limit":
+            array = np.minimum(array, _NO_LIMIT)
         if name == "normal" and abs(np.linalg.norm(array) - 1.0) > 1e-6:
             raise InputError(
                 f"normal: not a unit vector (length {np.linalg.norm(array):.6g}); divide it by its length"

@@ -12,9 +12,9 @@ from .runge_kutta import rate_of_change
 
 __all__ = ["longest_stable_step", "slope_function"]
 
-# the classical Runge-Kutta method (and Taylor's of the same order) is stable for |rate| h up to this on the
-# negative axis
-_LIMIT = 2.785
+# the classical Runge-Kutta method and Taylor's of order six are both stable for decaying modes with |rate|
+# h up to this
+_LIMIT = 2.6
 
 
 def slope_function(model: JointSpaceModel) -> Any:
@@ -25,7 +25,7 @@ def slope_function(model: JointSpaceModel) -> Any:
 
 
 def longest_stable_step(model: JointSpaceModel, slope: Any, data: dict[str, Any]) -> float:
-    """[s] beyond which a step is unstable: no joint saturated, friction in its transition band, 1 mm penetrated."""
+    """[s] beyond which a step is unstable, with no joint saturated and friction in its transition band."""
     worst = dict(data)
     for name in {"feedforward", "joint_velocity"} & {*model.data}:
         worst[name] = np.zeros(model.n)

@@ -2,9 +2,9 @@
 
 Between events (end of compression, separation, a joint entering or leaving saturation or its friction's
 transition band) the equations are smooth, and linear but for the contact law. So a step takes the phase at
-its start, computes the state's first four time derivatives, looks along Taylor's polynomials for the first
-event, and ends there or after its full length. For linear equations that is the classical Runge-Kutta step
-(the same polynomial for the same work) with events located.
+its start, computes the state's first time derivatives, looks along Taylor's polynomials for the first event,
+and ends there or after its full length. Each order costs one product with the robot's inverse inertia, as a
+stage of a Runge-Kutta method does; for linear equations of order four it is the classical one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from .model import JointSpaceModel
 
 __all__ = ["taylor_step"]
 
-ORDER = 4
+# with steps of 0.25 ms the sixth order is worth 200 times the accuracy of the fourth, for half as much again
+ORDER = 6
 
 
 def taylor_step(model: JointSpaceModel, length: float) -> Any:
@@ -86,11 +87,8 @@ class _Motion:
     def _order(self, k: int) -> None:
         """The state's derivatives of order k + 1."""
         model, jets = self.model, self.jets
-        u, tau, f = (
-            ca.SX.sym(f"velocity_{k}", model.n),
-            ca.SX.sym(f"torque_{k}", model.n),
-            ca.SX.sym(f"force_{k}"),
-        )
+        u, tau = ca.SX.sym(f"velocity_{k}", model.n), ca.SX.sym(f"torque_{k}", model.n)
+        f = ca.SX.sym(f"force_{k}")
         self.symbols += [u, tau, f]
         self.stages.append([self._torque(k, u), self._force(k)])
         self.forces.append(f)
@@ -119,11 +117,8 @@ class _Motion:
 
     def _force(self, k: int) -> Any:
         """k-th derivative of the force, and of the rate of penetration (paper, eqs. 15-17)."""
-        model, law, target = (
-            self.model,
-            self.model.law_numbers(self.data),
-            self.model.target_numbers(self.data),
-        )
+        model = self.model
+        law, target = model.law_numbers(self.data), model.target_numbers(self.data)
         speed = model.hand_speed_change(self._y(k), self.data)
         if k == 0:
             speed = speed + self.data["hand_speed"]

@@ -43,7 +43,7 @@ def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
     return {
         "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl},
         "contact": {"point": 3, "velocity": 3},
-        "coasting_legs": {"rate": c.nl, "acceleration": c.nl},
+        "coasting": {"closure": 6 * soles, "twist": 6 * soles},
         "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n},
         "force": {"law": 1, "target": 1, "rate": 1, "penetration": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
@@ -102,27 +102,34 @@ def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
     return ca.Function("striker", [rb.q, rb.v, rb.a], outs)
 
 
-def coasting_legs(c: StanceCoordinates) -> BlockExpression:
-    """Leg joint rates and accelerations of the reference that coasts from contact on.  z = y, legs, ydot; out = rates, accelerations."""
-    y, legs, u = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("u", c.ny)
-    v, a = c.motion(y, legs, u, ca.SX.zeros(c.ny))
-    return _block([y, legs, u], [], {"rate": _leg_part(c, v), "acceleration": _leg_part(c, a)})
+def coasting(c: StanceCoordinates) -> BlockExpression:
+    """The legs of the reference that coasts through the collision: soles in place and at rest, as residuals.
+
+    z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s];  p = s (place in the phase), 1 in restitution else 0.
+    out = pose error of the held soles [m, rad], twist of the held soles [m/s, rad/s].
+    """
+    y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
+    legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
+    T1, T, s, after = (ca.SX.sym(name) for name in ("T1", "T", "s", "after"))
+    y = y0 + u0 * (after * T1 + T * s)
+    out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
+    return _block([y0, u0, T1, T, legs, rates], [s, after], out)
 
 
 def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision: H, J and bias frozen anew at the point (steps 1b to 6b).
 
-    The servo (equations 10, 12 as rows) follows a reference that coasts at its velocity at contact, legs to second order in time:
+    The servo (equation 10; 12 as rows) follows a reference that coasts at its velocity at contact:
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
-    z = y0, legs0, u0 (ydot) at contact; r1, r2 leg rates and accelerations of the coasting reference; feed-forward over torque limit (n);
+    z = y0, u0 (ydot) at contact; legs and leg rates of the coasting reference; feed-forward over torque limit (n);
     d1, T1, d, T: y = y0 + T1 d1 + T d; u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
     p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight [N], lever [m].
     out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit.
     """
     ny, n, nl = c.ny, c.robot.n, c.nl
     y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
-    legs0, r1, r2, legs = (ca.SX.sym(s, nl) for s in ("legs0", "r1", "r2", "legs"))
+    ref_legs, ref_rates, legs = (ca.SX.sym(s, nl) for s in ("ref_legs", "ref_rates", "legs"))
     ff, w = ca.SX.sym("ff", n), ca.SX.sym("w", 6 * len(c.legs))
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
     normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
@@ -137,8 +144,8 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
     row = ca.Function("row", [rb.q], [ca.densify(rb.jacobian(f"striker:{striker}")[:3, :])])(q)
     tau = rnea(q, v, a) + ca.mtimes(row.T, normal) * f - c.sole_wrench_map(legs, w)
     # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
-    ahead = c.configuration(y0 + u0 * t - y, legs0 + r1 * t + 0.5 * r2 * t**2 - legs)[c.base :]
-    faster = c.configuration(u0 - u, r1 + r2 * t)[c.base :] - c.configuration(ca.SX.zeros(ny), _leg_part(c, v))[c.base :]
+    ahead = c.configuration(y0 + u0 * t - y, ref_legs - legs)[c.base :]
+    faster = c.configuration(u0 - u, ref_rates - _leg_part(c, v))[c.base :]
     servo = ff + (kp * ahead + kd * faster) / limit
     out = {
         "closure": c.closure(y, legs),
@@ -146,7 +153,7 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
         "joints": tau[c.base :] / limit - servo,
         "torque": servo,
     }
-    z = [y0, legs0, u0, r1, r2, ff, d1, T1, d, T, u, u1, legs, f, w]
+    z = [y0, u0, ref_legs, ref_rates, ff, d1, T1, d, T, u, u1, legs, f, w]
     return _block(z, [normal, s, after, kp, kd, limit, weight, lever], out)
 
 
@@ -219,5 +226,5 @@ def builders(
         "collision": lambda: collision(c, striker),
         "force": lambda: force(c, striker, law),
         "link": link,
-        **({"coasting_legs": lambda: coasting_legs(c), "balance": lambda: balance(c, edges)} if c.legs else {}),
+        **({"coasting": lambda: coasting(c), "balance": lambda: balance(c, edges)} if c.legs else {}),
     }

@@ -96,5 +96,7 @@ def _collision(t: Transcription, x: Array, y: Array, rates: Array, legs: Array) 
     if c.legs:
         t.hit_legs.write(x, legs)
         t.hit_w.write(x, t.swing_w.read(x)[-1:])
-        _, v, a = c.complete_motion(y, rates, np.zeros(c.ny), legs)
-        t.leg_coast.write(x, np.stack([v[c.base + c.dependent], a[c.base + c.dependent]]))
+        for k, at in enumerate(elapsed):
+            legs = c.solve_legs(y + rates * at, legs)
+            v = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)[1]
+            x[t.coast_legs.index(k)], x[t.coast_rates.index(k)] = legs, v[c.base + c.dependent]

@@ -181,7 +181,8 @@ class Transcription:
             self._duration(f"{name} duration", p.contact_duration, 0.01) for name in ("compression", "restitution")
         ]
         self.u0 = add("rate at contact", 1, ny, labels=c.labels)
-        self.leg_coast = add("coasting legs", 2, nl, labels=c.leg_labels)  # rates, accelerations
+        self.coast_legs = add("coasting legs", nc, nl, labels=c.leg_labels)
+        self.coast_rates = add("coasting leg rates", nc, nl, labels=c.leg_labels)
         self.u = add("collision rate", nc, ny, labels=c.labels)
         self.d = add("collision travel", nc, ny, labels=c.labels)
         self.hit_legs = add("collision legs", nc, nl, **legs)
@@ -387,9 +388,9 @@ class Transcription:
     def _collision(self) -> None:
         p, r, c = self.problem, self.robot, self.coordinates
         y, _, _ = self.contact_state
-        legs, u0 = self.swing_legs[-1], self.u0[0]
+        u0 = self.u0[0]
         zero, none = Affine.zeros(self.ny), Affine.zeros(1)
-        collision, force, collision_p, force_p = [], [], [], []
+        coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
         gains = np.concatenate([r.kp, r.kd, r.torque_limit, [self.weight, LEVER]])
         for i, s in enumerate(self.stages):
             u, u1 = self._stage_slots(self.u, i, u0)
@@ -398,28 +399,31 @@ class Transcription:
             T1 = self.phase_T[0][0] if s.phase else none
             d1 = self.d[self.end[0]] if s.phase else zero
             x1 = self.xt[self.end[0]] if s.phase else none
-            coast = [self.leg_coast[0], self.leg_coast[1], self.feedforward[0]]
+            coast = [self.coast_legs[i], self.coast_rates[i]]
             travel = [d1, T1, self.d[i], T]
-            collision.append([y, legs, u0, *coast, *travel, u, u1, self.hit_legs[i], self.f[i], self.hit_w[i]])
+            coasting.append([y, u0, T1, T, *coast])
+            coasting_p.append([s.place, float(s.phase)])
+            ff, hit = self.feedforward[0], [self.hit_legs[i], self.f[i], self.hit_w[i]]
+            collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
             force.append([y, *travel, u, self.f[i], v, v1, self.xt[i], x1])
             collision_p.append(np.concatenate([p.normal, [s.place, float(s.phase)], gains]))
             force_p.append([*p.point, *p.normal, float(s.phase), 1 / p.target.mass, *p.law.parameters.values()])
             self._integral_rows(i)
         at = sum(b.count * b.n_out for b in self.blocks)
         if c.legs:
-            block = Block.make("coasting_legs", self.functions, [[y, legs, u0]], np.zeros(0))
+            block = Block.make("coasting", self.functions, coasting, np.array(coasting_p))
             self.blocks.append(block)
-            for k, what in enumerate(("rate", "acceleration")):
+            names = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
+            for i in range(block.count):
                 self.rows.add(
                     term="legs of the coasting reference",
-                    place=what,
-                    components=c.leg_labels,
-                    outputs=at + k * self.nl + np.arange(self.nl),
-                    affine=-self.leg_coast[k],
+                    place=self.stage_name(i),
+                    components=[*names, *[f"{n} rate" for n in names]],
+                    outputs=at + i * block.n_out + np.arange(block.n_out),
                     lower=0,
                     upper=0,
                 )
-            at += block.n_out
+            at += block.count * block.n_out
         block = Block.make("collision", self.functions, collision, np.array(collision_p))
         self.blocks.append(block)
         self._collision_rows(at, block.n_out)

@@ -99,7 +99,8 @@ class _World:
     def rates(self, t: float, s: _State) -> _Rates:
         model, data, scene = self.model, self.data, self.scene
         pin.computeJointJacobians(model, data, s.q)
-        jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)[:3]
+        jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)
+        jac = np.reshape(jac, (6, model.nv))[:3]  # pin drops an axis where nv is 1
         point = pin.updateFramePlacement(model, data, self.hand).translation
         row = scene.normal @ jac
         speed = float(row @ s.v)

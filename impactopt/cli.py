@@ -1,0 +1,219 @@
+"""The command line: `impactopt solve`, `impactopt check`, `impactopt robots`.
+
+What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
+Exit codes: 0 solved, 1 not solved, 2 bad input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import json
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from impactopt.output import Record
+    from impactopt.screen import Progress
+    from impactopt.solution import Solution
+
+__all__ = ["app", "main"]
+
+NOT_SOLVED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
+
+app = typer.Typer(
+    name="impactopt",
+    help="Impact motions of humanoid robots: planned by the impulse they deliver, checked in full dynamics.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ProblemFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Problem file, such as problems/punch.toml.")
+]
+
+
+class Solver(str, enum.Enum):
+    ipopt = "ipopt"
+    sqp = "sqp"
+
+
+def main() -> None:
+    """Entry point of the command `impactopt`."""
+    app()
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        from impactopt import __version__
+
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def solve(
+    file: ProblemFile,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
+    ] = None,
+    solver: Annotated[Solver | None, typer.Option(help="Instead of the one that FILE names.")] = None,
+    time_limit: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Stop the solver then; keep its best iterate.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
+) -> None:
+    """Plan the motion that a problem file asks for, replay it in full dynamics, write numbers and pictures.
+
+    Ctrl-C stops the solver; its best iterate is kept. Exit code: 0 solved, 1 not solved, 2 bad input.
+    """
+    with _plain_errors() as console:
+        from impactopt.output import make_directory
+        from impactopt.planner import solve as plan
+        from impactopt.problem_file import read_problem_file
+        from impactopt.screen import Progress
+
+        if time_limit is not None and not time_limit > 0:
+            raise typer.BadParameter(f"{time_limit:g}; give seconds > 0", param_hint="--time-limit")
+        read = read_problem_file(file)
+        chosen = solver.value if solver is not None else read.solver.name
+        with Progress(console, quiet=quiet) as progress:
+            progress.say(f"{file} is read; building the robot")
+            problem = read.build()
+            directory = make_directory(out if out is not None else Path("results") / file.stem)
+            progress.say("building the program (compiles for a minute or two the first time)")
+            solution = plan(
+                problem,
+                solver=chosen,
+                options=read.solver.options.get(chosen),
+                time_limit=time_limit if time_limit is not None else read.solver.time_limit,
+                report=progress.say,
+                callback=progress.iteration,
+            )
+            progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
+            record = _record(solution, read.text, validate, progress)
+            written = _write(record, directory, progress)
+        _show(record, written, as_json)
+        if not solution.status.usable:
+            raise typer.Exit(NOT_SOLVED)
+
+
+@app.command()
+def check(file: ProblemFile) -> None:
+    """Say whether a problem file is sound and its target within reach. Exit code: 0 sound, 2 not."""
+    with _plain_errors():
+        from impactopt.problem_file import load_problem
+
+        problem = load_problem(file)
+        typer.echo(f"{file} is sound:")
+        for name, value in problem.describe().items():
+            typer.echo(f"  {name:<8} {value}")
+
+
+@app.command()
+def robots() -> None:
+    """List the robots that problem files can name."""
+    with _plain_errors():
+        from impactopt.presets import load_robot, robot_names
+
+        for name in robot_names():
+            robot = load_robot(name)
+            mass = sum(float(body.mass) for body in robot.model.inertias)
+            typer.echo(f"{name}: {robot.n} joints, {mass:.0f} kg")
+            for kind, names in (
+                ("strikers", robot.strikers),
+                ("soles", [sole.name for sole in robot.soles]),
+                ("postures", robot.postures),
+            ):
+                typer.echo(f"  {kind:<9} {', '.join(names)}")
+
+
+def _record(solution: Solution, text: str, validate: bool, progress: Progress) -> Record:
+    """The solution as numbers, with its re-simulation where there is something to simulate."""
+    from impactopt.errors import InputError
+    from impactopt.output import record_of
+
+    simulation, violation = None, solution.result.max_violation
+    if validate and not violation <= WORTH_REPLAYING:
+        progress.say(f"no replay: rows of the plan are off by up to {violation:.2g}")
+    elif validate:
+        progress.say("replaying the plan in full dynamics")
+        try:
+            simulation = solution.validate()
+        except KeyboardInterrupt:
+            progress.say("the replay was interrupted; the plan is kept without it")
+        except InputError as error:
+            progress.say(f"the plan is kept without a replay: {error}")
+    return record_of(solution, simulation=simulation, problem=text)
+
+
+def _write(record: Record, directory: Path, progress: Progress) -> list[Path]:
+    from impactopt.output import save_record
+
+    written = [*save_record(record, directory)]
+    progress.say("drawing pictures")
+    from impactopt.plotting import save_pictures
+
+    return written + save_pictures(record, directory)
+
+
+def _show(record: Record, written: list[Path], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(record.summary, indent=2))
+        return
+    from rich.console import Console
+
+    from impactopt.screen import result_table, violation_table
+
+    console, summary = Console(), record.summary
+    if record.completed:
+        console.print(result_table(summary))
+    for text in (summary.get("note"), summary.get("simulated", {}).get("error")):
+        if text:
+            console.print(text, markup=False, highlight=False)
+    if summary["violations"]:
+        console.print(violation_table(summary["violations"]))
+    console.print(
+        f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
+        f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
+        highlight=False,
+    )
+    names = ", ".join(path.name for path in written)
+    console.print(f"{written[0].parent}: {names}", highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def _plain_errors() -> Iterator[Console]:
+    """A console on stderr; bad input and warnings as plain messages there, without tracebacks."""
+    from rich.console import Console
+
+    from impactopt.errors import InputError
+
+    console = Console(stderr=True)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_a, **_k: console.print(f"warning: {message}", markup=False)
+        try:
+            yield console
+        except InputError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            typer.echo("interrupted before there was a plan to keep", err=True)
+            raise typer.Exit(INTERRUPTED) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""What a solve leaves on disk: `solution.npz` with all numbers, and `summary.json` for a glance.
+
+`solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
+its place and then moved there, so that a reader never sees half of one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.solution import Solution
+
+__all__ = ["Record", "load_record", "make_directory", "record_of", "save_record", "write_file"]
+
+FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
+NUMBERS, SUMMARY = "solution.npz", "summary.json"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Record:
+    """A solution as numbers and text only: what is kept, drawn and compared.
+
+    summary : the content of `summary.json`.
+    problem : text of the problem file, "" if there was none.
+    arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
+        corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
+        by field, `reference_*` (`impactopt.plan.Trajectory`), `plan_*` (`Plan`), `swing_*`, `follow_*` (its
+        splines), `collision_*` (`PlannedCollision`), `simulated_*` (`Simulation`), `solver_*`
+        (`SolverResult`), `history_*` (its iterations).
+    """
+
+    summary: dict[str, Any]
+    problem: str = ""
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict, repr=False)
+
+    @property
+    def completed(self) -> bool:
+        """Whether the planned motion is part of the record."""
+        return "reference_time" in self.arrays
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a re-simulation is part of the record."""
+        return "simulated_time" in self.arrays
+
+
+def record_of(solution: Solution, *, simulation: Any | None = None, problem: str = "") -> Record:
+    """The record of a solution, of its re-simulation if there is one, and of the problem file's text.
+
+    There is always one: where the solver was stopped so early that legs and base do not fit together, it has
+    no `reference_*`, and a summary without the motion's numbers and with a `note` that says why.
+    """
+    plan, robot, result = solution.plan, solution.problem.robot, solution.result
+    arrays: dict[str, Any] = {
+        "joints": np.array(robot.joint_names),
+        "torque_limit": robot.torque_limit,
+        "velocity_limit": robot.velocity_limit,
+        "polygon": plan.polygon,
+    }
+    for leg in plan.coordinates.legs:
+        corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
+        world = corners @ leg.placement.rotation.T + leg.placement.translation
+        arrays[f"sole_{leg.sole.name}"] = world[:, :2]
+    parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
+    parts |= {"collision": plan.collision, "solver": result}
+    summary = _summary(solution, simulation)
+    if "note" not in summary:
+        parts["reference"] = solution.trajectory
+    if simulation is not None:
+        parts["simulated"] = simulation
+    for prefix in {"reference", "simulated"} & parts.keys():
+        arrays[f"{prefix}_angle"] = np.array([robot.joint_positions(q) for q in parts[prefix].q])
+    for prefix, thing in parts.items():
+        arrays |= {f"{prefix}_{name}": value for name, value in _numbers(thing).items()}
+    if result.history:
+        history = [_numbers(iteration) for iteration in result.history]
+        arrays |= {f"history_{name}": [row[name] for row in history] for name in history[0]}
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    return Record(summary=_plain(summary), problem=problem, arrays=arrays)
+
+
+def _summary(solution: Solution, simulation: Any | None) -> dict[str, Any]:
+    try:
+        return solution.summary(simulation)
+    except InputError as error:
+        if simulation is not None:  # such as one that missed the target
+            return {**_summary(solution, None), "simulated": {"error": str(error)}}
+        return {
+            "status": solution.status.value,
+            "message": solution.result.message,
+            "note": f"the plan's motion cannot be completed: {error}",
+            "solver": solution.solver,
+            "iterations": solution.result.iterations,
+            "solve_seconds": solution.solve_seconds,
+            "build_seconds": solution.build_seconds,
+            "max_violation": solution.result.max_violation,
+            "violations": [{"row": name, "amount": amount} for name, amount in solution.violations],
+            "problem": solution.problem.describe(),
+        }
+
+
+def _numbers(thing: Any) -> dict[str, Any]:
+    """The fields of a dataclass that are numbers or arrays."""
+    values = {f.name: getattr(thing, f.name) for f in dataclasses.fields(thing)}
+    kinds = (int, float, np.ndarray, np.generic)
+    return {name: value for name, value in values.items() if isinstance(value, kinds)}
+
+
+def _plain(value: Any) -> Any:
+    """`value` as JSON has it; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def make_directory(directory: str | os.PathLike[str]) -> Path:
+    """The directory, made if it is not there; before hours of work are lost for want of it.
+
+    Raises
+    ------
+    InputError : it cannot be made, or nothing can be written there.
+    """
+    path = Path(directory)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the directory {path}: {error.strerror}; give another one") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write into {path}; give another directory")
+    return path
+
+
+def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """Write `solution.npz` and `summary.json` into the directory, which is made if it is not there.
+
+    Raises
+    ------
+    InputError : they cannot be written.
+    """
+    path = make_directory(directory)
+    summary = json.dumps(_plain(record.summary), indent=2, allow_nan=False)
+    extra = {"summary_json": summary, "problem_toml": record.problem, "format": FORMAT}
+    numbers: dict[str, Any] = {**record.arrays, **extra}
+    write_file(path / NUMBERS, lambda file: np.savez(file, **numbers))
+    write_file(path / SUMMARY, lambda file: file.write(f"{summary}\n".encode()))
+    return path / NUMBERS, path / SUMMARY
+
+
+def write_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """Let `write` fill a new file that then takes the place of `path` in one step.
+
+    Raises
+    ------
+    InputError : it cannot be written; what was at `path` before is still there.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+        os.replace(temporary, path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise InputError(f"cannot write {path}: {error.strerror}") from error
+        raise
+
+
+def load_record(directory: str | os.PathLike[str]) -> Record:
+    """The record that `save_record` left in a directory.
+
+    Raises
+    ------
+    InputError : there is none, it is damaged, or of a newer impactopt.
+    """
+    path = Path(directory) / NUMBERS
+    mend = "solve again with `impactopt solve`"
+    try:
+        # from memory: np.load leaves a damaged file open
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            version = int(file["format"])
+            if version > FORMAT:
+                raise InputError(f"{path} is of a newer impactopt (format {version}); update impactopt")
+            arrays = {name: file[name] for name in file.files}
+        summary = json.loads(str(arrays.pop("summary_json")))
+        problem = str(arrays.pop("problem_toml"))
+        del arrays["format"]
+    except InputError:
+        raise
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise InputError(f"there is no {path}; {mend}") from error
+    except PermissionError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    # what NumPy and zipfile raise for files that are cut, overwritten or of another kind
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
+        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+    except (zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+    return Record(summary=summary, problem=problem, arrays=arrays)

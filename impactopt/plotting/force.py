@@ -1,0 +1,40 @@
+"""The contact force, planned and simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from impactopt.output import Record
+from impactopt.plotting.style import PLANNED, SIMULATED, title
+
+
+def force(record: Record) -> Figure:
+    """Contact force over the time since contact."""
+    a, summary = record.arrays, record.summary
+    figure = Figure(figsize=(7.0, 3.8))
+    axes = figure.subplots()
+    label = f"planned: {_impulse(summary)}"
+    axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", color=PLANNED, label=label, zorder=3)
+    end = 1e3 * float(a["collision_time"][-1])
+    if record.simulated and np.isfinite(a["simulated_contact_start"]):
+        time = 1e3 * (a["simulated_time"] - a["simulated_contact_start"])
+        keep = (time >= 0) & (time < 1.08 * end)
+        label = f"simulated: {_impulse(summary.get('simulated', {}))}"
+        # before contact there is no force, however coarsely the simulation was recorded
+        shown = np.concatenate([[-0.05 * end, 0.0], time[keep]])
+        value = np.concatenate([[0.0, 0.0], a["simulated_force"][keep]])
+        axes.plot(shown, value, color=SIMULATED, label=label)
+    axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
+    axes.set_title(title(record, "contact force"))
+    axes.set_ylim(bottom=0.0)
+    axes.legend(title="impulse")
+    return figure
+
+
+def _impulse(summary: Mapping[str, Any]) -> str:
+    value = summary.get("impulse_Ns")
+    return "unknown" if value is None else f"{value:.2f} N s"

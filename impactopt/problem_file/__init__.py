@@ -1,0 +1,11 @@
+"""Problem files: an `impactopt.problem.ImpactProblem` written in TOML, in SI units.
+
+* sections.py   the sections and keys of a file, and what they make
+* values.py     ranges of the keys' values
+* mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
+* reading.py    from file to problem
+"""
+
+from impactopt.problem_file.reading import ProblemFile, SolverSettings, load_problem, read_problem_file
+
+__all__ = ["ProblemFile", "SolverSettings", "load_problem", "read_problem_file"]

@@ -1,0 +1,161 @@
+"""From a problem file to a problem, in two steps: the text is checked, and then the robot is built."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from impactopt.errors import InputError, did_you_mean
+from impactopt.problem import ImpactProblem
+from impactopt.problem_file.mistakes import Mistake, mistakes_of, report_mistakes
+from impactopt.problem_file.sections import File
+from impactopt.robot import Robot
+from impactopt.stance import BothSoles, FixedBase, OneSole, Stance
+
+__all__ = ["ProblemFile", "SolverSettings", "load_problem", "read_problem_file"]
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """What a file's [solver] section says.
+
+    name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
+    """
+
+    name: str = "ipopt"
+    time_limit: float | None = None
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProblemFile:
+    """A problem file whose text is sound.
+
+    path, text : where it was read, and what it said.  solver : its [solver] section.
+    """
+
+    path: Path
+    text: str
+    solver: SolverSettings
+    content: File = field(repr=False)
+
+    def build(self) -> ImpactProblem:
+        """The problem, with its robot.
+
+        Raises
+        ------
+        InputError : what only shows with the robot: a URDF that is missing or not sound, an unknown joint or
+            frame; then an unknown striker, posture and sole, all at once; then a point out of reach.
+        """
+        content, mistakes = self.content, _Collector(self.text)
+        robot = mistakes.attempt(("robot",), lambda: content.make_robot(self.path.parent))
+        mistakes.raise_if_any(self.path)
+        assert robot is not None  # for mypy: it would have been a mistake
+        mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
+        mistakes.attempt(("problem", "start"), lambda: robot.posture(content.problem.start))
+        stance = mistakes.attempt(("stance", "soles"), lambda: _stance(content, robot))
+        mistakes.raise_if_any(self.path)
+        assert stance is not None
+        try:
+            return ImpactProblem(robot=robot, stance=stance, **content.arguments())
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from error
+
+
+def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
+    """The problem that a TOML file describes.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
+    """
+    return read_problem_file(path).build()
+
+
+def read_problem_file(path: str | os.PathLike[str]) -> ProblemFile:
+    """A problem file, checked as far as that is possible without its robot.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
+    """
+    path = Path(path)
+    text = _read(path)
+    tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is not TOML: {error}") from error
+    mistakes = _robot_given_once(data)
+    try:
+        content = File.model_validate(data)
+    except ValidationError as error:
+        mistakes += mistakes_of(error, File)
+    if mistakes:
+        raise InputError(report_mistakes(path, text, mistakes))
+    given = content.solver.model_dump(exclude_unset=True) if content.solver else {}
+    options: dict[str, Any] = {}
+    for solver in {"ipopt", "sqp"} & given.keys():
+        options[solver] = given.pop(solver)
+    return ProblemFile(path=path, text=text, content=content, solver=SolverSettings(**given, options=options))
+
+
+class _Collector:
+    """Gathers the mistakes of several attempts."""
+
+    def __init__(self, text: str) -> None:
+        self._text, self._mistakes = text, list[Mistake]()
+
+    def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
+        """What `make` gives; None, and a mistake at `place`, if it raises an InputError."""
+        try:
+            return make()
+        except InputError as error:
+            self._mistakes.append(Mistake(place=place, sections=1, text=str(error)))
+            return None
+
+    def raise_if_any(self, path: Path) -> None:
+        if self._mistakes:
+            raise InputError(report_mistakes(path, self._text, self._mistakes))
+
+
+def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
+    section = data.get("problem")
+    named, table = isinstance(section, Mapping) and "robot" in section, "robot" in data
+    if named != table:
+        return []
+    text = "given twice: keep this, or the section [robot]" if named else "missing; name a preset"
+    return [Mistake(place=("problem", "robot"), sections=1, text=text)]
+
+
+def _stance(content: File, robot: Robot) -> Stance:
+    soles = content.stance.soles if content.stance else "both"
+    stance: Stance = BothSoles() if soles == "both" else OneSole(soles)
+    if not robot.floating:
+        if content.stance:
+            raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
+        stance = FixedBase()
+    stance.soles(robot)
+    return stance
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        folder = path.parent
+        near = did_you_mean(path.name, [p.name for p in folder.glob("*.toml")]) if folder.is_dir() else ""
+        raise InputError(f"there is no file {path}{near}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not text in UTF-8: {error.reason} at byte {error.start}") from error
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error

@@ -1,0 +1,264 @@
+"""The sections of a problem file: their keys and units.
+
+Each model is a section; its fields are the keys, by their `alias` where a unit belongs to the name. `build`
+makes the class `kind` from the keys that are given: defaults and further checks are that class's own, and
+stand nowhere twice.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+
+from impactopt import terms
+from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
+from impactopt.presets import load_robot
+from impactopt.problem import ImpactProblem, Phase
+from impactopt.problem_file.values import (
+    Duration,
+    Fraction,
+    Fractions,
+    IpoptOptions,
+    NotNegative,
+    PerJoint,
+    Point2,
+    Positive,
+    Preset,
+    Range,
+    UnitVector,
+    Vector,
+)
+from impactopt.robot import Robot, Sole, Striker
+from impactopt.sqp import SQPOptions
+
+
+def _optional(key: str | None = None) -> Any:
+    """A key that may be left out; the class that is built has the default."""
+    return Field(default=None, alias=key)
+
+
+class Section(BaseModel):
+    """A section; unknown keys, NaN, infinity and text where a number belongs are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+    kind: ClassVar[Any] = None
+
+    def given(self) -> dict[str, Any]:
+        """The keys that the file has, by the names of the class's fields."""
+        return self.model_dump(exclude_unset=True)
+
+    def build(self) -> Any:
+        """The thing that this section describes."""
+        return self.kind(**self.given())
+
+    @model_validator(mode="after")
+    def _can_be_built(self) -> Section:
+        if self.kind is not None:
+            self.build()
+        return self
+
+
+class Problem(Section):
+    name: str = _optional()
+    robot: Preset = _optional()
+    striker: str
+    point: Vector = Field(alias="point_m")
+    normal: UnitVector
+    start: str = cast(str, ImpactProblem.start)
+
+
+class Target(Section):
+    kind = FreeMass
+    mass: Positive = Field(alias="mass_kg")
+
+
+class Contact(Section):
+    kind = SpringDamper
+    stiffness: Positive = Field(alias="stiffness_N_m")
+    damping: NotNegative = Field(alias="damping_N_s_m")
+
+
+class Stance(Section):
+    soles: str = "both"
+
+
+class PhaseSection(Section):
+    kind = Phase
+    duration: Duration = Field(alias="duration_s")
+    intervals: int = _optional()
+    grading: float = _optional()
+
+
+class Collision(Section):
+    """`compression`, `restitution`: lengths of their collocation elements, as fractions; `stages` in each."""
+
+    contact_duration: Duration = _optional("duration_s")
+    collision_stages: Literal[2, 3] = _optional("stages")
+    compression: Fractions = _optional()
+    restitution: Fractions = _optional()
+
+
+class Objective(Section):
+    smoothness: NotNegative = _optional()
+    wrench_price: NotNegative = _optional()
+
+
+class TorqueLimit(Section):
+    kind = terms.TorqueLimit
+    fraction: Fraction = _optional()
+    collision: Fraction = _optional()
+
+
+class VelocityLimit(Section):
+    kind = terms.VelocityLimit
+    fraction: Fraction = _optional()
+
+
+class PositionLimit(Section):
+    kind = terms.PositionLimit
+    margin: NotNegative = _optional("margin_rad")
+
+
+class ContactWrenchCone(Section):
+    kind = terms.ContactWrenchCone
+    friction: Positive = _optional()
+    margin: NotNegative = _optional("margin_m")
+    collision_margin: NotNegative = _optional("collision_margin_m")
+    minimum_force: NotNegative = _optional("minimum_force_N")
+
+
+class Balance(Section):
+    kind = terms.Balance
+    capture_margin: NotNegative = _optional("capture_margin_m")
+    vertical_speed: NotNegative = _optional("vertical_speed_m_s")
+    angular_momentum: NotNegative = _optional("angular_momentum_N_m_s")
+
+
+class Incidence(Section):
+    kind = terms.Incidence
+    speed: NotNegative = _optional("speed_m_s")
+
+
+class Terms(Section):
+    torque_limit: TorqueLimit = _optional()
+    velocity_limit: VelocityLimit = _optional()
+    position_limit: PositionLimit = _optional()
+    contact_wrench_cone: ContactWrenchCone = _optional()
+    balance: Balance = _optional()
+    incidence: Incidence = _optional()
+
+
+_SQP_KEYS: dict[str, Any] = {
+    name: (hint, _optional()) for name, hint in get_type_hints(SQPOptions).items() if name != "time_limit"
+}
+SQP: Any = create_model("SQP", __base__=Section, **_SQP_KEYS)
+SQP.kind = SQPOptions
+
+
+class Solver(Section):
+    name: Literal["ipopt", "sqp"] = _optional()
+    time_limit: Positive = _optional("time_limit_s")
+    ipopt: IpoptOptions = _optional()
+    sqp: SQP = _optional()
+
+
+class SoleSection(Section):
+    kind = Sole
+    name: str
+    frame: str
+    polygon: list[Point2] = Field(alias="polygon_m")
+
+
+class StrikerSection(Section):
+    kind = Striker
+    name: str
+    frame: str
+    point: Vector = Field(alias="point_m")
+
+
+class RobotSection(Section):
+    """A preset with changes, or a URDF; files are relative to the problem file.
+
+    A preset keeps its own strikers beside the section's.
+    """
+
+    preset: Preset = _optional()
+    urdf: str = _optional()
+    srdf: str = _optional()
+    name: str = _optional()
+    floating: bool = _optional()
+    locked: dict[str, float] = _optional("locked_rad")
+    armature: PerJoint = _optional("armature_kg_m2")
+    kp: PerJoint = _optional("kp_N_m_rad")
+    kd: PerJoint = _optional("kd_N_m_s_rad")
+    torque_limit: PerJoint = _optional("torque_limit_N_m")
+    velocity_limit: PerJoint = _optional("velocity_limit_rad_s")
+    position_limit: dict[str, Range] = _optional("position_limit_rad")
+    soles: list[SoleSection] = _optional()
+    strikers: list[StrikerSection] = _optional()
+    postures: dict[str, dict[str, float]] = _optional("postures_rad")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RobotSection:
+        if ("preset" in self.model_fields_set) == ("urdf" in self.model_fields_set):
+            raise ValueError("give either preset or urdf")
+        return self
+
+    def make(self, folder: Path) -> Robot:
+        """The robot; relative files are in `folder`."""
+        options = self.given()
+        for file in ("urdf", "srdf"):
+            if file in options:
+                options[file] = folder / options[file]
+        if "soles" in options:
+            options["soles"] = [sole.build() for sole in self.soles]
+        if "position_limit" in options:
+            options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
+        strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
+        if "urdf" in options:
+            return Robot.from_urdf(options.pop("urdf"), strikers=strikers, **options)
+        robot = load_robot(options.pop("preset"), **options)
+        for striker in strikers:
+            robot = robot.with_striker(striker)
+        return robot
+
+
+class File(Section):
+    """A whole problem file."""
+
+    problem: Problem
+    robot: RobotSection = _optional()
+    target: Target
+    contact: Contact
+    stance: Stance = _optional()
+    swing: PhaseSection = _optional()
+    follow: PhaseSection = _optional()
+    collision: Collision = _optional()
+    objective: Objective = _optional()
+    terms: Terms = _optional()
+    solver: Solver = _optional()
+
+    def make_robot(self, folder: Path) -> Robot:
+        """The robot of [robot], or the preset that [problem] names."""
+        return self.robot.make(folder) if self.robot is not None else load_robot(self.problem.robot)
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""
+        out = {name: value for name, value in self.problem.given().items() if name != "robot"}
+        out |= {"law": self.contact.build(), "target": self.target.build()}
+        out |= {name: getattr(self, name).build() for name in ("swing", "follow") if getattr(self, name)}
+        out |= self.objective.given() if self.objective else {}
+        if self.collision is not None:
+            given = self.collision.given()
+            first, second = ImpactProblem.collision_elements
+            elements = given.pop("compression", first), given.pop("restitution", second)
+            if "contact_duration" in given:
+                given["contact_duration"] = tuple(given["contact_duration"])
+            out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
+        if self.terms is not None:
+            found = (getattr(self.terms, name) for name in Terms.model_fields)
+            out["terms"] = tuple(term.build() for term in found if term is not None)
+        return out

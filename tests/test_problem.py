@@ -1,0 +1,259 @@
+"""Problems: what is wrong with one is said when it is written, before anything is built."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from small_robots import arm, biped
+
+from impactopt import codegen
+from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
+from impactopt.errors import InputError
+from impactopt.problem import ImpactProblem, Phase
+from impactopt.robot import Robot
+from impactopt.planner import solve
+from impactopt.stance import BothSoles, FixedBase, OneSole
+from impactopt.terms import (
+    DEFAULT_TERMS,
+    Balance,
+    ContactWrenchCone,
+    Incidence,
+    PositionLimit,
+    Term,
+    TorqueLimit,
+    VelocityLimit,
+)
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def robot() -> Robot:
+    return biped()
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bad input is refused before any function is built."""
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise AssertionError("functions are being built")
+
+    monkeypatch.setattr(codegen, "cached", refuse)
+    monkeypatch.setattr("impactopt.nlp.transcription.cached", refuse)
+
+
+def problem(robot: Robot, **changes: Any) -> ImpactProblem:
+    settings: dict[str, Any] = {
+        "robot": robot,
+        "striker": "fist",
+        "point": [0.5, -0.15, 1.1],
+        "normal": [1.0, 0.0, 0.0],
+        "law": SpringDamper(stiffness=1e4, damping=300.0),
+        "target": FreeMass(mass=3.0),
+    }
+    return ImpactProblem(**{**settings, **changes})
+
+
+def posture(robot: Robot, **angles: float) -> Array:
+    """The half-sitting posture with some joint angles changed (spaces in names as underscores)."""
+    q = robot.posture("half_sitting")
+    for name, angle in angles.items():
+        q[7 + robot.joint_index(name.replace("_", " "))] = angle
+    return q
+
+
+# ---- what a good one holds
+
+
+def test_a_good_problem_has_numbers_and_a_contact_posture(robot: Robot) -> None:
+    p = problem(robot)
+    assert p.point.dtype == np.float64
+    np.testing.assert_array_equal(p.start_posture, robot.posture("half_sitting"))
+    assert p.contact_posture.shape == (robot.nq,)
+    assert p.coordinates.nl == 12
+    json.dumps(p.describe())  # goes into summary.json
+    assert p.describe()["striker"] == "fist"
+
+
+def test_a_normal_within_rounding_of_a_unit_vector_is_made_one(robot: Robot) -> None:
+    p = problem(robot, normal=[0.70710678, 0.70710678, 0.0])
+    assert np.linalg.norm(p.normal) == pytest.approx(1, abs=1e-15)
+
+
+def test_a_start_may_be_a_configuration(robot: Robot) -> None:
+    q = posture(robot, elbow=1.0)
+    np.testing.assert_array_equal(problem(robot, start=q).start_posture, q)
+
+
+def test_inputs_are_copied(robot: Robot) -> None:
+    point = np.array([0.5, -0.15, 1.1])
+    p = problem(robot, point=point)
+    point[:] = 9
+    assert p.point[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("stance", "legs"), [(BothSoles(), ["left", "right"]), (OneSole("right"), ["right"])], ids=["both", "one"]
+)
+def test_the_stance_decides_which_soles_are_held(robot: Robot, stance: Any, legs: list[str]) -> None:
+    assert [leg.sole.name for leg in problem(robot, stance=stance).coordinates.legs] == legs
+
+
+def test_a_fixed_base_holds_no_soles() -> None:
+    p = problem(arm(), striker="hand", start="start", stance=FixedBase(), point=[0.45, 0.2, 0.8])
+    assert p.coordinates.legs == []
+    assert p.coordinates.ny == 4
+
+
+# ---- bad input, one clear error each
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"point": [np.nan, 0, 1]}, r"point.*nan"),
+        ({"point": [0.5, 0.1]}, r"point.*shape \(3\)"),
+        ({"point": "there"}, "point.*numbers"),
+        ({"normal": [1, 0, np.inf]}, "normal"),
+        ({"normal": [1, 0]}, r"normal.*shape \(3\)"),
+        ({"normal": [2.0, 0, 0]}, r"normal.*unit vector.*length is 2.*did you mean \[1.0, 0.0, 0.0\]"),
+        ({"normal": [0, 0, 0]}, "normal.*unit vector.*length is 0"),
+        ({"striker": "fits"}, "no striker 'fits'.*did you mean 'fist'"),
+        ({"start": "half_siting"}, "no posture 'half_siting'.*did you mean 'half_sitting'"),
+        ({"point": [2.5, 0.0, 1.0]}, r"\[2.5, 0.0, 1.0\].*out of reach of 'fist'.*nearer"),
+        ({"stance": OneSole("lft")}, "no sole 'lft'.*did you mean 'left'"),
+        ({"stance": FixedBase()}, "free-flyer"),
+        ({"contact_duration": (0.0, 0.1)}, "contact_duration"),
+        ({"contact_duration": (0.2, 0.1)}, "contact_duration"),
+        ({"contact_duration": (np.nan, 0.1)}, "contact_duration"),
+        ({"collision_elements": ((0.5, 0.4), (1.0,))}, r"collision_elements.*\(0.5, 0.4\)"),
+        ({"collision_elements": ((1.5, -0.5), (1.0,))}, "collision_elements"),
+        ({"collision_elements": ((), (1.0,))}, "collision_elements"),
+        ({"collision_elements": ((1.0,),)}, "collision_elements"),
+        ({"terms": (Incidence(), Incidence(speed=0.1))}, "two terms of kind Incidence"),
+        ({"smoothness": -1.0}, "smoothness"),
+        ({"wrench_price": np.nan}, "wrench_price"),
+        ({"stance": BothSoles(base_mass=1e6, base_inertia=1e6)}, "virtual base"),
+    ],
+)
+def test_bad_input_is_named(robot: Robot, changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        problem(robot, **changes)
+
+
+def test_a_start_with_a_bad_configuration_is_named(robot: Robot) -> None:
+    q = robot.posture("half_sitting")
+    bad = q.copy()
+    bad[9] = np.nan
+    with pytest.raises(InputError, match=r"start posture.*nan.*index 9"):
+        problem(robot, start=bad)
+    with pytest.raises(InputError, match=r"start posture.*shape \(22\)"):
+        problem(robot, start=q[:-1])
+    bad = q.copy()
+    bad[3:7] *= 2
+    with pytest.raises(InputError, match=r"start posture.*quaternion.*norm 2"):
+        problem(robot, start=bad)
+
+
+def test_a_start_outside_its_limits_is_named(robot: Robot) -> None:
+    with pytest.raises(InputError, match=r"start posture.*'elbow' at 2.5 \(limits -2.2 to 2.2\)"):
+        problem(robot, start=posture(robot, elbow=2.5))
+
+
+def test_a_start_with_soles_off_the_ground_is_named(robot: Robot) -> None:
+    high = robot.posture("half_sitting")
+    high[2] += 0.01
+    with pytest.raises(InputError, match="sole 'left' is 10 mm above the ground"):
+        problem(robot, start=high)
+    with pytest.raises(InputError, match=r"sole 'right' is tilted by 0\.1 rad"):
+        problem(robot, start=posture(robot, right_ankle_roll=0.1))
+    lifted = posture(robot, right_hip_pitch=-0.8, right_knee=1.6, right_ankle_pitch=-0.8)
+    with pytest.raises(InputError, match="sole 'right'"):
+        problem(robot, start=lifted)
+    # a foot that is not held may be in the air
+    assert problem(robot, start=lifted, stance=OneSole("left")).coordinates.nl == 6
+
+
+def test_a_robot_without_soles_or_free_flyer_is_named(robot: Robot) -> None:
+    with pytest.raises(InputError, match="fixed base"):
+        problem(arm(), striker="hand", start="start")
+    with pytest.raises(InputError, match="no soles"):
+        problem(dataclasses.replace(robot, soles=()))
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: FreeMass(mass=-1.0), "mass"),
+        (lambda: FreeMass(mass=np.nan), "mass"),
+        (lambda: SpringDamper(stiffness=-1.0, damping=1.0), "stiffness"),
+        (lambda: SpringDamper(stiffness=1.0, damping=-1.0), "damping"),
+        (lambda: Phase(duration=0.0), "duration"),
+        (lambda: Phase(duration=-0.5), "duration"),
+        (lambda: Phase(duration=np.nan), "duration"),
+        (lambda: Phase(duration=np.inf), "duration"),
+        (lambda: Phase(duration=(0.8, 0.5)), "duration"),
+        (lambda: Phase(duration=(0.5, 0.6, 0.7)), "duration"),
+        (lambda: Phase(duration=0.8, intervals=5), "6 spline intervals.*not 5"),
+        (lambda: Phase(duration=0.8, intervals=7.5), "intervals"),
+        (lambda: Phase(duration=0.8, grading=0.5), "grading"),
+        (lambda: Phase(duration=0.8, grading=np.nan), "grading"),
+    ],
+)
+def test_bad_parts_are_named(make: Any, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        make()
+
+
+def test_a_misspelt_field_fails_when_it_is_written(robot: Robot) -> None:
+    with pytest.raises(TypeError, match="strikr"):
+        problem(robot, strikr="fist")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        problem(robot).point = np.zeros(3)  # type: ignore[misc]
+
+
+# ---- phases and terms
+
+
+def test_a_phase_of_one_duration_is_of_exactly_that_duration() -> None:
+    assert Phase(duration=0.8).duration == (0.8, 0.8)
+    assert Phase(duration=[0.5, 1]).duration == (0.5, 1.0)
+
+
+@pytest.mark.parametrize("kind", [type(t) for t in DEFAULT_TERMS])
+def test_no_term_takes_negative_numbers(kind: type[Term]) -> None:
+    names = [f.name for f in dataclasses.fields(kind)]
+    assert names
+    for name in names:
+        for bad in (-0.1, np.nan):
+            with pytest.raises(InputError, match=f"{kind.__name__}.{name}"):
+                kind(**{name: bad})
+
+
+def test_terms_of_a_problem_come_before_the_defaults(robot: Robot) -> None:
+    p = problem(robot, terms=(TorqueLimit(fraction=0.5),))
+    assert p.term(TorqueLimit).fraction == 0.5
+    for term in DEFAULT_TERMS[1:]:
+        assert p.term(type(term)) == term
+
+
+def test_every_term_has_a_name_and_a_unit() -> None:
+    kinds = {TorqueLimit, VelocityLimit, PositionLimit, ContactWrenchCone, Balance, Incidence}
+    assert {type(t) for t in DEFAULT_TERMS} == kinds
+    assert len({t.name for t in DEFAULT_TERMS}) == len(DEFAULT_TERMS)
+    assert all(t.name and t.unit for t in DEFAULT_TERMS)
+
+
+# ---- solve
+
+
+def test_an_unknown_solver_is_named_before_anything_is_built(robot: Robot) -> None:
+    with pytest.raises(InputError, match=r"unknown solver 'ipot'.*did you mean 'ipopt'"):
+        solve(problem(robot), solver="ipot")

@@ -1,0 +1,336 @@
+"""Problem files: what they say reaches the problem; what is wrong in them is named, with the mend."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import impactopt.problem_file.sections as sections
+from impactopt import terms
+from impactopt.contact import FreeMass, SpringDamper
+from impactopt.errors import InputError
+from impactopt.problem import ImpactProblem, Phase
+from impactopt.problem_file import load_problem, read_problem_file
+from impactopt.problem_file.mistakes import key_lines
+from impactopt.stance import FixedBase, OneSole
+
+PUNCH = Path(__file__).parents[1] / "problems" / "punch.toml"
+
+GOOD = """\
+[problem]
+robot = "talos"
+striker = "right_hand"
+point_m = [0.6, -0.25, 1.1]
+normal = [1.0, 0.0, 0.0]
+
+[target]
+mass_kg = 5.0
+
+[contact]
+stiffness_N_m = 1e4
+damping_N_s_m = 300.0
+"""
+
+ARM = """\
+<robot name="two links">
+  <link name="ground"/>
+  <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
+    <inertia ixx="0.03" iyy="0.03" izz="0.005" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="lower"><inertial><origin xyz="0 0 0.2"/><mass value="1"/>
+    <inertia ixx="0.02" iyy="0.02" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="fist"><inertial><mass value="0.5"/>
+    <inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="turn" type="revolute"><parent link="ground"/><child link="upper"/><origin xyz="0 0 0.5"/>
+    <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="80" velocity="6"/></joint>
+  <joint name="bend" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.4"/>
+    <axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="60" velocity="6"/></joint>
+  <joint name="twist" type="revolute"><parent link="lower"/><child link="fist"/><origin xyz="0 0 0.4"/>
+    <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="40" velocity="6"/></joint>
+</robot>
+"""
+
+
+def write(folder: Path, text: str, name: str = "problem.toml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def message(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        load_problem(path)
+    return str(caught.value)
+
+
+@pytest.fixture
+def no_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Building a robot fails the test."""
+
+    def refuse(*args: Any, **options: Any) -> None:
+        raise AssertionError("a robot was built")
+
+    monkeypatch.setattr(sections, "load_robot", refuse)
+
+
+def test_the_demos_file_is_the_punch_it_says() -> None:
+    problem = load_problem(PUNCH)
+    assert (problem.robot.name, problem.striker, problem.start) == ("talos", "right_hand", "half_sitting")
+    np.testing.assert_array_equal(problem.point, [0.6, -0.25, 1.1])
+    np.testing.assert_array_equal(problem.normal, [1, 0, 0])
+    assert problem.target == FreeMass(mass=5.0)
+    assert problem.law == SpringDamper(stiffness=1e4, damping=300.0)
+    assert read_problem_file(PUNCH).solver.name == "ipopt"
+
+
+def test_the_commented_keys_of_the_demos_file_show_the_defaults(tmp_path: Path) -> None:
+    """Whoever takes the # away gets the same problem, and can then change the number."""
+    text = PUNCH.read_text(encoding="utf-8")
+    hidden = [line for line in text.splitlines() if line.startswith("# ") and " = " in line]
+    assert hidden
+    shown = text
+    for line in hidden:
+        if "time_limit" not in line:
+            shown = shown.replace(line, line.removeprefix("# "))
+    a, b = load_problem(PUNCH), load_problem(write(tmp_path, shown))
+    for field in dataclasses.fields(ImpactProblem):
+        if field.name not in ("robot", "point", "normal"):
+            assert getattr(a, field.name) == getattr(b, field.name), field.name
+
+
+def test_all_that_a_file_says_reaches_the_problem(tmp_path: Path) -> None:
+    more = """
+[stance]
+soles = "left"
+[swing]
+duration_s = [0.5, 0.9]
+intervals = 9
+grading = 2.0
+[follow]
+duration_s = 1.5
+[collision]
+duration_s = [0.004, 0.1]
+stages = 3
+restitution = [0.25, 0.75]
+[objective]
+smoothness = 1e-5
+wrench_price = 2e-3
+[terms.torque_limit]
+fraction = 0.7
+collision = 0.8
+[terms.velocity_limit]
+fraction = 0.6
+[terms.position_limit]
+margin_rad = 0.03
+[terms.contact_wrench_cone]
+friction = 0.5
+margin_m = 0.01
+collision_margin_m = 0.015
+minimum_force_N = 20
+[terms.balance]
+capture_margin_m = 0.03
+vertical_speed_m_s = 0.15
+angular_momentum_N_m_s = 6
+[terms.incidence]
+speed_m_s = 0.1
+[solver]
+name = "sqp"
+time_limit_s = 12
+[solver.ipopt]
+max_iter = 77
+[solver.sqp]
+hessian = "bfgs"
+price = 50.0
+"""
+    path = write(tmp_path, GOOD.replace('robot = "talos"', 'robot = "talos"\nname = "all of it"') + more)
+    problem, solver = load_problem(path), read_problem_file(path).solver
+    default = ImpactProblem.collision_elements[0]
+    assert problem.name == "all of it"
+    assert problem.stance == OneSole("left")
+    assert problem.swing == Phase(duration=(0.5, 0.9), intervals=9, grading=2.0)
+    assert problem.follow == Phase(duration=1.5)
+    assert problem.contact_duration == (0.004, 0.1)
+    assert problem.collision_stages == 3
+    assert problem.collision_elements == (default, (0.25, 0.75))
+    assert (problem.smoothness, problem.wrench_price) == (1e-5, 2e-3)
+    assert problem.term(terms.TorqueLimit) == terms.TorqueLimit(fraction=0.7, collision=0.8)
+    assert problem.term(terms.VelocityLimit) == terms.VelocityLimit(fraction=0.6)
+    assert problem.term(terms.PositionLimit) == terms.PositionLimit(margin=0.03)
+    assert problem.term(terms.ContactWrenchCone) == terms.ContactWrenchCone(
+        friction=0.5, margin=0.01, collision_margin=0.015, minimum_force=20
+    )
+    assert problem.term(terms.Balance) == terms.Balance(
+        capture_margin=0.03, vertical_speed=0.15, angular_momentum=6
+    )
+    assert problem.term(terms.Incidence) == terms.Incidence(speed=0.1)
+    assert (solver.name, solver.time_limit) == ("sqp", 12)
+    assert solver.options == {"ipopt": {"max_iter": 77}, "sqp": {"hessian": "bfgs", "price": 50.0}}
+
+
+def test_what_a_file_leaves_out_is_the_problems_own_default(tmp_path: Path) -> None:
+    given = read_problem_file(write(tmp_path, GOOD)).content.arguments()
+    assert given.keys() == {"striker", "point", "normal", "law", "target"}
+
+
+def test_every_field_of_what_a_file_describes_has_a_key() -> None:
+    """A new field of a term, a phase or the problem that no file could set would be found here."""
+    kinds = {
+        section.kind: section for section in sections.Section.__subclasses__() if section.kind is not None
+    }
+    for term in terms.DEFAULT_TERMS:
+        assert type(term) in kinds
+        assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
+    for kind in (Phase, FreeMass, SpringDamper):
+        assert {f.name for f in dataclasses.fields(kind)} == set(kinds[kind].model_fields)
+    keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
+    keys |= {*sections.Collision.model_fields, "law", "collision_elements"}
+    assert {f.name for f in dataclasses.fields(ImpactProblem)} <= keys
+
+
+@pytest.mark.usefixtures("no_robots")
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("mass_kg", "mas_kg", ["line 8", "[target]", "mas_kg", "did you mean 'mass_kg'"]),
+        ("[target]", "[tagret]", ["tagret", "unknown section", "did you mean 'target'"]),
+        ("mass_kg = 5.0", "mass_kg = nan", ["line 8", "nan", "finite"]),
+        ("mass_kg = 5.0", "mass_kg = -5.0", ["line 8", "[target] mass_kg", "-5.0", "> 0"]),
+        ("mass_kg = 5.0", "mass_kg = '5'", ["'5'", "give a number"]),
+        ("mass_kg = 5.0", "mass_kg = true", ["True", "give a number"]),
+        ("mass_kg = 5.0", "", ["[target] mass_kg", "missing"]),
+        ("300.0", "-1", ["damping_N_s_m", "-1", ">= 0"]),
+        ("1e4", "inf", ["stiffness_N_m", "inf", "finite"]),
+        ("1e4", "0", ["stiffness_N_m", "0", "> 0"]),
+        ("[1.0, 0.0, 0.0]", "[1.0, 1.0, 0.0]", ["normal", "1.41421", "unit vector", "0.707107"]),
+        ("[1.0, 0.0, 0.0]", "[0.0, 0.0, 0.0]", ["normal", "length 0", "unit vector"]),
+        ("[1.0, 0.0, 0.0]", "[1.0, nan, 0.0]", ["normal[1]", "nan"]),
+        ("[0.6, -0.25, 1.1]", "[0.6, -0.25]", ["point_m", "2 values", "give 3"]),
+        ("[0.6, -0.25, 1.1]", "0.6", ["point_m", "0.6", "list"]),
+        ('"talos"', '"talso"', ["line 2", "talso", "did you mean 'talos'", "g1"]),
+        ('robot = "talos"', "", ["robot", "missing"]),
+        ("[target]", "[robot]\npreset = 'g1'\n[target]", ["robot", "twice"]),
+        ("[target]", "[swing]\nduration_s = [0.9, 0.5]\n[target]", ["duration_s", "0.9", "not exceed"]),
+        ("[target]", "[swing]\nduration_s = -1\n[target]", ["duration_s", "-1", "> 0"]),
+        ("[target]", "[swing]\nduration_s = 1\nintervals = 3\n[target]", ["[swing]", "at least 6", "3"]),
+        ("[target]", "[terms.torque_limit]\nfraction = 85\n[target]", ["fraction", "85", "> 0 and <= 1"]),
+        (
+            "[target]",
+            "[terms.torque]\nfraction = 1\n[target]",
+            ["[terms] torque", "did you mean 'torque_limit'"],
+        ),
+        ("[target]", "[collision]\ncompression = [0.5, 0.6]\n[target]", ["compression", "1.1", "sum to 1"]),
+        ("[target]", "[solver]\nname = 'ipotp'\n[target]", ["ipotp", "did you mean 'ipopt'"]),
+        ("[target]", "[solver.ipopt]\nmax_itr = 3\n[target]", ["[solver]", "max_itr"]),
+        ("[target]", "[solver.sqp]\nradus = 3\n[target]", ["[solver.sqp]", "radus", "did you mean 'radius'"]),
+        ("[target]", "[solver.sqp]\nqp_solver = 'osq'\n[target]", ["qp_solver", "did you mean 'osqp'"]),
+        ("[target]", "[solver]\ntime_limit_s = 0\n[target]", ["time_limit_s", "> 0"]),
+    ],
+)
+def test_a_mistake_is_named_with_the_mend_before_a_robot_is_built(
+    tmp_path: Path, old: str, new: str, parts: list[str]
+) -> None:
+    assert old in GOOD
+    text = message(write(tmp_path, GOOD.replace(old, new)))
+    assert [part for part in parts if part not in text] == []
+    assert "\n" not in text, "one mistake, one line"
+
+
+@pytest.mark.usefixtures("no_robots")
+def test_all_mistakes_are_named_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+    text = GOOD.replace("talos", "talo").replace("mass_kg = 5.0", "mass_kg = nan").replace("300.0", "-1")
+    rows = message(write(tmp_path, text)).splitlines()
+    assert "3 mistakes" in rows[0]
+    assert [row.split(",")[0].strip() for row in rows[1:]] == ["line 2", "line 8", "line 12"]
+
+
+def test_unknown_names_of_a_robots_parts_are_named_at_once(tmp_path: Path) -> None:
+    text = GOOD.replace("right_hand", "right_hnd").replace("normal", 'start = "half_siting"\nnormal')
+    text = message(write(tmp_path, text + '[stance]\nsoles = "lef"\n'))
+    for meant in ("right_hand", "half_sitting", "left"):
+        assert f"did you mean {meant!r}" in text
+    assert "3 mistakes" in text
+
+
+def test_a_point_out_of_reach_is_one_clear_message(tmp_path: Path) -> None:
+    text = message(write(tmp_path, GOOD.replace("[0.6, -0.25, 1.1]", "[3.0, -0.25, 1.1]")))
+    assert "out of reach" in text and "right_hand" in text and "problem.toml" in text
+
+
+def test_files_that_are_no_problem_files(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD)
+    assert "did you mean 'problem.toml'" in message(tmp_path / "probelm.toml")
+    assert "there is no file" in message(tmp_path / "nowhere" / "problem.toml")
+    assert str(tmp_path) in message(tmp_path)
+    assert "is not TOML" in message(write(tmp_path, "[problem\n", "broken.toml"))
+    path.write_bytes(b"\xff\xfe\x00")
+    assert "UTF-8" in message(path)
+    assert "missing" in message(write(tmp_path, "", "empty.toml"))
+
+
+def test_a_robot_of_ones_own_beside_the_file(tmp_path: Path) -> None:
+    write(tmp_path, ARM, "arm.urdf")
+    robot = """
+[robot]
+urdf = "arm.urdf"
+name = "my arm"
+floating = false
+armature_kg_m2 = 0.05
+kd_N_m_s_rad = {turn = 20.0}
+torque_limit_N_m = 50.0
+position_limit_rad = {turn = [-1.0, 1.5]}
+postures_rad = {bent = {turn = 0.5, bend = 0.5}}
+[[robot.strikers]]
+name = "fist"
+frame = "fist"
+point_m = [0.0, 0.0, 0.1]
+"""
+    text = GOOD.replace('robot = "talos"', 'start = "bent"').replace("right_hand", "fist") + robot
+    text = text.replace("[0.6, -0.25, 1.1]", "[0.4, -0.25, 1.1]")
+    problem = load_problem(write(tmp_path, text))
+    assert problem.robot.name == "my arm" and problem.stance == FixedBase()
+    np.testing.assert_array_equal(problem.robot.torque_limit, 50.0)
+    np.testing.assert_array_equal(problem.robot.armature, 0.05)
+    assert problem.robot.kd[0] == 20.0
+    assert (problem.robot.lower[0], problem.robot.upper[0]) == (-1.0, 1.5)
+    np.testing.assert_allclose(problem.start_posture, [0.5, 0.5, 0.0])
+    assert "either preset or urdf" in message(write(tmp_path, text.replace('urdf = "arm.urdf"', "")))
+    assert "[robot]" in message(write(tmp_path, text.replace("arm.urdf", "leg.urdf")))
+    assert "did you mean 'turn'" in message(write(tmp_path, text.replace("{turn = 20.0}", "{trun = 20.0}")))
+    assert "fixed base" in message(write(tmp_path, text + '[stance]\nsoles = "both"\n'))
+
+
+def test_a_preset_with_changes_keeps_its_strikers(tmp_path: Path) -> None:
+    robot = """
+[robot]
+preset = "talos"
+kp_N_m_rad = 3000.0
+[[robot.strikers]]
+name = "elbow"
+frame = "arm_right_4_link"
+point_m = [0.0, 0.0, -0.05]
+"""
+    problem = load_problem(write(tmp_path, GOOD.replace('robot = "talos"', "") + robot))
+    assert {"right_hand", "left_hand", "elbow"} == set(problem.robot.strikers)
+    np.testing.assert_array_equal(problem.robot.kp, 3000.0)
+
+
+KEY = st.from_regex(r"[a-z][a-z0-9_-]{0,8}", fullmatch=True)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.dictionaries(KEY, st.dictionaries(KEY, st.integers(), max_size=4), max_size=4))
+def test_keys_are_found_on_their_lines(tables: dict[str, dict[str, int]]) -> None:
+    lines: list[str] = []
+    expected: dict[tuple[str, ...], int] = {}
+    for table, keys in tables.items():
+        lines += ["# comment", f"[{table}]  # of a section"]
+        expected[(table,)] = len(lines)
+        for key, value in keys.items():
+            lines.append(f"{key} = {value}")
+            expected[table, key] = len(lines)
+    assert key_lines("\n".join(lines)) == expected

@@ -1,9 +1,11 @@
-"""What people do without an optimizer: a minimum-jerk reach to the target, as hard as the same limits let it be.
+"""What people do without an optimizer: a minimum-jerk reach to the target, as hard as the same limits let it
+be.
 
-From rest to a posture at the hit point (by inverse kinematics) with the striking point moving along the normal, and back, each on the
-minimum-jerk polynomial (Flash and Hogan 1985) in the independent coordinates; the swing's duration is the best of several, the way
-back has the problem's own.  The speed is the greatest for which position, velocity and torque limits and the contact wrench cones hold on the way and, re-simulated in
-full dynamics with the same servo, ZMP and torque stay inside while and after it hits.
+From rest to a posture at the hit point (by inverse kinematics) with the striking point moving along the
+normal, and back, each on the minimum-jerk polynomial (Flash and Hogan 1985) in the independent coordinates;
+the swing's duration is the best of several, the way back has the problem's own.  The speed is the greatest
+for which position, velocity and torque limits and the contact wrench cones hold on the way and, re-simulated
+in full dynamics with the same servo, ZMP and torque stay inside while and after it hits.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """The reach: duration [s] of the swing, speed [m/s] of the striking point that it was planned with, and what came of it."""
+    """The reach: duration [s] of the swing, speed [m/s] of the striking point that it was planned with, and
+    what came of it.
+    """
 
     duration: float
     speed: float
@@ -47,7 +51,9 @@ class Baseline:
 DURATIONS = (0.6, 0.8, 1.0, 1.3, 1.7)  # [s] of the swing that are tried
 
 
-def minimum_jerk_baseline(problem: ImpactProblem, *, fastest: float = 5.0, tolerance: float = 0.02) -> Baseline:
+def minimum_jerk_baseline(
+    problem: ImpactProblem, *, fastest: float = 5.0, tolerance: float = 0.02
+) -> Baseline:
     """The hardest minimum-jerk reach; ``tolerance``: of its speed, relative; ``fastest`` [m/s] that is tried.
 
     Raises
@@ -81,7 +87,9 @@ def _hardest(problem: ImpactProblem, duration: float, fastest: float, tolerance:
     return None
 
 
-def _phases(problem: ImpactProblem, there: float, speed: float) -> list[tuple[float, tuple[Array, Array, Array, Array]]]:
+def _phases(
+    problem: ImpactProblem, there: float, speed: float
+) -> list[tuple[float, tuple[Array, Array, Array, Array]]]:
     """(duration, (start, start rate, end, end rate)) of the way there and of the way back."""
     c = problem.coordinates
     y0, _ = c.split(problem.start_posture)
@@ -92,7 +100,9 @@ def _phases(problem: ImpactProblem, there: float, speed: float) -> list[tuple[fl
     return [(there, (y0, zero, hit, rates)), (back, (hit, rates, y0, zero))]
 
 
-def _profile(duration: float, ends: tuple[Array, Array, Array, Array], time: Array) -> tuple[Array, Array, Array]:
+def _profile(
+    duration: float, ends: tuple[Array, Array, Array, Array], time: Array
+) -> tuple[Array, Array, Array]:
     """y, ydot, yddot (k, ny) of the quintic at times [s]; it rests after ``duration``."""
     nodes = np.linspace(0, 1, 6)
     fit = np.polynomial.polynomial.polyfit(nodes, quintic(*ends[:2], *ends[2:], duration, nodes), 5)
@@ -128,7 +138,9 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
 
 
 def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> bool:
-    """Whether some sole wrenches in their cones balance the motion with torques inside the limits (a linear program)."""
+    """Whether some sole wrenches in their cones balance the motion with torques inside the limits (a linear
+    program).
+    """
     c, r = problem.coordinates, problem.robot
     tau = np.array(pin.rnea(r.model, r.model.createData(), q, v, a))
     limit = problem.term(TorqueLimit).fraction * r.torque_limit
@@ -170,7 +182,9 @@ def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory
         time = np.linspace(0.0, length, round(length / 1e-3) + 1)
         y, yd, ydd = _profile(duration, ends, time)
         wrench = np.tile(static_wrenches(c, ends[0], legs), (len(time), 1))
-        parts.append((start + time, np.full(len(time), phase), *complete_reference(problem, y, yd, ydd, wrench, legs)))
+        parts.append(
+            (start + time, np.full(len(time), phase), *complete_reference(problem, y, yd, ydd, wrench, legs))
+        )
         legs = c.split(parts[-1][2][-1])[1]
         start += duration
     time, phases, q, v, a, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(7))

@@ -46,8 +46,19 @@ Report = Callable[[str], None]
 
 # Sources that cannot shape a graph: a change in them leaves compiled functions valid. All others count.
 _NOT_IN_GRAPHS = frozenset(
-    ("__init__", "__main__", "cli", "errors", "ipopt", "plotting", "presets", "private_files", "program")
-) | {"report", "solution", "sqp", "sweep", "validation"}
+    (
+        "__init__",
+        "__main__",
+        "cli",
+        "errors",
+        "ipopt",
+        "output",
+        "planner",
+        "plotting",
+        "presets",
+        "private_files",
+    )
+) | {"baseline", "problem_file", "program", "report", "screen", "solution", "sqp", "sweep", "validation"}
 # gcc -O1 allocates registers in more than linear time: 6, 18, 71 s for 16, 47, 118 thousand instructions.
 # Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
 _MAX_OPTIMIZED = 60_000

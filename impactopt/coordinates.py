@@ -236,7 +236,10 @@ class StanceCoordinates:
         return v, self._embed(a_base, ydd[6:], ca.vertcat(*accs))
 
     def sole_twists(self, y: Any, legs: Any, yd: Any, rates: Any) -> Any:
-        """Twists (6 a held sole) [m/s, rad/s] in the base's own frame for leg rates (nl,) that need not be right, SX."""
+        """Twists (6 a held sole) [m/s, rad/s], in the base's own frame, SX.
+
+        They are for leg rates (nl,) that need not be right.
+        """
         still, nothing = ca.SX.zeros(self.nl), ca.SX.zeros(self.rb.nv)
         base = self._base_motion(self.configuration(y, still), self._embed(yd[:6], yd[6:], still), nothing)[0]
         v = self._embed(base, ca.SX.zeros(len(self.independent)), rates)

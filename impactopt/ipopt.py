@@ -41,7 +41,8 @@ IPOPT_DEFAULTS: Mapping[str, Any] = {
     "constr_viol_tol": 1e-6,
     # Our rows are scaled when they are transcribed; IPOPT's own scaling would loosen the large ones only.
     "nlp_scaling_method": "none",
-    # Starts are rough but not far off: a large first barrier would only push them away (104 iterations instead of 217).
+    # Starts are rough but not far off: a large first barrier would only push them away
+    # (104 iterations instead of 217).
     "mu_strategy": "monotone",
     "mu_init": 1e-2,
     "acceptable_tol": 1e-4,
@@ -226,7 +227,8 @@ def _build(
 def _one_blas_thread() -> None:
     """Keep the OpenBLAS that CasADi's wheel carries to one thread.
 
-    On MUMPS's small fronts a second one gains nothing, and while it waits it spins: half of the processor time was the system's.
+    On MUMPS's small fronts a second one gains nothing, and while it waits it spins: half of the processor
+    time was the system's.
     """
     for library in Path(ca.__file__).parent.glob("libcasadi-tp-openblas.so*"):
         with contextlib.suppress(OSError, AttributeError):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -24,9 +25,11 @@ Array = NDArray[np.float64]
 class Trajectory:
     """What the servo is given: nothing else of the plan reaches a simulation.
 
-    time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2 follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n) feed-forward [N m];
-    ground (k, 6) total ground wrench about the world's origin that the feed-forward assumes [N, N m].
-    contact_start, contact_end, end [s]: when the plan expects contact to begin and to end, and the motion to be over.
+    time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2
+    follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n)
+    feed-forward [N m]; ground (k, 6) total ground wrench about the world's origin that the feed-forward
+    assumes [N, N m]. contact_start, contact_end, end [s]: when the plan expects contact to begin and to end,
+    and the motion to be over.
     """
 
     time: Array
@@ -45,8 +48,9 @@ class Trajectory:
 class PlannedCollision:
     """The collision that the plan predicts, at its m collocation points.
 
-    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s]; torque (m + 1, n) [N m], servo and
-    feed-forward; ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each sole's frame.
+    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s];
+    torque (m + 1, n) [N m], servo and feed-forward; ground (m, 6) total ground wrench about the world's
+    origin [N, N m]; sole_wrench (m, 6 a sole) in each sole's frame.
     """
 
     time: Array
@@ -62,9 +66,10 @@ class Plan:
     """A planned impact motion.
 
     swing, follow : splines in the independent coordinates; compression, restitution [s].
-    swing_nodes (k,), swing_wrench (k, 6 a sole): where on [0, 1] the program had nodes, and the wrenches there, in each sole's frame [N, N m];
-    follow_nodes, follow_wrench likewise. The reference that coasts through the collision keeps the swing's last wrench.
-    hand_speed [m/s] along the normal at contact; impulse [N s] to the target.
+    swing_nodes (k,), swing_wrench (k, 6 a sole): where on [0, 1] the program had nodes, and the wrenches
+    there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
+    through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
+    [N s] to the target.
     """
 
     problem: ImpactProblem
@@ -103,15 +108,18 @@ class Plan:
         return support_polygon(self.problem.robot, self.coordinates)
 
     def independent(self, phase: int, time: Array) -> tuple[Array, Array, Array, Array]:
-        """Reference y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) of a phase at times (k,) [s] since the motion's start.
+        """Reference y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) of a phase.
 
-        phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through, then rest.
+        time (k,) [s] : since the motion's start.
+        phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
+        then rest.
         """
         ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
         if phase == 1:
             end, rate, _ = self.swing.sample(self.contact_start)
             y = end + rate * (ts[:, None] - self.contact_start)
-            return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), np.tile(self.swing_wrench[-1], (len(ts), 1))
+            wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
+            return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
         curve, start, nodes, wrench = (
             (self.swing, 0.0, self.swing_nodes, self.swing_wrench)
             if phase == 0
@@ -124,22 +132,24 @@ class Plan:
         return y, yd, ydd, w
 
     def trajectory(self, *, step: float = 1e-3, hold: float = 0.5) -> Trajectory:
-        """The servo's reference about every ``step`` [s] from the start until ``hold`` [s] after the motion's end.
+        """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
 
-        Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse dynamics under the planned
-        sole wrenches, corrected to balance the base exactly between the nodes.  The instants of contact and of its end are
-        there twice: the reference jumps from the coasting one to the predicted state.
+        Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
+        dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.
+        The instants of contact and of its end are there twice: the reference jumps from the coasting one to
+        the predicted state.
         """
         t0, t1, end = self.contact_start, self.contact_end, self.duration + hold
         legs = self.coordinates.split(self.problem.start_posture)[1]
-        parts = []
+        parts: list[tuple[Any, ...]] = []
         for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
             times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
-            parts.append((phase, times, *complete_reference(self.problem, *self.independent(phase, times), legs)))
+            rows = complete_reference(self.problem, *self.independent(phase, times), legs)
+            parts.append((phase, times, *rows))
             legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
         time, q, v, a_, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(1, 7))
-        # while in contact the feed-forward is held: the collision model counts on what makes the robot coast at contact
+        # held while in contact: the collision model counts on what makes the robot coast at contact
         torque[phases == 1] = self.collision.torque[0]
         return Trajectory(
             time=time,
@@ -155,7 +165,7 @@ class Plan:
         )
 
     def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:
-        """Planned ZMP margin [m] and torque demand over limit, each in swing, collision and follow-through."""
+        """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through."""
         ref = self.trajectory() if trajectory is None else trajectory
         limit = self.problem.robot.torque_limit
         phase = ref.phase
@@ -174,16 +184,17 @@ class Plan:
 def complete_reference(
     problem: ImpactProblem, y: Array, yd: Array, ydd: Array, wrench: Array, legs: Array
 ) -> tuple[Array, ...]:
-    """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6) from independent coordinates and rates.
+    """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6).
 
-    wrench (k, 6 a sole) is corrected as little as it takes to balance the base; legs (nl,) starts their inverse kinematics.
+    y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
+    as little as it takes to balance the base; legs (nl,) starts their inverse kinematics.
     """
     c, robot = problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
     n = len(y)
     q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
     torque, ground = np.zeros((n, robot.n)), np.zeros((n, 6))
-    # least correction of the interpolated wrenches, moments dear: the share between the soles stays the planned one
+    # least correction of the interpolated wrenches, moments dear: the soles share the load as planned
     scale = np.array([1, 1, 1, 10, 10, 10] * len(c.legs))
     for k in range(n):
         legs = c.solve_legs(y[k], legs)
@@ -211,6 +222,9 @@ def _about_origin(placements: list[pin.SE3], wrenches: Array) -> Array:
 
 
 def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
-    """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches, soles where they are held."""
+    """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
+
+    The soles are where they are held.
+    """
     placements = [leg.placement for leg in coordinates.legs]
     return np.array([_about_origin(placements, w) for w in wrenches])

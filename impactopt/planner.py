@@ -35,10 +35,11 @@ def solve(
     """Plan the motion that hits hardest within the problem's terms.
 
     solver : "ipopt" (exact Hessian, the dependable one) or "sqp" (ours, on OSQP).
-    start (n,) : solver variables to start from, such as ``solution.result.x`` of a neighbouring problem; default: a plain reach.
+    start (n,) : solver variables to start from, such as ``solution.result.x`` of a neighbouring problem;
+        default: a plain reach.
     options : the solver's own.  time_limit [s] : of the solver.
-    report : told in words what is being built; callback : called with every iteration's record; returning True, or Ctrl-C, stops with the
-        best iterate.
+    report : told in words what is being built; callback : called with every iteration's record; returning
+        True, or Ctrl-C, stops with the best iterate.
 
     An infeasible problem is a status with named rows, not an exception.
 
@@ -47,7 +48,9 @@ def solve(
     InputError : unknown solver or option, a start of the wrong length.
     """
     if solver not in SOLVERS:
-        raise InputError(f"unknown solver {solver!r}{did_you_mean(solver, SOLVERS)}: there are {', '.join(SOLVERS)}")
+        raise InputError(
+            f"unknown solver {solver!r}{did_you_mean(solver, SOLVERS)}: there are {', '.join(SOLVERS)}"
+        )
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report)
     transcription = Transcription(problem, problem.coordinates, functions)

@@ -37,6 +37,7 @@ class Case:
     closure: Any  # y, legs -> closure, its Jacobian in (y, legs)
     wrenches: Any  # legs, w -> generalized force
     upper: Any  # y, yd, ydd -> q, v, a
+    twists: Any  # y, legs, yd, leg rates -> twists of the soles
 
 
 def make_case(robot: Robot, posture: str, soles: int | None = None) -> Case:
@@ -45,6 +46,8 @@ def make_case(robot: Robot, posture: str, soles: int | None = None) -> Case:
     y, yd, ydd = (ca.SX.sym(s, c.ny) for s in ("y", "yd", "ydd"))
     legs, w, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("rates", c.ny, 2)
     closure = c.closure(y, legs) if c.legs else ca.SX(0, 1)
+    leg_rates = ca.SX.sym("leg_rates", c.nl)
+    twists = c.sole_twists(y, legs, yd, leg_rates) if c.legs else ca.SX(0, 1)
     return Case(
         robot=robot,
         posture=q,
@@ -54,6 +57,7 @@ def make_case(robot: Robot, posture: str, soles: int | None = None) -> Case:
         closure=ca.Function("closure", [y, legs], [closure, ca.jacobian(closure, ca.vertcat(y, legs))]),
         wrenches=ca.Function("wrenches", [legs, w], [c.sole_wrench_map(legs, w)]),
         upper=ca.Function("upper", [y, yd, ydd], list(c.upper_motion(y, yd, ydd))),
+        twists=ca.Function("twists", [y, legs, yd, leg_rates], [twists]),
     )
 
 
@@ -238,6 +242,26 @@ def test_closure_is_the_sole_error_in_metres_and_radians(standing: Case) -> None
         np.testing.assert_allclose(value[3:], turn, atol=1e-3 * np.abs(turn).max())
 
 
+def test_sole_twists_are_pinocchios_in_the_axes_of_the_base(standing: Case) -> None:
+    """For any leg rates; for the right ones they are zero."""
+    c, model, rng = standing.c, standing.robot.model, np.random.default_rng(12)
+    data = model.createData()
+    y, legs, yd, _ = random_state(standing, rng)
+    q, v, _ = c.complete_motion(y, yd, 0 * yd, legs)
+    columns = c.base + c.dependent
+    np.testing.assert_allclose(column(standing.twists(y, legs, yd, v[columns])), 0, atol=1e-10)
+    v[columns] += rng.standard_normal(c.nl)
+    got = column(standing.twists(y, legs, yd, v[columns])).reshape(-1, 6)
+    pin.forwardKinematics(model, data, q, v)
+    pin.updateFramePlacements(model, data)
+    base = data.oMi[1].rotation
+    for twist, leg in zip(got, c.legs, strict=True):
+        frame = model.getFrameId(leg.sole.frame)
+        wanted = pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        np.testing.assert_allclose(base @ twist[:3], wanted.linear, atol=1e-10)
+        np.testing.assert_allclose(base @ twist[3:], wanted.angular, atol=1e-10)
+
+
 def test_the_wrench_map_is_the_soles_jacobians_transposed(standing: Case) -> None:
     """The wrench is in the sole's own frame: its generalized force is J_local^T w, wherever the base is."""
     c, model, rng = standing.c, standing.robot.model, np.random.default_rng(8)
@@ -372,6 +396,20 @@ def test_a_reached_posture_has_the_point_the_soles_and_the_limits(case: Case) ->
     angles = robot.joint_positions(q)
     assert (angles >= robot.lower + 0.02 - 1e-9).all()
     assert (angles <= robot.upper - 0.02 + 1e-9).all()
+
+
+def test_reach_keeps_away_from_limits_where_it_could_stay() -> None:
+    """From a posture at a limit, to a point near by: the joint is moved inside."""
+    case = made("biped")
+    robot, q = case.robot, case.posture.copy()
+    elbow = robot.joint_index("elbow")
+    q[7 + elbow] = robot.upper[elbow] - 0.01
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, q)
+    point = data.oMf[robot.model.getFrameId("striker:fist")].translation + 0.01
+    for options, margin in (({}, 0.02), ({"margin": 0.1}, 0.1)):
+        found = reach(case.c, "fist", point, q, **options)
+        assert robot.joint_positions(found)[elbow] <= robot.upper[elbow] - margin + 1e-9
 
 
 def test_reach_turns_a_continuous_joint_past_half_a_turn() -> None:

@@ -15,9 +15,9 @@ from impactopt import codegen
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
+from impactopt.planner import solve
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.robot import Robot
-from impactopt.planner import solve
 from impactopt.stance import BothSoles, FixedBase, OneSole
 from impactopt.terms import (
     DEFAULT_TERMS,

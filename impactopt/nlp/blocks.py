@@ -1,8 +1,8 @@
 """The nonlinear pieces of an impact motion's program as CasADi functions of (variables z, parameters p).
 
-Everything that is a number of the scene (normal, contact law, target, gains, limits) is a parameter, so one compiled library per robot,
-stance and striker serves every problem.  Times and rates: y' and y'' are derivatives in the phase's own s in [0, 1], so
-ydot = y'/T and yddot = y''/T^2.
+Everything that is a number of the scene (normal, contact law, target, gains, limits) is a parameter, so one
+compiled library per robot, stance and striker serves every problem.  Times and rates: y' and y'' are
+derivatives in the phase's own s in [0, 1], so ydot = y'/T and yddot = y''/T^2.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import casadi as ca
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.coordinates import StanceCoordinates
-
 
 FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
 DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
@@ -51,11 +50,12 @@ def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
 
 
 def node(c: StanceCoordinates) -> BlockExpression:
-    """A node of a swing or follow-through: closed legs, whole-body inverse dynamics under the soles' wrenches.
+    """A node of a swing or follow-through: closed legs, inverse dynamics under the soles' wrenches.
 
     z = y, y', y'' (ny each), legs (nl), sole wrenches (6 a sole, [N, N m], in the sole's frame), T [s];
     p = torque limits (n), leg rate limits (nl), weight [N], lever [m].
-    out = closure [m, rad], base rows of the equation of motion over weight and weight x lever, torque over limit, leg rate over limit.
+    out = closure [m, rad], base rows of the equation of motion over weight and weight x lever, torque over
+        limit, leg rate over limit.
     """
     ny, n = c.ny, c.robot.n
     y, y1, y2 = ca.SX.sym("y", ny), ca.SX.sym("y1", ny), ca.SX.sym("y2", ny)
@@ -83,7 +83,9 @@ def _leg_part(c: StanceCoordinates, v: Any) -> Any:
 
 
 def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """The striking point when it meets the target.  z = y, y', T;  p = rotation rows (normal, two tangents: 9).
+    """The striking point when it meets the target.
+
+    z = y, y', T;  p = rotation rows (normal, two tangents: 9).
 
     out = point [m] (world), velocity [m/s] along the normal and the two tangents.
     """
@@ -91,11 +93,16 @@ def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
     axes = ca.SX.sym("axes", 9)
     q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
     point, twist, _ = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))
-    return _block([y, y1, T], [axes], {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)})
+    return _block(
+        [y, y1, T], [axes], {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)}
+    )
 
 
 def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
-    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point, world axes."""
+    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point.
+
+    World axes.
+    """
     rb, frame = c.rb, f"striker:{striker}"
     _, point = rb.frame(frame)
     outs = [point, rb.frame_velocity(frame, rb.v)[:3], rb.frame_acceleration(frame, rb.v, rb.a)[:3]]
@@ -105,7 +112,8 @@ def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
 def coasting(c: StanceCoordinates) -> BlockExpression:
     """The legs of the reference that coasts through the collision: soles in place and at rest, as residuals.
 
-    z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s];  p = s (place in the phase), 1 in restitution else 0.
+    z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s];  p = s (place in the phase), 1 in
+        restitution else 0.
     out = pose error of the held soles [m, rad], twist of the held soles [m/s, rad/s].
     """
     y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
@@ -117,14 +125,16 @@ def coasting(c: StanceCoordinates) -> BlockExpression:
 
 
 def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Equation of motion (6) at one collocation point of the collision: H, J and bias frozen anew at the point (steps 1b to 6b).
+    """Equation of motion (6) at one collocation point of the collision.
 
+    H, J and bias are frozen anew at the point (steps 1b to 6b).
     The servo (equation 10; 12 as rows) follows a reference that coasts at its velocity at contact:
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
-    z = y0, u0 (ydot) at contact; legs and leg rates of the coasting reference; feed-forward over torque limit (n);
-    d1, T1, d, T: y = y0 + T1 d1 + T d; u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
-    p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight [N], lever [m].
+    z = y0, u0 (ydot) at contact; legs and leg rates of the coasting reference; feed-forward over torque limit
+    (n); d1, T1, d, T: y = y0 + T1 d1 + T d; u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
+    p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight
+        [N], lever [m].
     out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit.
     """
     ny, n, nl = c.ny, c.robot.n, c.nl
@@ -160,7 +170,8 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
 def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpression:
     """Contact law and target at one collocation point (equations 14 to 17, integrated).
 
-    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; target speed v [m/s], v' (in s), travel x, x1 as d, d1.
+    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; target speed v [m/s], v' (in s), travel x, x1 as
+        d, d1.
     p = point (3), normal (3), 1 in restitution else 0, 1/mass [1/kg], the law's parameters.
     out = (f - law) / 100 N, v' - T f / mass [m/s], approach speed [m/s], penetration / 1 cm.
     """
@@ -187,9 +198,10 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpressio
 
 
 def link() -> BlockExpression:
-    """One coordinate's hand-over from swing to collision, and from the predicted state after contact to the follow-through.
+    """One coordinate's hand-over from swing to collision, and from the state after it to the follow-through.
 
-    z = follow-through's first value and y', its T; swing's last value and y', its T; T1, T2; d after each phase; u at contact and at the end.
+    z = follow-through's first value and y', its T; swing's last value and y', its T; T1, T2; d after each
+        phase; u at contact and at the end.
     """
     names = ("yf", "yf1", "Tf", "y", "y1", "Ts", "T1", "T2", "d1", "d2", "u0", "u")
     yf, yf1, Tf, y, y1, Ts, T1, T2, d1, d2, u0, u = z = [ca.SX.sym(s) for s in names]
@@ -198,10 +210,12 @@ def link() -> BlockExpression:
 
 
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
-    """What is left after the impact: capture point [m], vertical speed of the CoM [m/s], angular momentum [N m s].
+    """What is left after the impact.
 
-    z = y, y', legs, T;  p = the support polygon's edges (inward normal, offset: 3 an edge).  out = distance of the capture point
-    c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012) from each edge, positive inside; vertical speed; angular momentum.
+    The capture point [m], the vertical speed of the CoM [m/s], the angular momentum [N m s].
+    z = y, y', legs, T;  p = the support polygon's edges (inward normal, offset: 3 an edge).  out = distance
+    of the capture point c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012) from each edge, positive inside;
+    vertical speed; angular momentum.
     """
     y, y1, legs, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("T")
     rb = c.rb
@@ -219,7 +233,10 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
 def builders(
     c: StanceCoordinates, striker: str, law: ContactLaw, edges: int
 ) -> dict[str, Callable[[], BlockExpression]]:
-    """name -> a function that builds the block's expression (slow: only called when the compiled library is not in the cache)."""
+    """Block's name -> a function that builds its expression.
+
+    That is slow: it is only called when the compiled library is not in the cache.
+    """
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),

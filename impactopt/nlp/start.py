@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pinocchio as pin
 
@@ -16,7 +18,10 @@ from impactopt.statics import static_wrenches
 def strike_rates(
     c: StanceCoordinates, striker: str, y: Array, legs: Array, velocity: Array, *, base: float = 0.3
 ) -> Array:
-    """Least rates ydot (ny,) that give the striking point ``velocity`` (3,) [m/s]; ``base``: ease of the base's rates."""
+    """Least rates ydot (ny,) that give the striking point ``velocity`` (3,) [m/s].
+
+    ``base`` : ease of the base's rates.
+    """
     model, data = c.model, c.model.createData()
     fid = model.getFrameId(f"striker:{striker}")
 
@@ -32,7 +37,10 @@ def strike_rates(
 
 
 def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
-    """Solver variables (n,) of a plain reach; ``noise`` [rad] perturbs the posture at contact (for several starts)."""
+    """Solver variables (n,) of a plain reach.
+
+    ``noise`` [rad] perturbs the posture at contact, for several starts.
+    """
     p, c = t.problem, t.coordinates
     rng = np.random.default_rng(seed)
     y_hit, legs_hit = c.split(p.contact_posture)
@@ -57,10 +65,8 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     ):
         legs, all_legs, all_w = t.legs0, [], []
         for y in spline.sample(nodes * spline.duration)[0]:
-            try:
+            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
                 legs = c.solve_legs(y, legs)
-            except InputError:  # out of the legs' reach: the solver has to mend it
-                pass
             all_legs.append(np.clip(legs, t.legs_lower, t.legs_upper))
             all_w.append(static_wrenches(c, y, legs))
         if c.legs:

@@ -1,8 +1,9 @@
 """From an impact problem to a nonlinear program, and from its solution back to a plan.
 
-Phases: swing (rest to contact), compression, restitution, follow-through (the predicted state after contact to rest).  Swing and
-follow-through are cubic splines in the independent coordinates; their legs and sole wrenches are variables of the nodes.  The two contact
-phases are Radau IIA collocation of the frozen dynamics with their durations as variables.
+Phases: swing (rest to contact), compression, restitution, follow-through (the predicted state after contact
+to rest).  Swing and follow-through are cubic splines in the independent coordinates; their legs and sole
+wrenches are variables of the nodes.  The two contact phases are Radau IIA collocation of the frozen dynamics
+with their durations as variables.
 """
 
 from __future__ import annotations
@@ -55,7 +56,10 @@ def block_functions(
     edges = len(support_polygon(robot, coordinates))
     recipe = (
         model_hash(robot.model),
-        tuple((leg.sole.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in coordinates.legs),
+        tuple(
+            (leg.sole.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)))
+            for leg in coordinates.legs
+        ),
         tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
         problem.striker,
         type(problem.law).__qualname__,
@@ -120,7 +124,9 @@ def with_middles(breaks: Array) -> Array:
 class Transcription:
     """The program of one problem, with the groups that its solution is read from."""
 
-    def __init__(self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]) -> None:
+    def __init__(
+        self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
+    ) -> None:
         self.problem, self.coordinates = problem, coordinates
         self.robot = problem.robot
         self.functions = functions
@@ -130,10 +136,12 @@ class Transcription:
         self.swing_breaks = graded_breaks(problem.swing.intervals, problem.swing.grading, fine_end=True)
         self.follow_breaks = graded_breaks(problem.follow.intervals, problem.follow.grading, fine_end=False)
         # nodes: ends and middles of the intervals; the swing's start is given
-        self.swing_nodes, self.follow_nodes = with_middles(self.swing_breaks)[1:], with_middles(self.follow_breaks)
+        self.swing_nodes = with_middles(self.swing_breaks)[1:]
+        self.follow_nodes = with_middles(self.follow_breaks)
         self.stages = collision_mesh(problem.collision_elements, Radau.of_stages(problem.collision_stages))
         self.end = [max(i for i, s in enumerate(self.stages) if s.phase == p) for p in (0, 1)]
-        self.layout, self.rows, self.blocks = Layout(), Rows(), []
+        self.layout, self.rows = Layout(), Rows()
+        self.blocks: list[Block] = []
         self._limits()
         self._variables()
         self.contact_state = self.at(self.swing_control, self.swing_breaks, 1.0)
@@ -165,20 +173,28 @@ class Transcription:
         c, ny, nl, nw = self.coordinates, self.ny, self.nl, self.nw
         ns, nf, nc = p.swing.intervals, p.follow.intervals, len(self.stages)
         ms, mf = len(self.swing_nodes), len(self.follow_nodes)
-        wrench_labels = [f"{leg.sole.name} sole {k}" for leg in c.legs for k in ("fx", "fy", "fz", "mx", "my", "mz")]
-        y = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
-        legs = {"lower": self.legs_lower, "upper": self.legs_upper, "labels": c.leg_labels}
-        w = {"scale": self.wrench_scale, "labels": wrench_labels}
+        wrench_labels = [
+            f"{leg.sole.name} sole {k}" for leg in c.legs for k in ("fx", "fy", "fz", "mx", "my", "mz")
+        ]
+        y: dict[str, Any] = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
+        legs: dict[str, Any] = {"lower": self.legs_lower, "upper": self.legs_upper, "labels": c.leg_labels}
+        w: dict[str, Any] = {"scale": self.wrench_scale, "labels": wrench_labels}
         self.swing_c = add("swing control point", ns - 1, ny, **y)
         self.swing_legs = add("swing legs", ms, nl, **legs)
         self.swing_w = add("swing sole wrench", ms, nw, **w)
         limit = self.torque.fraction
         self.feedforward = add(
-            "feed-forward at contact", 1, self.robot.n, lower=-limit, upper=limit, labels=self.robot.joint_names
+            "feed-forward at contact",
+            1,
+            self.robot.n,
+            lower=-limit,
+            upper=limit,
+            labels=self.robot.joint_names,
         )
         self.swing_T = self._duration("swing duration", p.swing.duration, 0.1)
         self.phase_T = [
-            self._duration(f"{name} duration", p.contact_duration, 0.01) for name in ("compression", "restitution")
+            self._duration(f"{name} duration", p.contact_duration, 0.01)
+            for name in ("compression", "restitution")
         ]
         self.u0 = add("rate at contact", 1, ny, labels=c.labels)
         self.coast_legs = add("coasting legs", nc, nl, labels=c.leg_labels)
@@ -199,10 +215,11 @@ class Transcription:
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
 
     def swing_control(self, j: int) -> Affine:
-        """Control point j = 0 .. N+2 of the swing; the first three make a start at rest, the last one an end without acceleration.
+        """Control point j = 0 .. N+2 of the swing.
 
-        The reference coasts from contact on, so the torque that the swing ends with is the feed-forward of the collision: it does
-        not jump, and a target that comes late meets the same motion.
+        The first three make a start at rest, the last one an end without acceleration.
+        The reference coasts from contact on, so the torque that the swing ends with is the feed-forward of
+        the collision: it does not jump, and a target that comes late meets the same motion.
         """
         if j <= 2:
             return Affine.constant(self.y0)
@@ -263,7 +280,9 @@ class Transcription:
         # the first two and the last two velocity control points are zero by construction
         last = [p.swing.intervals + 2, p.follow.intervals]
         self._rate_rows("swing", self.swing_control, range(2, last[0]), self.swing_breaks, self.swing_T)
-        self._rate_rows("follow-through", self.follow_control, range(last[1]), self.follow_breaks, self.follow_T)
+        self._rate_rows(
+            "follow-through", self.follow_control, range(last[1]), self.follow_breaks, self.follow_T
+        )
 
     def _node_rows(self, places: list[str], n_out: int) -> None:
         c, r = self.coordinates, self.robot
@@ -278,7 +297,12 @@ class Transcription:
                 ("equation of motion of the base", "base", DIRECTIONS[: c.base], 0.0),
             ):
                 self.rows.add(
-                    term=term, place=place, components=components, outputs=at + part[name], lower=-bound, upper=bound
+                    term=term,
+                    place=place,
+                    components=components,
+                    outputs=at + part[name],
+                    lower=-bound,
+                    upper=bound,
                 )
             if i != last:  # at contact it is the variable `feedforward`, which has the limit as its bounds
                 self.rows.add(
@@ -335,7 +359,12 @@ class Transcription:
             if fixed:
                 bound = float(longest)
                 self.rows.add(
-                    term=self.velocity.name, place=place, components=names, affine=step, lower=-bound, upper=bound
+                    term=self.velocity.name,
+                    place=place,
+                    components=names,
+                    affine=step,
+                    lower=-bound,
+                    upper=bound,
                 )
                 continue
             time = stack([duration[0]] * len(joints))
@@ -365,7 +394,11 @@ class Transcription:
             upper=p.point,
         )
         self.rows.add(
-            term="approach speed", place="contact", components=["normal"], outputs=np.array([at + 3]), lower=0.05
+            term="approach speed",
+            place="contact",
+            components=["normal"],
+            outputs=np.array([at + 3]),
+            lower=0.05,
         )
         self.rows.add(
             term=self.incidence.name,
@@ -377,7 +410,10 @@ class Transcription:
         )
 
     def _stage_slots(self, group: Group, i: int, start: Affine) -> tuple[Affine, Affine]:
-        """Value and d/ds of a collocated group (u or target speed) at stage i; ``start``: its value at contact."""
+        """Value and d/ds of a collocated group (u or target speed) at stage i.
+
+        ``start``: its value at contact.
+        """
         s = self.stages[i]
         slope = Affine.zeros(group.size)
         for m, w in zip(s.members, s.weights, strict=True):
@@ -407,7 +443,9 @@ class Transcription:
             collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
             force.append([y, *travel, u, self.f[i], v, v1, self.xt[i], x1])
             collision_p.append(np.concatenate([p.normal, [s.place, float(s.phase)], gains]))
-            force_p.append([*p.point, *p.normal, float(s.phase), 1 / p.target.mass, *p.law.parameters.values()])
+            force_p.append(
+                [*p.point, *p.normal, float(s.phase), 1 / p.target.mass, *p.law.parameters.values()]
+            )
             self._integral_rows(i)
         at = sum(b.count * b.n_out for b in self.blocks)
         if c.legs:
@@ -433,7 +471,7 @@ class Transcription:
         self._force_rows(at, block.n_out)
 
     def _integral_rows(self, i: int) -> None:
-        """d and the target's travel are the integrals of u and of the target's speed over the phase so far."""
+        """d and the target's travel are the integrals of u and of the target's speed in the phase so far."""
         s = self.stages[i]
         names = self.coordinates.labels
         for term, integral, rate, labels in (
@@ -445,7 +483,9 @@ class Transcription:
                 expression = expression - rate[m] * w
             if not s.new_phase:
                 expression = expression - integral[s.previous]
-            self.rows.add(term=term, place=self.stage_name(i), components=labels, affine=expression, lower=0, upper=0)
+            self.rows.add(
+                term=term, place=self.stage_name(i), components=labels, affine=expression, lower=0, upper=0
+            )
 
     def stage_name(self, i: int) -> str:
         s = self.stages[i]
@@ -464,7 +504,12 @@ class Transcription:
                 ("collision dynamics", "joints", r.joint_names),
             ):
                 self.rows.add(
-                    term=term, place=place, components=components, outputs=start + part[name], lower=0, upper=0
+                    term=term,
+                    place=place,
+                    components=components,
+                    outputs=start + part[name],
+                    lower=0,
+                    upper=0,
                 )
             self.rows.add(
                 term=f"{self.torque.name} in collision",
@@ -486,10 +531,20 @@ class Transcription:
         for i in range(len(self.stages)):
             start, place = at + i * n_out, self.stage_name(i)
             self.rows.add(
-                term="contact law", place=place, components=["force"], outputs=np.array([start]), lower=0, upper=0
+                term="contact law",
+                place=place,
+                components=["force"],
+                outputs=np.array([start]),
+                lower=0,
+                upper=0,
             )
             self.rows.add(
-                term="target's motion", place=place, components=["speed"], outputs=np.array([start + 1]), lower=0, upper=0
+                term="target's motion",
+                place=place,
+                components=["speed"],
+                outputs=np.array([start + 1]),
+                lower=0,
+                upper=0,
             )
         self.rows.add(
             term="end of compression",
@@ -568,7 +623,10 @@ class Transcription:
 
     # ------------------------------------------------------------------ objective
     def _objective(self) -> tuple[Affine, Any, Array]:
-        """- impulse [N s], plus a small price on accelerations and on sole wrenches, which makes the optimum unique."""
+        """- impulse [N s], plus a small price on accelerations and on sole wrenches.
+
+        The price makes the optimum unique.
+        """
         p, n = self.problem, self.layout.n
         impulse = self.vt[self.end[1]] * p.target.mass
         quadratic = sp.csr_array((n, n))
@@ -587,7 +645,8 @@ class Transcription:
                 linear += 2 * weight * (m.T @ acc.const)
         diagonal = np.zeros(n)
         for group in (self.swing_w, self.follow_w, self.hit_w):
-            diagonal[group.offset : group.offset + group.count * group.size] = p.wrench_price / max(1, group.count)
+            span = slice(group.offset, group.offset + group.count * group.size)
+            diagonal[span] = p.wrench_price / max(1, group.count)
         return -impulse, quadratic + sp.diags_array(diagonal), linear
 
     # ------------------------------------------------------------------ solution
@@ -630,7 +689,9 @@ class Transcription:
             time=np.array([0.0, *time]),
             force=np.array([first, *self.f.read(x)[:, 0]]),
             target_speed=np.array([0.0, *self.vt.read(x)[:, 0]]),
-            torque=np.vstack([self.feedforward.read(x), out["collision"][:, self._parts("collision")["torque"]]])
+            torque=np.vstack(
+                [self.feedforward.read(x), out["collision"][:, self._parts("collision")["torque"]]]
+            )
             * self.robot.torque_limit,
             sole_wrench=wrench,
             ground=total_ground_wrench(self.coordinates, wrench),

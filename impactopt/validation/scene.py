@@ -18,7 +18,9 @@ def scene_of(problem: ImpactProblem) -> Scene:
     """
     p = problem
     if not isinstance(p.law, SpringDamper):
-        raise InputError(f"the validation knows the contact law SpringDamper only, not {type(p.law).__name__}")
+        raise InputError(
+            f"the validation knows the contact law SpringDamper only, not {type(p.law).__name__}"
+        )
     return Scene(
         point=p.point,
         normal=p.normal,

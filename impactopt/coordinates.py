@@ -322,7 +322,7 @@ class StanceCoordinates:
                 legs[6 * k : 6 * k + 6] += np.clip(step, -0.3, 0.3)
             if worst < tolerance:
                 return legs
-        if worst < 1e-9:
+        if worst < 1e-6:
             return legs
         raise InputError(
             f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "

@@ -69,6 +69,7 @@ class ImpactProblem:
     contact_duration : bounds [s] of each of compression and restitution.
     collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
         sum to 1.
+    collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
     terms : what must hold; kinds that are not given take their defaults.
     smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches. Both only
         make the optimum unique.
@@ -90,10 +91,10 @@ class ImpactProblem:
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
     follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
     contact_duration: tuple[float, float] = (0.002, 0.2)
-    collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.15, 0.35, 0.5), (0.3, 0.3, 0.4))
-    collision_stages: int = 2
+    collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
+    collision_stages: int = 3
     terms: tuple[Term, ...] = ()
-    smoothness: float = 2e-6
+    smoothness: float = 1e-5
     wrench_price: float = 1e-3
     name: str = "impact"
 

@@ -96,6 +96,7 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
         demand=demand,
         torque=demand,
         ground=reference.ground[first],
+        sole_normal=np.repeat(reference.ground[first][:, 2:3] / 2, 2, axis=1),
         drift=np.zeros(len(time)),
         contact_start=start,
         contact_end=end,

@@ -43,6 +43,12 @@ class ContactLaw(ABC):
         `parameters` replace the law's own numbers, and may be CasADi symbols.
         """
 
+    def formula(self) -> tuple[str, str]:
+        """Both branches as text in symbols of their own: what a compiled model of this law depends on."""
+        names = {name: ca.SX.sym(name) for name in self.parameters}
+        x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
+        return str(self.branch(x, rate, True, names)), str(self.branch(x, rate, False, names))
+
     def force(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
         """Force f [N] on the target: never adhesive (f >= 0), and zero while apart (penetration < 0).
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.codegen import cached, model_hash
-from impactopt.cone import contact_wrench_cone, shrink
+from impactopt.cone import contact_wrench_cone
 from impactopt.coordinates import StanceCoordinates
 from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, rate_weights
 from impactopt.nlp import blocks as symbolic
@@ -62,7 +62,7 @@ def block_functions(
         ),
         tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
         problem.striker,
-        type(problem.law).__qualname__,
+        problem.law.formula(),
         edges,
     )
     out: dict[str, Any] = {}
@@ -594,10 +594,11 @@ class Transcription:
         if not c.legs:
             return
         at += block.count * block.n_out
-        polygon = shrink(support_polygon(self.robot, c), self.balance.capture_margin)
+        polygon = support_polygon(self.robot, c)
         edge = np.roll(polygon, -1, axis=0) - polygon
         inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-        edges = np.column_stack([inward, np.einsum("ij,ij->i", inward, polygon)])
+        offset = np.einsum("ij,ij->i", inward, polygon) + self.balance.capture_margin
+        edges = np.column_stack([inward, offset])
         instance = [yf, yf1, self.follow_legs[0], self.follow_T[0]]
         self.blocks.append(Block.make("balance", self.functions, [instance], edges.ravel()))
         k = len(edges)

@@ -133,6 +133,10 @@ class _World:
             total[3:] += m.rotation @ wrench[3:] + np.cross(m.translation, force)
         return total
 
+    def normals(self) -> Array:
+        """Normal force (soles,) [N] of each held sole of the last call of ``rates``."""
+        return np.array([float(self.data.lambda_c[6 * k + 2]) for k in range(len(self.sole_ids))])
+
     def soles(self) -> Array:
         return np.array(
             [pin.updateFramePlacement(self.model, self.data, i).translation for i in self.sole_ids]
@@ -165,7 +169,7 @@ def simulate_pinocchio(
     for k in range(round(end / step)):
         t = k * step
         first = world.rates(t, state)
-        ground, soles = world.ground(), world.soles()
+        ground, normals, soles = world.ground(), world.normals(), world.soles()
         start_soles = soles if start_soles is None else start_soles
         if first.force > 0 and not world.touched:
             world.touched, contact_start = True, t
@@ -184,6 +188,7 @@ def simulate_pinocchio(
                     first.demand,
                     first.torque,
                     ground,
+                    normals,
                     drift,
                 )
             )
@@ -200,7 +205,7 @@ def simulate_pinocchio(
                 "gains"
             )
     columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, force, vt, hand, demand, torque, ground, drifts = columns
+    time, q, force, vt, hand, demand, torque, ground, normals, drifts = columns
     return Simulation(
         engine="pinocchio",
         time=time,
@@ -211,6 +216,7 @@ def simulate_pinocchio(
         demand=demand,
         torque=torque,
         ground=ground,
+        sole_normal=normals,
         drift=drifts,
         contact_start=contact_start,
         contact_end=contact_end,

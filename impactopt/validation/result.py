@@ -39,7 +39,8 @@ class Simulation:
     """Histories over ``time`` (k,) [s] of a re-simulated motion, and when contact began and ended.
 
     force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m] servo torque before saturation;
-    torque (k, n) after it; ground (k, 6) ground wrench about the world's origin [N, N m]; drift (k,) [m] of
+    torque (k, n) after it; ground (k, 6) ground wrench about the world's origin [N, N m];
+    sole_normal (k, soles) [N], negative where the ground would have to pull; drift (k,) [m] of
     the sole that moved most; q (k, nq). contact_start, contact_end [s]: nan if the target was not hit.
     """
 
@@ -52,6 +53,7 @@ class Simulation:
     demand: Array
     torque: Array
     ground: Array
+    sole_normal: Array
     drift: Array
     contact_start: float
     contact_end: float
@@ -89,6 +91,6 @@ class Simulation:
             out["zmp_margin_m"] = {
                 n: float(inside[phase == k].min()) for k, n in enumerate(PHASES) if (phase == k).any()
             }
-            out["min_normal_force_N"] = float(self.ground[:, 2].min())
+            out["min_normal_force_N"] = float(self.sole_normal.min())  # of any one sole
             out["sole_drift_mm"] = 1e3 * float(self.drift.max())
         return out

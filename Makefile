@@ -39,7 +39,7 @@ $(STAMP): pyproject.toml
 
 demo: $(STAMP) ## plan a TALOS punch, replay it in full dynamics, put pictures and numbers in results/punch
 	@echo "== planning a punch (the first run compiles the robot's functions, up to two minutes)"
-	@$(BIN)/impactopt solve problems/punch.toml --out results/punch $(ARGS)
+	@$(BIN)/impactopt solve problems/punch.toml --out results/punch --baseline $(ARGS)
 
 test: $(STAMP) ## run the tests (ARGS='-k robot' for some of them)
 	@echo "== running the tests (the first run compiles functions)"

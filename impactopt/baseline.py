@@ -47,6 +47,10 @@ class Baseline:
         """Simulated impulse [N s]."""
         return float(self.summary["impulse_Ns"])
 
+    def describe(self) -> dict[str, Any]:
+        """The numbers for ``summary.json``, all simulated but the swing's duration."""
+        return {"method": "minimum jerk", "swing_s": self.duration, **self.summary}
+
 
 DURATIONS = (0.6, 0.8, 1.0, 1.3, 1.7)  # [s] of the swing that are tried
 

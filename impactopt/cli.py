@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from impactopt.output import Record
+    from impactopt.problem import ImpactProblem
     from impactopt.screen import Progress
     from impactopt.solution import Solution
 
@@ -75,6 +76,9 @@ def solve(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
     validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
+    baseline: Annotated[
+        bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach inside the same limits.")
+    ] = False,
 ) -> None:
     """Plan the motion that a problem file asks for, replay it in full dynamics, write numbers and pictures.
 
@@ -105,6 +109,9 @@ def solve(
             )
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
             record = _record(solution, read.text, validate, progress)
+            if baseline:
+                progress.say("looking for the hardest minimum-jerk reach inside the same limits")
+                record.summary["baseline"] = _baseline(problem)
             written = _write(record, directory, progress)
         _show(record, written, as_json)
         if not solution.status.usable:
@@ -160,6 +167,16 @@ def _record(solution: Solution, text: str, validate: bool, progress: Progress) -
     return record_of(solution, simulation=simulation, problem=text)
 
 
+def _baseline(problem: ImpactProblem) -> dict[str, object]:
+    from impactopt.baseline import minimum_jerk_baseline
+    from impactopt.errors import InputError
+
+    try:
+        return minimum_jerk_baseline(problem).describe()
+    except InputError as error:
+        return {"method": "minimum jerk", "error": str(error)}
+
+
 def _write(record: Record, directory: Path, progress: Progress) -> list[Path]:
     from impactopt.output import save_record
 
@@ -181,7 +198,14 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     console, summary = Console(), record.summary
     if record.completed:
         console.print(result_table(summary))
-    for text in (summary.get("note"), summary.get("simulated", {}).get("error")):
+    reach = summary.get("baseline", {})
+    if "impulse_Ns" in reach:
+        console.print(
+            f"hardest minimum-jerk reach inside the same limits: {reach['impulse_Ns']:.2f} N s at "
+            f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
+            highlight=False,
+        )
+    for text in (summary.get("note"), summary.get("simulated", {}).get("error"), reach.get("error")):
         if text:
             console.print(text, markup=False, highlight=False)
     if summary["violations"]:

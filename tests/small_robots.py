@@ -120,3 +120,11 @@ def slider(mass: float, **options: Any) -> Robot:
         **options,
     }
     return Robot.from_model(model, **settings)
+
+
+def striking_point(robot: Robot, posture: str, striker: str) -> Any:
+    """World position (3,) [m] of a striking point in a named posture."""
+    model = robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, robot.posture(posture))
+    return np.array(data.oMf[model.getFrameId(f"striker:{striker}")].translation)

@@ -162,6 +162,26 @@ def test_without_replay_there_are_planned_numbers_only(planner: Planner, file: P
     assert "simulated" not in json.loads((tmp_path / "out" / "summary.json").read_text())
 
 
+def test_the_baseline_is_reported_beside_the_plan(
+    planner: Planner, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Reach:
+        def describe(self) -> dict[str, object]:
+            return {"method": "minimum jerk", "impulse_Ns": 1.5, "hand_speed_m_s": 0.4}
+
+    monkeypatch.setattr("impactopt.baseline.minimum_jerk_baseline", lambda problem: Reach())
+    out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
+    assert "minimum-jerk reach inside the same limits: 1.50 N s at 0.40 m/s" in out
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["baseline"]["impulse_Ns"] == 1.5
+
+    def nothing(problem: ImpactProblem) -> Reach:
+        raise impactopt.InputError("no reach keeps the limits")
+
+    monkeypatch.setattr("impactopt.baseline.minimum_jerk_baseline", nothing)
+    out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
+    assert "no reach keeps the limits" in out
+
+
 def test_the_files_solver_settings_reach_the_solver(planner: Planner, file: Path, tmp_path: Path) -> None:
     run("solve", file, "--out", tmp_path / "out")
     assert (planner.options["solver"], planner.options["time_limit"]) == ("ipopt", 40)

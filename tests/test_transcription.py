@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from small_robots import arm, biped
+from small_robots import arm, biped, striking_point
 
 from impactopt.cone import contact_wrench_cone
 from impactopt.contact.laws import SpringDamper
@@ -28,7 +28,6 @@ from impactopt.nlp.transcription import Transcription, collision_mesh, rotation_
 from impactopt.plan import Plan, Trajectory, total_ground_wrench
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.program import SolverResult, Status, check_program
-from impactopt.robot import Robot
 from impactopt.stance import FixedBase
 from impactopt.support import support_polygon, zmp
 from impactopt.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
@@ -47,13 +46,6 @@ def functions_of(problem: ImpactProblem) -> dict[str, Any]:
         block = build()
         out |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out)}
     return out
-
-
-def striking_point(robot: Robot, posture: str, striker: str) -> Array:
-    model = robot.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, robot.posture(posture))
-    return np.array(data.oMf[model.getFrameId(f"striker:{striker}")].translation)
 
 
 @dataclasses.dataclass

@@ -77,7 +77,7 @@ def solve(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
     validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
     baseline: Annotated[
-        bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach inside the same limits.")
+        bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach in the same limits.")
     ] = False,
 ) -> None:
     """Plan the motion that a problem file asks for, replay it in full dynamics, write numbers and pictures.

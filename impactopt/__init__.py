@@ -21,6 +21,7 @@ _EXPORTS = {
     "ImpactProblem": "problem",
     "Incidence": "terms",
     "InputError": "errors",
+    "LegExtension": "terms",
     "NoCompilerWarning": "errors",
     "OneSole": "stance",
     "Phase": "problem",

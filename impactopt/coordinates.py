@@ -48,8 +48,11 @@ def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
     return rows, cols
 
 
-def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> Any:
-    """Solve  a x = b  (SX, a square) by elimination in a fixed order, skipping structural zeros."""
+def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> tuple[Any, Any]:
+    """x of  a x = b  (SX, a square) by elimination in a fixed order, and the product of the pivots.
+
+    Structural zeros are skipped.
+    """
     rows, cols = order
     n, k_rhs = a.shape[0], b.shape[1]
     m = [[a[int(r), int(c)] for c in cols] for r in rows]
@@ -74,7 +77,10 @@ def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> Any:
                     s = s - m[i][c] * back[c]
             back[i] = s / m[i][i]
             x[int(cols[i]), j] = back[i]
-    return x
+    pivots = m[0][0]
+    for k in range(1, n):
+        pivots = pivots * m[k][k]
+    return x, pivots
 
 
 @dataclass(frozen=True)
@@ -130,6 +136,11 @@ class StanceCoordinates:
         self.leg_labels = tuple(robot.joint_names[j] for j in self.dependent)
         self.rb = RigidBody(self.model, base="rpy")
         self._build_symbolic_pieces()
+        legs = ca.SX.sym("legs", self.nl)
+        start = self.split(posture)[1]
+        self.start_determinants = np.array(
+            ca.Function("det", [legs], [self.leg_determinants(legs)])(start) if self.legs else np.zeros(0)
+        ).ravel()
 
     def _leg_samples(self, frame: str, joints: Index, posture: Array) -> list[Array]:
         rng = np.random.default_rng(0)
@@ -208,7 +219,7 @@ class StanceCoordinates:
         for s, leg in enumerate(self.legs):
             _, _, jac, _, _ = self._sole_terms(s, legs, nothing, nothing)
             twists = [self._sole_terms(s, legs, self._base_only(b), nothing)[3] for b in base]
-            leg_rates.append(solve_in_order(jac, -ca.horzcat(*twists), leg.order))
+            leg_rates.append(solve_in_order(jac, -ca.horzcat(*twists), leg.order)[0])
         parts = ca.vertcat(*leg_rates)
         return ca.horzcat(*[self._embed(base[i], rates[6:, i], parts[:, i]) for i in range(k)])
 
@@ -232,8 +243,17 @@ class StanceCoordinates:
         accs = []
         for s, leg in enumerate(self.legs):
             _, _, jac, _, acc = self._sole_terms(s, legs, v, self._base_only(a_base))
-            accs.append(solve_in_order(jac, -acc, leg.order))
+            accs.append(solve_in_order(jac, -acc, leg.order)[0])
         return v, self._embed(a_base, ydd[6:], ca.vertcat(*accs))
+
+    def leg_determinants(self, legs: Any) -> Any:
+        """Determinant, up to its sign, of each held leg's Jacobian (a leg), SX; zero at a straight knee."""
+        nothing = ca.SX.zeros(self.rb.nv)
+        out = []
+        for s, leg in enumerate(self.legs):
+            jac = self._sole_terms(s, legs, nothing, nothing)[2]
+            out.append(solve_in_order(jac, ca.SX(6, 0), leg.order)[1])
+        return ca.vertcat(*out)
 
     def sole_twists(self, y: Any, legs: Any, yd: Any, rates: Any) -> Any:
         """Twists (6 a held sole) [m/s, rad/s], in the base's own frame, SX.

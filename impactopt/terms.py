@@ -101,6 +101,19 @@ class Incidence(Term):
     speed: float = 0.05
 
 
+@dataclass(frozen=True, kw_only=True)
+class LegExtension(Term):
+    """Held legs stay away from the singularity of a straight knee, at the nodes of swing and follow-through.
+
+    minimum: determinant of the leg's Jacobian (joints to sole) over its value in the start posture, at least.
+    Near a straight knee the joint rates that hold the sole grow without bound.
+    """
+
+    name: ClassVar[str] = "leg extension"
+    unit: ClassVar[str] = "of start"
+    minimum: float = 0.15
+
+
 DEFAULT_TERMS: tuple[Term, ...] = (
     TorqueLimit(),
     VelocityLimit(),
@@ -108,4 +121,5 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     ContactWrenchCone(),
     Balance(),
     Incidence(),
+    LegExtension(),
 )

@@ -327,7 +327,7 @@ def test_elimination_in_the_found_order_is_a_solve(seed: int, n: int, columns: i
         assert sorted(part.tolist()) == list(range(n))
     sparse = ca.sparsify(ca.DM(a))
     symbol, rhs = ca.SX.sym("a", sparse.sparsity()), ca.SX.sym("b", n, columns)
-    f = ca.Function("solve", [symbol, rhs], [solve_in_order(symbol, rhs, order)])
+    f = ca.Function("solve", [symbol, rhs], [solve_in_order(symbol, rhs, order)[0]])
     got = np.array(f(sparse, b))
     np.testing.assert_allclose(got, np.linalg.solve(a, b), rtol=1e-7, atol=1e-8 * np.abs(got).max())
 

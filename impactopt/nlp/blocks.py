@@ -40,7 +40,7 @@ def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
     """Lengths of the named slices of a block's output, in order."""
     n, base, soles = c.robot.n, c.base, len(c.legs)
     return {
-        "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl},
+        "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl, "extension": soles},
         "contact": {"point": 3, "velocity": 3},
         "coasting": {"closure": 6 * soles, "twist": 6 * soles},
         "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n},
@@ -53,15 +53,15 @@ def node(c: StanceCoordinates) -> BlockExpression:
     """A node of a swing or follow-through: closed legs, inverse dynamics under the soles' wrenches.
 
     z = y, y', y'' (ny each), legs (nl), sole wrenches (6 a sole, [N, N m], in the sole's frame), T [s];
-    p = torque limits (n), leg rate limits (nl), weight [N], lever [m].
+    p = torque limits (n), leg rate limits (nl), weight [N], lever [m], leg determinants in the start posture.
     out = closure [m, rad], base rows of the equation of motion over weight and weight x lever, torque over
-        limit, leg rate over limit.
+        limit, leg rate over limit, leg determinants over those of the start posture.
     """
     ny, n = c.ny, c.robot.n
     y, y1, y2 = ca.SX.sym("y", ny), ca.SX.sym("y1", ny), ca.SX.sym("y2", ny)
     legs, w, T = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("T")
     limit, rate_limit = ca.SX.sym("limit", n), ca.SX.sym("rate_limit", c.nl)
-    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    weight, lever, start = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("start", len(c.legs))
     v, a = c.motion(y, legs, y1 / T, y2 / T**2)
     rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
     tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(legs, w)
@@ -70,8 +70,9 @@ def node(c: StanceCoordinates) -> BlockExpression:
         "base": tau[: c.base] / _base_scale(c, weight, lever),
         "torque": tau[c.base :] / limit,
         "leg_rate": _leg_part(c, v) / rate_limit,
+        "extension": c.leg_determinants(legs) / start,
     }
-    return _block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever], out)
+    return _block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever, start], out)
 
 
 def _base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:

@@ -30,6 +30,7 @@ from impactopt.terms import (
     Balance,
     ContactWrenchCone,
     Incidence,
+    LegExtension,
     PositionLimit,
     TorqueLimit,
     VelocityLimit,
@@ -160,6 +161,7 @@ class Transcription:
         self.torque, self.velocity = p.term(TorqueLimit), p.term(VelocityLimit)
         self.position, self.cone = p.term(PositionLimit), p.term(ContactWrenchCone)
         self.balance, self.incidence = p.term(Balance), p.term(Incidence)
+        self.extension = p.term(LegExtension)
         lower, upper = r.lower + self.position.margin, r.upper - self.position.margin
         box = BASE_BOX[: c.base]
         self.y_lower = np.concatenate([self.y0[: c.base] - box, lower[c.independent]])
@@ -246,9 +248,8 @@ class Transcription:
     # ------------------------------------------------------------------ rows
     def _node_parameters(self) -> Array:
         c = self.coordinates
-        return np.concatenate(
-            [self.robot.torque_limit, self.robot.velocity_limit[c.dependent], [self.weight, LEVER]]
-        )
+        rates = self.robot.velocity_limit[c.dependent]
+        return np.concatenate([self.robot.torque_limit, rates, [self.weight, LEVER], c.start_determinants])
 
     def _swing_and_follow(self) -> None:
         """Nodes of swing, contact (coasting) and follow-through: one block for all of them."""
@@ -304,6 +305,13 @@ class Transcription:
                     lower=-bound,
                     upper=bound,
                 )
+            self.rows.add(
+                term=self.extension.name,
+                place=place,
+                components=[f"{leg.sole.name} leg" for leg in c.legs],
+                outputs=at + part["extension"],
+                lower=self.extension.minimum,
+            )
             if i != last:  # at contact it is the variable `feedforward`, which has the limit as its bounds
                 self.rows.add(
                     term=self.torque.name,

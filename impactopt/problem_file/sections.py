@@ -142,6 +142,11 @@ class Incidence(Section):
     speed: NotNegative = _optional("speed_m_s")
 
 
+class LegExtension(Section):
+    kind = terms.LegExtension
+    minimum: Fraction = _optional()
+
+
 class Terms(Section):
     torque_limit: TorqueLimit = _optional()
     velocity_limit: VelocityLimit = _optional()
@@ -149,6 +154,7 @@ class Terms(Section):
     contact_wrench_cone: ContactWrenchCone = _optional()
     balance: Balance = _optional()
     incidence: Incidence = _optional()
+    leg_extension: LegExtension = _optional()
 
 
 _SQP_KEYS: dict[str, Any] = {

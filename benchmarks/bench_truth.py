@@ -3,7 +3,7 @@
     python benchmarks/bench_truth.py [--json]
 
 One row a problem: solver time, planned impulse, and from the re-simulation the impulse's error, the least ZMP
-margin, the largest torque demand over limit and the least normal force of a sole.  What fails stays in the table.
+margin, the largest torque demand over limit and the least normal force of a sole.  What fails stays in.
 """
 
 from __future__ import annotations

@@ -42,6 +42,7 @@ def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
     return {
         "node": {"closure": 6 * soles, "base": base, "torque": n, "leg_rate": c.nl, "extension": soles},
         "contact": {"point": 3, "velocity": 3},
+        "approach": {"along": 1},
         "coasting": {"closure": 6 * soles, "twist": 6 * soles},
         "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n},
         "force": {"law": 1, "target": 1, "rate": 1, "penetration": 1},
@@ -97,6 +98,15 @@ def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
     return _block(
         [y, y1, T], [axes], {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)}
     )
+
+
+def approach(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """The striking point on its way.  z = y;  p = normal (3);  out = its coordinate along the normal [m]."""
+    y, normal = ca.SX.sym("y", c.ny), ca.SX.sym("n", 3)
+    zero = ca.SX.zeros(c.ny)
+    q, v, _ = c.upper_motion(y, zero, zero)
+    point = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
+    return _block([y], [normal], {"along": ca.dot(normal, point)})
 
 
 def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
@@ -241,6 +251,7 @@ def builders(
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),
+        "approach": lambda: approach(c, striker),
         "collision": lambda: collision(c, striker),
         "force": lambda: force(c, striker, law),
         "link": link,

@@ -416,6 +416,19 @@ class Transcription:
             lower=-self.incidence.speed,
             upper=self.incidence.speed,
         )
+        at += block.n_out
+        nodes = self.swing_nodes[:-1]
+        instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
+        block = Block.make("approach", self.functions, instances, p.normal)
+        self.blocks.append(block)
+        for i, s in enumerate(nodes):
+            self.rows.add(
+                term="no touch before contact",
+                place=f"swing, {100 * s:.0f} %",
+                components=[p.striker],
+                outputs=np.array([at + i]),
+                upper=float(p.normal @ p.point),
+            )
 
     def _stage_slots(self, group: Group, i: int, start: Affine) -> tuple[Affine, Affine]:
         """Value and d/ds of a collocated group (u or target speed) at stage i.

@@ -291,6 +291,17 @@ def test_the_hand_meets_the_point_along_the_normal(solved: Planned) -> None:
     assert np.linalg.norm(across) <= np.sqrt(2) * problem.term(Incidence).speed + 1e-5
 
 
+def test_the_hand_does_not_touch_the_target_before_contact(solved: Planned) -> None:
+    """Between the nodes too, but for a millimetre."""
+    problem, t = solved.problem, solved.trajectory
+    model = problem.robot.model
+    data = model.createData()
+    frame = model.getFrameId(f"striker:{problem.striker}")
+    for q in t.q[t.phase == 0]:
+        pin.framesForwardKinematics(model, data, q)
+        assert problem.normal @ (data.oMf[frame].translation - problem.point) < 1e-3
+
+
 def test_the_planned_impulse_is_momentum_and_the_integral_of_force(solved: Planned) -> None:
     plan, mass = solved.plan, solved.problem.target.mass
     hit = plan.collision

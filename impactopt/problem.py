@@ -71,8 +71,9 @@ class ImpactProblem:
         sum to 1.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
     terms : what must hold; kinds that are not given take their defaults.
-    smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches. Both only
-        make the optimum unique.
+    smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
+        return_price: of ending away from the start posture [N s per rad^2]. They only make the optimum
+        unique, and its end natural.
 
     Raises
     ------
@@ -96,6 +97,7 @@ class ImpactProblem:
     terms: tuple[Term, ...] = ()
     smoothness: float = 1e-5
     wrench_price: float = 1e-3
+    return_price: float = 0.1
     name: str = "impact"
 
     def __post_init__(self) -> None:
@@ -123,7 +125,7 @@ class ImpactProblem:
             raise InputError(
                 f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
             )
-        for name in ("smoothness", "wrench_price"):
+        for name in ("smoothness", "wrench_price", "return_price"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} must be a number >= 0, not {getattr(self, name)}")
         if np.any(self.stance.compliance > 0):

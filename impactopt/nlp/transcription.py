@@ -669,7 +669,11 @@ class Transcription:
         for group in (self.swing_w, self.follow_w, self.hit_w):
             span = slice(group.offset, group.offset + group.count * group.size)
             diagonal[span] = p.wrench_price / max(1, group.count)
-        return -impulse, quadratic + sp.diags_array(diagonal), linear
+        end = self.follow_c.index(-1)  # price (y_end - y_start)^2: rest near the start posture
+        diagonal[end] += 2 * p.return_price
+        linear[end] -= 2 * p.return_price * self.y0
+        away = Affine.constant(p.return_price * float(self.y0 @ self.y0))
+        return away - impulse, quadratic + sp.diags_array(diagonal), linear
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> Plan:

@@ -104,6 +104,7 @@ class Collision(Section):
 class Objective(Section):
     smoothness: NotNegative = _optional()
     wrench_price: NotNegative = _optional()
+    return_price: NotNegative = _optional()
 
 
 class TorqueLimit(Section):

@@ -146,7 +146,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     program).
     """
     c, r = problem.coordinates, problem.robot
-    tau = np.array(pin.rnea(r.model, r.model.createData(), q, v, a))
+    tau = np.array(pin.rnea(c.model, c.data, q, v, a))
     limit = problem.term(TorqueLimit).fraction * r.torque_limit
     if not c.legs:
         return bool(np.all(np.abs(tau) <= limit))

@@ -8,6 +8,8 @@ for humanoid robots", ICRA 2015, whose closed form for a rectangle the tests com
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
@@ -18,15 +20,22 @@ Array = NDArray[np.float64]
 MERGED = 1e-9  # [m] corners nearer to a line than this lie on it
 
 
+def inward_edges(polygon: Array) -> tuple[Array, Array]:
+    """Inward unit normals (k, 2), offsets (k,) [m] of a counter-clockwise polygon; inside, n.p >= offset."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    return inward, np.einsum("ij,ij->i", inward, polygon)
+
+
 def shrink(polygon: ArrayLike, margin: float) -> Array:
     """The convex polygon (k, 2) [m], counter-clockwise, with every edge moved inwards by ``margin`` [m]."""
     p = np.array(polygon, dtype=float)
     if margin == 0.0:
         return p
-    edge = np.roll(p, -1, axis=0) - p
-    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    offset = np.einsum("ij,ij->i", inward, p) + margin
-    for normal, least in zip(inward, offset, strict=True):  # an edge shorter than the margin may vanish
+    inward, offset = inward_edges(p)
+    for normal, least in zip(
+        inward, offset + margin, strict=True
+    ):  # an edge shorter than the margin may vanish
         p = _clip(p, p @ normal - least)
     if len(p) < 3:
         raise InputError(
@@ -58,6 +67,11 @@ def contact_wrench_cone(polygon: ArrayLike, friction: float, *, margin: float = 
     if not friction > 0:
         raise InputError(f"friction must be positive, not {friction}")
     corners = shrink(polygon, margin)
+    return _facets(tuple(map(tuple, corners.tolist())), float(friction)).copy()
+
+
+@functools.lru_cache(maxsize=64)  # asked for at every node of a program, for the same few soles
+def _facets(corners: tuple[tuple[float, float], ...], friction: float) -> Array:
     rays = []
     for x, y in corners:
         for fx, fy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):

@@ -99,18 +99,7 @@ def _summary(solution: Solution, simulation: Any | None) -> dict[str, Any]:
     except InputError as error:
         if simulation is not None:  # such as one that missed the target
             return {**_summary(solution, None), "simulated": {"error": str(error)}}
-        return {
-            "status": solution.status.value,
-            "message": solution.result.message,
-            "note": f"the plan's motion cannot be completed: {error}",
-            "solver": solution.solver,
-            "iterations": solution.result.iterations,
-            "solve_seconds": solution.solve_seconds,
-            "build_seconds": solution.build_seconds,
-            "max_violation": solution.result.max_violation,
-            "violations": [{"row": name, "amount": amount} for name, amount in solution.violations],
-            "problem": solution.problem.describe(),
-        }
+        return {**solution.outcome(), "note": f"the plan's motion cannot be completed: {error}"}
 
 
 def _numbers(thing: Any) -> dict[str, Any]:

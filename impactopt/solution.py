@@ -67,10 +67,9 @@ class Solution:
             raise InputError(f"unknown engine {engine!r}: there is 'pinocchio'")
         return simulate_pinocchio(self.problem.robot, self.trajectory, scene_of(self.problem), **options)
 
-    def summary(self, simulation: Any | None = None) -> dict[str, Any]:
-        """The numbers of ``summary.json``; ``simulated`` is there when a simulation is given."""
-        plan = self.plan
-        out: dict[str, Any] = {
+    def outcome(self) -> dict[str, Any]:
+        """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""
+        return {
             "status": self.status.value,
             "message": self.result.message,
             "solver": self.solver,
@@ -79,13 +78,20 @@ class Solution:
             "build_seconds": self.build_seconds,
             "max_violation": self.result.max_violation,
             "violations": [{"row": name, "amount": amount} for name, amount in self.violations],
+            "problem": self.problem.describe(),
+        }
+
+    def summary(self, simulation: Any | None = None) -> dict[str, Any]:
+        """The numbers of ``summary.json``; ``simulated`` is there when a simulation is given."""
+        plan = self.plan
+        out: dict[str, Any] = {
+            **self.outcome(),
             "impulse_Ns": plan.impulse,
             "peak_force_N": float(plan.collision.force.max()),
             "contact_ms": 1e3 * (plan.compression + plan.restitution),
             "hand_speed_m_s": plan.hand_speed,
             "duration_s": plan.duration,
             **plan.margins(self.trajectory),
-            "problem": self.problem.describe(),
             "versions": versions(),
         }
         if simulation is not None:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from impactopt.cone import inward_edges
+
 Array = NDArray[np.float64]
 MERGED = 1e-6  # [m] a corner nearer than this to the line of its neighbours is no corner
 
@@ -39,9 +41,8 @@ def support_polygon(robot: Any, coordinates: Any) -> Array:
 
 def margin(polygon: Array, points: Array) -> Array:
     """Distance (n,) [m] of points (n, 2) from the polygon's nearest edge line, positive inside."""
-    edge = np.roll(polygon, -1, axis=0) - polygon
-    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    return np.asarray((points @ inward.T - np.einsum("ij,ij->i", inward, polygon)).min(axis=1))
+    inward, offset = inward_edges(polygon)
+    return np.asarray((points @ inward.T - offset).min(axis=1))
 
 
 def zmp(wrench: Array) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.codegen import cached, model_hash
-from impactopt.cone import contact_wrench_cone
+from impactopt.cone import contact_wrench_cone, inward_edges
 from impactopt.coordinates import StanceCoordinates
 from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, rate_weights
 from impactopt.nlp import blocks as symbolic
@@ -615,11 +615,8 @@ class Transcription:
         if not c.legs:
             return
         at += block.count * block.n_out
-        polygon = support_polygon(self.robot, c)
-        edge = np.roll(polygon, -1, axis=0) - polygon
-        inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-        offset = np.einsum("ij,ij->i", inward, polygon) + self.balance.capture_margin
-        edges = np.column_stack([inward, offset])
+        inward, offset = inward_edges(support_polygon(self.robot, c))
+        edges = np.column_stack([inward, offset + self.balance.capture_margin])
         instance = [yf, yf1, self.follow_legs[0], self.follow_T[0]]
         self.blocks.append(Block.make("balance", self.functions, [instance], edges.ravel()))
         k = len(edges)
@@ -687,6 +684,8 @@ class Transcription:
         swing = spline(self.swing_control, self.swing_breaks, self.swing_T)
         follow = spline(self.follow_control, self.follow_breaks, self.follow_T)
         durations = [float(g.read(x)[0, 0]) for g in self.phase_T]
+        outputs = self.program.outputs(x)
+        approach = float(outputs["contact"][0, 3])
         swing_w = self.swing_w.read(x)
         start_w = static_wrenches(c, self.y0, self.legs0)
         return Plan(
@@ -699,24 +698,23 @@ class Transcription:
             swing_wrench=np.vstack([start_w, swing_w]),
             follow_nodes=self.follow_nodes,
             follow_wrench=self.follow_w.read(x),
-            collision=self._decode_collision(x, durations),
-            hand_speed=float(self.program.outputs(x)["contact"][0, 3]),
+            collision=self._decode_collision(x, outputs, approach, durations),
+            hand_speed=approach,
             impulse=float(self.vt.read(x)[self.end[1], 0]) * p.target.mass,
         )
 
-    def _decode_collision(self, x: Array, durations: list[float]) -> PlannedCollision:
-        p = self.problem
-        out = self.program.outputs(x)
+    def _decode_collision(
+        self, x: Array, outputs: dict[str, Array], approach: float, durations: list[float]
+    ) -> PlannedCollision:
         time = [(durations[0] if s.phase else 0.0) + s.place * durations[s.phase] for s in self.stages]
-        approach = float(out["contact"][0, 3])
-        first = float(p.law.branch(0.0, approach, True))
+        first = float(self.problem.law.branch(0.0, approach, True))
         wrench = self.hit_w.read(x)
         return PlannedCollision(
             time=np.array([0.0, *time]),
             force=np.array([first, *self.f.read(x)[:, 0]]),
             target_speed=np.array([0.0, *self.vt.read(x)[:, 0]]),
             torque=np.vstack(
-                [self.feedforward.read(x), out["collision"][:, self._parts("collision")["torque"]]]
+                [self.feedforward.read(x), outputs["collision"][:, self._parts("collision")["torque"]]]
             )
             * self.robot.torque_limit,
             sole_wrench=wrench,

@@ -55,17 +55,16 @@ class Solution:
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.validation.Simulation`.
 
-        options : of the engine, such as ``step`` [s].
+        engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
+        ``validate``).  options : of the engine, such as ``step`` [s].
 
         Raises
         ------
-        InputError : an unknown engine; a contact law or target that the engine does not have.
+        InputError : an unknown engine or option; a contact law or target that the engines do not have.
         """
-        from impactopt.validation import scene_of, simulate_pinocchio
+        from impactopt.validation import simulate
 
-        if engine != "pinocchio":
-            raise InputError(f"unknown engine {engine!r}: there is 'pinocchio'")
-        return simulate_pinocchio(self.problem.robot, self.trajectory, scene_of(self.problem), **options)
+        return simulate(self.problem, self.trajectory, engine=engine, **options)
 
     def outcome(self) -> dict[str, Any]:
         """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""

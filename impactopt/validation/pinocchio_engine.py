@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robot import Robot
 from impactopt.validation.result import Scene, Simulation
+from impactopt.validation.servo import Servo
 
 Array = NDArray[np.float64]
 
@@ -47,14 +48,7 @@ class _World:
         self.model, self.data = robot.model, robot.model.createData()
         self.base = robot.model.nv - robot.n
         self.hand = self.model.getFrameId(scene.striker)
-        self.time = np.asarray(reference.time)
-        joints = list(self.model.joints)[-robot.n :]
-        self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        # a continuous joint's angle is kept as (cosine, sine)
-        self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
-        angles = np.array([self.angles(q) for q in reference.q])
-        angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
-        self.reference = np.hstack([angles, reference.v[:, -robot.n :], reference.torque])
+        self.servo = Servo(robot, reference)
         self.contacts = pin.StdVec_RigidConstraintModel()
         for name in scene.soles:
             frame = self.model.frames[self.model.getFrameId(name)]
@@ -77,25 +71,6 @@ class _World:
         self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
         self.touched = self.released = False
 
-    def angles(self, q: Array) -> Array:
-        """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""
-        out = q[self.place]
-        for k in self.continuous:
-            out[k] = np.arctan2(q[self.place[k] + 1], q[self.place[k]])
-        return out
-
-    def servo(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Torque demand and the torque after saturation."""
-        # an instant that stands twice is a jump of the reference; "right" takes what comes after it
-        i = min(max(int(np.searchsorted(self.time, t, side="right")) - 1, 0), len(self.time) - 2)
-        f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
-        row = (1 - f) * self.reference[i] + f * self.reference[i + 1]
-        n, r = self.robot.n, self.robot
-        error = row[:n] - self.angles(q)
-        error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
-        demand = row[2 * n :] + r.kp * error + r.kd * (row[n : 2 * n] - v[-n:])
-        return demand, np.clip(demand, -r.torque_limit, r.torque_limit)
-
     def rates(self, t: float, s: _State) -> _Rates:
         model, data, scene = self.model, self.data, self.scene
         pin.computeJointJacobians(model, data, s.q)
@@ -111,7 +86,7 @@ class _World:
             if depth > 0 and not self.released
             else 0.0
         )
-        demand, torque = self.servo(t, s.q, s.v)
+        demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
         tau = -row * force
         tau[self.base :] += torque
         if self.sole_ids:
@@ -123,24 +98,24 @@ class _World:
         return _Rates(s.v.copy(), np.array(a), s.vt, force / scene.mass, force, speed, demand, torque)
 
     def ground(self) -> Array:
-        """Ground wrench about the world's origin of the last call of ``rates``."""
-        total = np.zeros(6)
+        """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
+        ``rates``.
+        """
+        out = np.zeros((len(self.sole_ids), 6))
         for k, i in enumerate(self.sole_ids):
             m = pin.updateFramePlacement(self.model, self.data, i)
             wrench = self.data.lambda_c[6 * k : 6 * k + 6]
-            force = m.rotation @ wrench[:3]
-            total[:3] += force
-            total[3:] += m.rotation @ wrench[3:] + np.cross(m.translation, force)
-        return total
+            out[k, :3] = m.rotation @ wrench[:3]
+            out[k, 3:] = m.rotation @ wrench[3:] + np.cross(m.translation, out[k, :3])
+        return out
 
-    def normals(self) -> Array:
-        """Normal force (soles,) [N] of each held sole of the last call of ``rates``."""
-        return np.array([float(self.data.lambda_c[6 * k + 2]) for k in range(len(self.sole_ids))])
-
-    def soles(self) -> Array:
-        return np.array(
-            [pin.updateFramePlacement(self.model, self.data, i).translation for i in self.sole_ids]
-        )
+    def corners(self) -> list[Array]:
+        """World places (k, 3) of each held sole's corners."""
+        placements = [pin.updateFramePlacement(self.model, self.data, i) for i in self.sole_ids]
+        return [
+            np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
+            for m, c in zip(placements, self.scene.corners, strict=True)
+        ]
 
     def advance(self, s: _State, r: _Rates, h: float) -> _State:
         return _State(pin.integrate(self.model, s.q, h * r.v), s.v + h * r.a, s.x + h * r.vt, s.vt + h * r.at)
@@ -164,34 +139,26 @@ def simulate_pinocchio(
     state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, 0.0)
     end = float(reference.end) + settle
     rows: list[tuple[Any, ...]] = []
-    start_soles: Array | None = None
+    saturated = 0.0
+    start_soles: list[Array] | None = None
     contact_start = contact_end = np.nan
     for k in range(round(end / step)):
         t = k * step
         first = world.rates(t, state)
-        ground, normals, soles = world.ground(), world.normals(), world.soles()
+        ground, soles = world.ground(), world.corners()
         start_soles = soles if start_soles is None else start_soles
+        saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
         if first.force > 0 and not world.touched:
             world.touched, contact_start = True, t
         if world.touched and not world.released and first.force <= 0 and t > contact_start + 2 * step:
             world.released, contact_end = True, t
         in_contact = world.touched and not world.released
         if in_contact or k % record == 0:
-            drift = float(np.linalg.norm(soles - start_soles, axis=1).max()) if len(soles) else 0.0
-            rows.append(
-                (
-                    t,
-                    state.q,
-                    first.force,
-                    state.vt,
-                    first.hand_speed,
-                    first.demand,
-                    first.torque,
-                    ground,
-                    normals,
-                    drift,
-                )
-            )
+            moves = [now - then for now, then in zip(soles, start_soles, strict=True)]
+            slip = [float(np.linalg.norm(m[:, :2], axis=1).max()) for m in moves]
+            lift = [max(0.0, float(m[:, 2].max())) for m in moves]
+            motion = (state.q, state.v, first.force, state.vt, first.hand_speed)
+            rows.append((t, *motion, first.demand, first.torque, ground, slip, lift))
         middle = world.rates(t + step / 2, world.advance(state, first, step / 2))
         state = _State(
             pin.integrate(robot.model, state.q, step * middle.v),
@@ -205,20 +172,32 @@ def simulate_pinocchio(
                 "gains"
             )
     columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, force, vt, hand, demand, torque, ground, normals, drifts = columns
+    time, q, v, force, vt, hand, demand, torque, ground, slip, lift = columns
     return Simulation(
         engine="pinocchio",
         time=time,
         q=q,
+        v=v,
         force=force,
         target_speed=vt,
         hand_speed=hand,
         demand=demand,
         torque=torque,
-        ground=ground,
-        sole_normal=normals,
-        drift=drifts,
+        sole_ground=ground,
+        slip=slip.reshape(len(time), -1),
+        lift=lift.reshape(len(time), -1),
         contact_start=contact_start,
         contact_end=contact_end,
         mass=scene.mass,
+        saturated=saturated,
+        posture_error=_posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
+        fall=None,
     )
+
+
+def _posture_error(model: pin.Model, q: Array, planned: Array) -> float:
+    """[rad] of the joint, or of the base's orientation, that is farthest from where it should be."""
+    error = np.abs(pin.difference(model, planned, q))
+    if model.joints[1].nv == 6:
+        return float(max(np.linalg.norm(error[3:6]), error[6:].max(initial=0.0)))
+    return float(error.max())

@@ -19,9 +19,9 @@ class Scene:
     """The target and its contact: a free mass behind a spring-damper that damps in compression only.
 
     point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; stiffness
-    [N/m]; damping [N s/m]; mass [kg]; striker: frame of the model that hits; soles: frames of the model that
-    are held, with their polygons (k, 2) [m]; polygon (k, 2) [m]: support polygon on the ground,
-    counter-clockwise.
+    [N/m]; damping [N s/m]; mass [kg], inf for none at all: the target is missing; striker: frame of the model
+    that hits; soles: frames of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in
+    the plane of its frame; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise.
     """
 
     point: Array
@@ -31,6 +31,7 @@ class Scene:
     mass: float
     striker: str
     soles: tuple[str, ...]
+    corners: tuple[Array, ...]
     polygon: Array
 
 
@@ -38,26 +39,62 @@ class Scene:
 class Simulation:
     """Histories over ``time`` (k,) [s] of a re-simulated motion, and when contact began and ended.
 
-    force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m] servo torque before saturation;
-    torque (k, n) after it; ground (k, 6) ground wrench about the world's origin [N, N m];
-    sole_normal (k, soles) [N], negative where the ground would have to pull; drift (k,) [m] of
-    the sole that moved most; q (k, nq). contact_start, contact_end [s]: nan if the target was not hit.
+    q (k, nq) and v (k, nv), pin's; force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m]
+    servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
+    each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; slip,
+    lift (k, soles) [m]: how far the corner of a sole that moved most went along the ground, and rose.
+    contact_start, contact_end [s]: nan if the target was not hit.  saturated [s]: how long some joint asked
+    for more than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where
+    the engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's
+    orientation, that ends farthest from the reference's last posture.
     """
 
     engine: str
     time: Array
     q: Array
+    v: Array
     force: Array
     target_speed: Array
     hand_speed: Array
     demand: Array
     torque: Array
-    ground: Array
-    sole_normal: Array
-    drift: Array
+    sole_ground: Array
+    slip: Array
+    lift: Array
     contact_start: float
     contact_end: float
     mass: float
+    saturated: float
+    posture_error: float
+    fall: str | None
+
+    @property
+    def ground(self) -> Array:
+        """Ground wrench (k, 6) about the world's origin [N, N m]."""
+        return np.asarray(self.sole_ground.sum(axis=1))
+
+    @property
+    def sole_normal(self) -> Array:
+        """Normal force (k, soles) [N] of each sole, negative where the ground would have to pull."""
+        return self.sole_ground[:, :, 2]
+
+    @property
+    def impulse(self) -> float:
+        """What the target has at the end [N s]; 0 if it was not hit."""
+        return float(self.mass * self.target_speed[-1]) if np.isfinite(self.contact_start) else 0.0
+
+    @property
+    def standing(self) -> bool | None:
+        """Whether the robot stands at the end; None where the engine holds its soles to the ground."""
+        return None if self.fall is None else not self.fall
+
+    def zmp(self) -> Array:
+        """Zero moment point (k, 2) [m] on the ground; nan where nothing presses on it."""
+        return centre_of_pressure(self.ground)
+
+    def sole_cop(self) -> Array:
+        """Centre of pressure (k, soles, 2) [m] of each sole, world; nan where it does not press."""
+        return centre_of_pressure(self.sole_ground)
 
     def phase(self) -> NDArray[np.intp]:
         """0 swing, 1 collision, 2 follow-through, by the contact that happened."""
@@ -66,31 +103,52 @@ class Simulation:
         return np.asarray((self.time >= start).astype(int) + (self.time >= end).astype(int))
 
     def summary(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
-        """Impulse, force, margins and demand by phase, normal force, drift; keys as in ``summary.json``."""
-        if not np.isfinite(self.contact_start):
+        """Impulse, force, margins and demand by phase, soles, standing; keys as in ``summary.json``."""
+        hit = bool(np.isfinite(self.contact_start))
+        if not hit and self.fall is None:
             raise InputError("the simulated motion never touched the target")
         phase = self.phase()
-        impulse = float(self.mass * self.target_speed[-1])
         out: dict[str, Any] = {
             "engine": self.engine,
-            "impulse_Ns": impulse,
-            "impulse_error_pct": 100 * (impulse / planned_impulse - 1),
+            "standing": self.standing,
+            "reason": "the soles are held: only an engine with free soles can tell"
+            if self.fall is None
+            else self.fall,
+            "impulse_Ns": self.impulse,
+            "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1),
             "peak_force_N": float(self.force.max()),
-            "contact_ms": 1e3 * (self.contact_end - self.contact_start),
+            "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
             "hand_speed_m_s": float(self.hand_speed[phase == 0][-1]),
+            "saturated_ms": 1e3 * self.saturated,
+            "final_posture_error_rad": self.posture_error,
         }
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {
             n: float(ratio[phase == k].max()) for k, n in enumerate(PHASES) if (phase == k).any()
         }
         if len(polygon):
-            zmp = np.stack([-self.ground[:, 4], self.ground[:, 3]], axis=1) / self.ground[:, 2:3]
-            edge = np.roll(polygon, -1, axis=0) - polygon
-            inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-            inside = (zmp @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1)
+            inside = _distance_inside(polygon, self.zmp())
             out["zmp_margin_m"] = {
-                n: float(inside[phase == k].min()) for k, n in enumerate(PHASES) if (phase == k).any()
+                n: float(np.nanmin(inside[phase == k]))
+                for k, n in enumerate(PHASES)
+                if np.isfinite(inside[phase == k]).any()
             }
             out["min_normal_force_N"] = float(self.sole_normal.min())  # of any one sole
-            out["sole_drift_mm"] = 1e3 * float(self.drift.max())
+            out["sole_slip_mm"] = 1e3 * float(self.slip.max())
+            out["sole_lift_mm"] = 1e3 * float(self.lift.max())
+            collision = self.lift[phase == 1]
+            out["sole_lift_collision_mm"] = 1e3 * float(collision.max()) if collision.size else 0.0
         return out
+
+
+def centre_of_pressure(wrench: Array) -> Array:
+    """(..., 2) [m] on the ground of (..., 6) wrenches about the world's origin; nan where f_z <= 0."""
+    normal = np.where(wrench[..., 2] > 1e-6, wrench[..., 2], np.nan)
+    return np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / normal[..., None]
+
+
+def _distance_inside(polygon: Array, points: Array) -> Array:
+    """Distance (k,) [m] of points (k, 2) from the nearest edge of a counter-clockwise polygon, < 0 outside."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    return np.asarray((points @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1))

@@ -29,5 +29,6 @@ def scene_of(problem: ImpactProblem) -> Scene:
         mass=p.target.mass,
         striker=p.robot.striker(p.striker).model_frame,
         soles=p.stance.constraint_frames(p.robot),
+        corners=tuple(sole.polygon for sole in p.stance.soles(p.robot)),
         polygon=support_polygon(p.robot, p.coordinates),
     )

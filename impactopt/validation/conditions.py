@@ -1,0 +1,65 @@
+"""How the world of a replay differs from the one that was planned for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from impactopt.errors import InputError
+from impactopt.validation.result import Scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """What a replay finds; the defaults are what was planned, on a floor of friction 0.9.
+
+    mass, stiffness, damping : of the target and its contact, as factors of the planned ones.
+    distance [m] : how much farther along the normal the target waits; negative: it comes early.
+    missing : there is no target.
+    payload [kg] : a point mass at the striking point that the plan does not know of.
+    friction : coefficient between soles and floor.  floor_time [s] : time constant of the floor's contact
+        (MuJoCo's solref), the softness of floor and soles: a sole sinks by about 9.81 floor_time^2 [m].
+    kp, kd, torque_limit : of the servo, as factors.
+    period [s] : the servo reads the joints and sets torques this often, and holds them between; 0: in every
+        step of the simulation.  delay [s] : between reading and setting.
+
+    Raises
+    ------
+    InputError : naming the number that is out of its range.
+    """
+
+    mass: float = 1.0
+    stiffness: float = 1.0
+    damping: float = 1.0
+    distance: float = 0.0
+    missing: bool = False
+    payload: float = 0.0
+    friction: float = 0.9
+    floor_time: float = 2e-3
+    kp: float = 1.0
+    kd: float = 1.0
+    torque_limit: float = 1.0
+    period: float = 0.0
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = float(getattr(self, f.name))
+            if not np.isfinite(value):
+                raise InputError(f"conditions: {f.name} is {value}; give a finite number")
+            if f.name != "distance" and value < 0:
+                raise InputError(f"conditions: {f.name} is {value:g}; give a number >= 0")
+        for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"conditions: {name} is {getattr(self, name):g}; give a number > 0")
+
+    def scene(self, planned: Scene) -> Scene:
+        """The scene as it turns out."""
+        return replace(
+            planned,
+            point=planned.point + self.distance * planned.normal,
+            stiffness=self.stiffness * planned.stiffness,
+            damping=self.damping * planned.damping,
+            mass=self.mass * planned.mass,
+        )

@@ -1,0 +1,291 @@
+"""Replay in MuJoCo with nothing held: the robot is free on its soles.
+
+Unilateral contact with friction at the soles' corners, the servo with its limits, the target a body of its
+own with the problem's contact law. Shares no code with the planner: it reads a reference (times, positions,
+velocities, feed-forward), the robot's numbers and the scene's.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robot import Robot
+from impactopt.validation.conditions import Conditions
+from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module
+from impactopt.validation.result import Scene, Simulation
+from impactopt.validation.servo import Servo
+
+Array = NDArray[np.float64]
+FALLEN_TILT, FALLEN_DROP = 1.0, 0.4  # [rad] of the base from its start; of its height, as a fraction
+LEANS, STIRS = 0.2, 0.05  # [rad] from the reference's last base; [m/s] of the base: more is no standing
+BEARS = 0.02  # of the weight: a sole with less on it does not stand
+
+
+class _Replay:
+    def __init__(
+        self, robot: Robot, reference: Any, scene: Scene, conditions: Conditions, solver: Solver
+    ) -> None:
+        self.mujoco = mujoco_module()
+        self.robot, self.scene, self.conditions = robot, conditions.scene(scene), conditions
+        self.world = build_world(robot, self.scene, conditions, solver)
+        self.data = self.mujoco.MjData(self.world)
+        self.servo = Servo(
+            robot, reference, kp=conditions.kp, kd=conditions.kd, limit=conditions.torque_limit
+        )
+        joints = [self.world.joint(name) for name in robot.joint_names]
+        self.dof = np.array([joint.dofadr[0] for joint in joints])
+        self.place = np.array([joint.qposadr[0] for joint in joints])
+        self.floating = robot.model.nv > robot.n
+        self.site = self.world.site("striker").id
+        self.target = None if conditions.missing else int(self.world.joint("target").dofadr[0])
+        self.row = np.zeros((3, self.world.nv))
+        self.held = {name: k for k, name in enumerate(scene.soles)}
+        self.geom_sole = np.full(self.world.ngeom, -1)
+        for sole in robot.soles:
+            for k in range(len(sole.polygon)):
+                self.geom_sole[self.world.geom(f"sole {sole.frame} {k}").id] = self.held.get(sole.frame, -1)
+        frames = [robot.model.frames[robot.model.getFrameId(name)] for name in scene.soles]
+        self.sole_body = [self.world.body(f"body {robot.model.names[f.parentJoint]}").id for f in frames]
+        self.corners = [
+            np.array([f.placement.act(np.array([*c, 0.0])) for c in corners])
+            for f, corners in zip(frames, scene.corners, strict=True)
+        ]
+        self.start(np.asarray(reference.q[0]))
+
+    def start(self, q: Array) -> None:
+        d = self.data
+        if self.floating:
+            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
+        d.qpos[self.place] = self.servo.angles(q)
+        self.mujoco.mj_forward(self.world, d)
+        self.start_corners = self.corner_places()
+        self.start_base = self.base()
+
+    # ------------------------------------------------------------------ what a step needs
+    def hand_speed(self) -> float:
+        """Speed of the striking point along the normal [m/s]; leaves its Jacobian in ``row``."""
+        self.mujoco.mj_jacSite(self.world, self.data, self.row, None, self.site)
+        self.push = self.scene.normal @ self.row
+        return float(self.push @ self.data.qvel)
+
+    def contact_force(self, speed: float) -> float:
+        if self.target is None:
+            return 0.0
+        travel = float(self.scene.normal @ (self.data.site_xpos[self.site] - self.scene.point))
+        depth = travel - float(self.data.qpos[self.world.jnt_qposadr[-1]])
+        if depth <= 0:
+            return 0.0
+        approach = speed - float(self.data.qvel[self.target])
+        return self.scene.stiffness * depth + self.scene.damping * max(approach, 0.0)
+
+    def target_speed(self) -> float:
+        return 0.0 if self.target is None else float(self.data.qvel[self.target])
+
+    # ------------------------------------------------------------------ what a record needs
+    def base(self) -> tuple[Array, Array, float]:
+        """Position (3,), rotation (3, 3) and speed [m/s] of the base."""
+        if not self.floating:
+            return np.zeros(3), np.eye(3), 0.0
+        rotation = np.zeros(9)
+        self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
+        return self.data.qpos[:3].copy(), rotation.reshape(3, 3), float(np.linalg.norm(self.data.qvel[:3]))
+
+    def state(self) -> tuple[Array, Array]:
+        """q (nq,), v (nv,) in Pinocchio's conventions."""
+        model, d = self.robot.model, self.data
+        q, v = np.zeros(model.nq), np.zeros(model.nv)
+        if self.floating:
+            _, rotation, _ = self.base()
+            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
+            v[:3], v[3:6] = rotation.T @ d.qvel[:3], d.qvel[3:6]
+        angles = d.qpos[self.place]
+        q[self.servo.place] = angles
+        for k in self.servo.continuous:
+            at = self.servo.place[k]
+            q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
+        v[-self.robot.n :] = d.qvel[self.dof]
+        return q, v
+
+    def corner_places(self) -> list[Array]:
+        """World places (k, 3) of each held sole's corners."""
+        d = self.data
+        return [
+            c @ d.xmat[b].reshape(3, 3).T + d.xpos[b]
+            for b, c in zip(self.sole_body, self.corners, strict=True)
+        ]
+
+    def sole_moves(self) -> tuple[list[float], list[float]]:
+        """Slip and lift [m] of each held sole."""
+        moves = [now - then for now, then in zip(self.corner_places(), self.start_corners, strict=True)]
+        slip = [float(np.linalg.norm(m[:, :2], axis=1).max()) for m in moves]
+        return slip, [max(0.0, float(m[:, 2].max())) for m in moves]
+
+    def sole_ground(self) -> Array:
+        """(soles, 6) wrench of the floor on each held sole about the world's origin; after the step's forces
+        are known."""
+        out = np.zeros((len(self.held), 6))
+        contacts = self.data.contact
+        if not self.data.ncon:
+            return out
+        for geoms, frame, place, address in zip(
+            contacts.geom, contacts.frame, contacts.pos, contacts.efc_address, strict=True
+        ):
+            sole = max(self.geom_sole[geoms[0]], self.geom_sole[geoms[1]])
+            if address < 0 or sole < 0:
+                continue
+            # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
+            force = frame.reshape(3, 3).T @ self.data.efc_force[address : address + 3]
+            out[sole, :3] += force
+            out[sole, 3:] += np.cross(place, force)
+        return out
+
+    def fallen(self) -> str:
+        if not self.floating:
+            return ""
+        place, rotation, _ = self.base()
+        start, upright, _ = self.start_base
+        tilt = _angle(rotation @ upright.T, axis_free=True)
+        if tilt > FALLEN_TILT:
+            return f"fell: the base leans by {tilt:.1f} rad"
+        if place[2] < (1 - FALLEN_DROP) * start[2]:
+            return f"fell: the base dropped from {start[2]:.2f} to {place[2]:.2f} m"
+        return ""
+
+    def posture_error(self, q_end: Array) -> float:
+        """[rad] of the joint, or of the base, that is farthest from where the reference ends."""
+        error = np.abs(self.data.qpos[self.place] - self.servo.reference[-1, : self.robot.n])
+        error[self.servo.continuous] = np.abs(
+            np.remainder(error[self.servo.continuous] + np.pi, 2 * np.pi) - np.pi
+        )
+        worst = float(error.max())
+        return max(worst, self.base_error(q_end)) if self.floating else worst
+
+    def base_error(self, q_end: Array) -> float:
+        planned = pin.Quaternion(q_end[3:7]).toRotationMatrix()
+        return _angle(self.base()[1] @ planned.T)
+
+    def not_standing(self, q_end: Array, sole_ground: Array, weight: float) -> str:
+        """Why the robot does not stand at the end, "" if it does."""
+        if not self.floating:
+            return ""
+        lean, speed = self.base_error(q_end), self.base()[2]
+        if lean > LEANS:
+            return f"leans at the end: base {lean:.2f} rad from where it should be"
+        if speed > STIRS:
+            return f"still moves at the end: base at {speed:.2f} m/s"
+        for k, name in enumerate(self.scene.soles):
+            if sole_ground[k, 2] < BEARS * weight:
+                return f"{name} bears no load at the end"
+        return ""
+
+
+def _angle(rotation: Array, *, axis_free: bool = False) -> float:
+    """Angle [rad] of a rotation; ``axis_free``: of the world's vertical only."""
+    cosine = rotation[2, 2] if axis_free else (np.trace(rotation) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def simulate_mujoco(
+    robot: Robot,
+    reference: Any,
+    scene: Scene,
+    *,
+    step: float = 2e-4,
+    iterations: int = 100,
+    tolerance: float = 1e-10,
+    settle: float = 2.0,
+    record: int = 5,
+    conditions: Conditions | None = None,
+) -> Simulation:
+    """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
+
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of :class:`impactopt.plan.Trajectory`.
+    step [s], iterations, tolerance : of MuJoCo (semi-implicit Euler, Newton, elliptic cones).
+    record : steps between recorded instants; every step is recorded in contact.
+    conditions : where the world differs from what was planned; default: nowhere.
+
+    A fall ends the simulation early; the result says so.
+
+    Raises
+    ------
+    InputError : MuJoCo is not installed, or the simulation diverges (with the time at which it did).
+    """
+    if not step > 0:
+        raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    world = conditions if conditions is not None else Conditions()
+    replay = _Replay(robot, reference, scene, world, Solver(step, iterations, tolerance))
+    mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
+    weight = 9.81 * float(sum(inertia.mass for inertia in robot.model.inertias))
+    q_end = np.asarray(reference.q[-1])
+    hold = max(1, round(world.period / step))
+    waiting: deque[tuple[Array, Array]] = deque()
+    lag = round(world.delay / step / hold)
+    demand = torque = np.zeros(robot.n)
+    ground = np.zeros((len(scene.soles), 6))
+    rows: list[tuple[Any, ...]] = []
+    contact_start = contact_end = np.nan
+    saturated, fall, before = 0.0, "", 0.0
+    for k in range(round((float(reference.end) + settle) / step)):
+        t = k * step
+        mujoco.mj_step1(model, data)
+        if k % hold == 0:
+            waiting.append(servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof]))
+            demand, torque = waiting[0] if len(waiting) <= lag else waiting.popleft()
+        speed = replay.hand_speed()
+        force = replay.contact_force(speed)
+        data.qfrc_applied[:] = -force * replay.push
+        data.qfrc_applied[replay.dof] += torque
+        if replay.target is not None:
+            data.qfrc_applied[replay.target] = force
+        if force > 0 and np.isnan(contact_start):
+            contact_start = t
+        if force <= 0 < before and np.isnan(contact_end):
+            contact_end = t
+        before = force
+        saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
+        target_speed = replay.target_speed()
+        kept = k % record == 0 or force > 0
+        state = replay.state() if kept else None
+        moves = replay.sole_moves() if kept else None
+        mujoco.mj_step2(model, data)
+        if kept:
+            ground = replay.sole_ground()
+            assert state is not None and moves is not None
+            rows.append((t, *state, force, target_speed, speed, demand, torque, ground, *moves))
+            if not np.all(np.isfinite(data.qvel)) or np.abs(data.qvel).max() > 1e4:
+                raise InputError(
+                    f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or "
+                    "softer gains"
+                )
+            fall = replay.fallen()
+            if fall:
+                fall = f"{fall} at t = {t:.2f} s"
+                break
+    columns = [np.array(c) for c in zip(*rows, strict=True)]
+    time, q, v, forces, target, hand, demands, torques, grounds, slip, lift = columns
+    return Simulation(
+        engine="mujoco",
+        time=time,
+        q=q,
+        v=v,
+        force=forces,
+        target_speed=target,
+        hand_speed=hand,
+        demand=demands,
+        torque=torques,
+        sole_ground=grounds,
+        slip=slip.reshape(len(time), -1),
+        lift=lift.reshape(len(time), -1),
+        contact_start=contact_start,
+        contact_end=contact_end,
+        mass=replay.scene.mass,
+        saturated=saturated,
+        posture_error=replay.posture_error(q_end),
+        fall=fall or replay.not_standing(q_end, ground, weight),
+    )

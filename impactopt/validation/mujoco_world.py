@@ -1,0 +1,134 @@
+"""A robot, its floor and its target as a MuJoCo model, built body by body from the robot's numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robot import Robot
+from impactopt.validation.conditions import Conditions
+from impactopt.validation.result import Scene
+
+Array = NDArray[np.float64]
+FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
+
+
+@dataclass(frozen=True)
+class Solver:
+    """MuJoCo's own settings: step [s], iterations and tolerance of its contact solver."""
+
+    step: float = 2e-4
+    iterations: int = 100
+    tolerance: float = 1e-10
+
+
+def mujoco_module() -> Any:
+    """MuJoCo, or an error that says how to get it."""
+    try:
+        import mujoco
+    except ImportError as error:
+        raise InputError(
+            "the engine 'mujoco' needs the package mujoco; run: pip install 'impactopt[validate]'"
+        ) from error
+    return mujoco
+
+
+def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solver) -> Any:
+    """The compiled mujoco.MjModel.
+
+    Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
+    the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners; the target is the body
+    ``target`` on a slide along the normal. Nothing else touches anything: the contact law between striker and
+    target is the engine's business.
+    """
+    mujoco = mujoco_module()
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.compiler.balanceinertia = False
+    spec.option.timestep = solver.step
+    spec.option.iterations = solver.iterations
+    spec.option.tolerance = solver.tolerance
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0  # friction as hard as the normal direction: no creep
+    spec.option.gravity = [0.0, 0.0, -9.81]
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
+    _surface(floor, conditions)
+    _robot_bodies(mujoco, spec, robot, scene, conditions)
+    if not conditions.missing:
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        body = spec.worldbody.add_body(name="target", pos=scene.point)
+        body.add_joint(name="target", type=slide, axis=scene.normal)
+        _inertial(body, scene.mass, np.zeros(3), 0.01 * scene.mass * np.eye(3))
+    return spec.compile()
+
+
+def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions: Conditions) -> None:
+    model = robot.model
+    bodies = [spec.worldbody]
+    for j in range(1, model.njoints):
+        placement = model.jointPlacements[j]
+        body = bodies[model.parents[j]].add_body(
+            name=f"body {model.names[j]}", pos=placement.translation, quat=_quaternion(placement.rotation)
+        )
+        bodies.append(body)
+        inertia = model.inertias[j]
+        _inertial(body, inertia.mass, inertia.lever, inertia.inertia)
+        if model.joints[j].nv == 6:
+            body.add_freejoint(name=model.names[j])
+            continue
+        data = model.joints[j].createData()
+        model.joints[j].calc(data, pin.neutral(model))
+        subspace = np.asarray(data.S).reshape(6)
+        turns = bool(np.any(subspace[3:]))
+        body.add_joint(
+            name=model.names[j],
+            type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=subspace[3:] if turns else subspace[:3],
+            armature=float(model.armature[model.joints[j].idx_v]),
+        )
+    for sole in robot.soles:
+        frame = model.frames[model.getFrameId(sole.frame)]
+        for k, corner in enumerate(sole.polygon):
+            centre = frame.placement.act(np.array([*corner, FOOT]))
+            sphere = bodies[frame.parentJoint].add_geom(
+                name=f"sole {sole.frame} {k}",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[FOOT, 0.0, 0.0],
+                pos=centre,
+                mass=0.0,
+            )
+            _surface(sphere, conditions)
+    frame = model.frames[model.getFrameId(scene.striker)]
+    hand = bodies[frame.parentJoint]
+    hand.add_site(name="striker", pos=frame.placement.translation)
+    if conditions.payload > 0:
+        load = hand.add_body(name="payload", pos=frame.placement.translation)
+        _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
+
+
+def _surface(geom: Any, conditions: Conditions) -> None:
+    geom.friction = [conditions.friction, 1e-3, 1e-4]
+    geom.condim = 3
+    geom.solref = [conditions.floor_time, 1.0]
+    geom.solimp = [0.95, 0.99, 5e-4, 0.5, 2.0]
+
+
+def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
+    body.explicitinertial = True
+    body.mass = float(mass)
+    body.ipos = centre
+    i = np.asarray(inertia)
+    body.fullinertia = [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]
+
+
+def _quaternion(rotation: Any) -> list[float]:
+    """(w, x, y, z), as MuJoCo has it."""
+    x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
+    return [w, x, y, z]

@@ -98,7 +98,8 @@ def result_table(summary: Mapping[str, Any]) -> Table:
     if simulated:
         for label, key, digits in (
             ("least normal force [N]", "min_normal_force_N", 0),
-            ("largest sole drift [mm]", "sole_drift_mm", 4),
+            ("largest slip of a sole [mm]", "sole_slip_mm", 3),
+            ("largest lift of a sole [mm]", "sole_lift_mm", 3),
             ("impulse error [%]", "impulse_error_pct", 2),
         ):
             if key in simulated:

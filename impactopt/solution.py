@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.errors import InputError
 from impactopt.plan import Plan, Trajectory
 from impactopt.problem import ImpactProblem
 from impactopt.program import SolverResult, Status

@@ -75,7 +75,7 @@ def _zmp_paths(record: Record) -> dict[tuple[str, int], tuple[Array, Array]]:
             keep = phase == k
             if keep.any():
                 shown = 1e3 * (time[keep] - time[keep][0]) if k == 1 else time[keep]
-                out["simulated", k] = shown, zmp(a["simulated_ground"][keep])
+                out["simulated", k] = shown, zmp(a["simulated_sole_ground"][keep].sum(axis=1))
     return out
 
 

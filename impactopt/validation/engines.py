@@ -18,7 +18,9 @@ ENGINES: dict[str, Callable[..., Simulation]] = {
 }
 
 
-def simulate(problem: ImpactProblem, reference: Any, *, engine: str = "pinocchio", **options: Any) -> Simulation:
+def simulate(
+    problem: ImpactProblem, reference: Any, *, engine: str = "pinocchio", **options: Any
+) -> Simulation:
     """Re-simulate a reference for a problem: "pinocchio" holds the soles, "mujoco" holds nothing.
 
     reference : as of :class:`impactopt.plan.Trajectory`.  options : of the engine, such as ``step`` [s].

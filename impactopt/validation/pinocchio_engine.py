@@ -172,7 +172,7 @@ def simulate_pinocchio(
                 "gains"
             )
     columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, v, force, vt, hand, demand, torque, ground, slip, lift = columns
+    time, q, v, force, vt, hand, demand, torque, ground, slips, lifts = columns
     return Simulation(
         engine="pinocchio",
         time=time,
@@ -184,8 +184,8 @@ def simulate_pinocchio(
         demand=demand,
         torque=torque,
         sole_ground=ground,
-        slip=slip.reshape(len(time), -1),
-        lift=lift.reshape(len(time), -1),
+        slip=slips.reshape(len(time), -1),
+        lift=lifts.reshape(len(time), -1),
         contact_start=contact_start,
         contact_end=contact_end,
         mass=scene.mass,
@@ -195,7 +195,7 @@ def simulate_pinocchio(
     )
 
 
-def _posture_error(model: pin.Model, q: Array, planned: Array) -> float:
+def _posture_error(model: Any, q: Array, planned: Array) -> float:
     """[rad] of the joint, or of the base's orientation, that is farthest from where it should be."""
     error = np.abs(pin.difference(model, planned, q))
     if model.joints[1].nv == 6:

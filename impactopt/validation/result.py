@@ -19,9 +19,9 @@ class Scene:
     """The target and its contact: a free mass behind a spring-damper that damps in compression only.
 
     point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; stiffness
-    [N/m]; damping [N s/m]; mass [kg], inf for none at all: the target is missing; striker: frame of the model
-    that hits; soles: frames of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in
-    the plane of its frame; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise.
+    [N/m]; damping [N s/m]; mass [kg]; striker: frame of the model that hits; soles: frames of the model that
+    the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame, counter-clockwise;
+    polygon (k, 2) [m]: support polygon on the ground, counter-clockwise.
     """
 
     point: Array
@@ -44,8 +44,8 @@ class Simulation:
     each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; slip,
     lift (k, soles) [m]: how far the corner of a sole that moved most went along the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  saturated [s]: how long some joint asked
-    for more than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where
-    the engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's
+    for more than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None
+    where the engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's
     orientation, that ends farthest from the reference's last posture.
     """
 
@@ -148,7 +148,7 @@ def centre_of_pressure(wrench: Array) -> Array:
 
 
 def _distance_inside(polygon: Array, points: Array) -> Array:
-    """Distance (k,) [m] of points (k, 2) from the nearest edge of a counter-clockwise polygon, < 0 outside."""
+    """Distance (k,) [m] of points (k, 2) from a counter-clockwise polygon's nearest edge, < 0 outside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     return np.asarray((points @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1))

@@ -51,8 +51,6 @@ class Servo:
         row, n = self.target(t), self.n
         error = row[:n] - angles
         if self.continuous.size:
-            error[self.continuous] = (
-                np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
-            )
+            error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
         demand = row[2 * n :] + self.kp * error + self.kd * (row[n : 2 * n] - rates)
         return demand, np.clip(demand, -self.limit, self.limit)

@@ -31,6 +31,7 @@ _EXPORTS = {
     "Robot": "robot",
     "SDC": "collision",
     "Sole": "robot",
+    "Scenario": "scenario",
     "Solution": "solution",
     "SpringDamper": "contact.laws",
     "Status": "program",

@@ -172,11 +172,13 @@ class Plan:
         grounds = [ref.ground[phase == 0], self.collision.ground, ref.ground[phase == 2]]
         torques = [ref.torque[phase == 0], self.collision.torque, ref.torque[phase == 2]]
         names = ("swing", "collision", "follow")
-        ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True)}
+        ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
         out = {"torque_ratio": ratio}
         if len(self.polygon):
             out["zmp_margin_m"] = {
-                n: float(margin(self.polygon, zmp(g)).min()) for n, g in zip(names, grounds, strict=True)
+                n: float(margin(self.polygon, zmp(g)).min())
+                for n, g in zip(names, grounds, strict=True)
+                if len(g)
             }
         return out
 

@@ -9,17 +9,19 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.laws import ContactLaw
+from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.coordinates import StanceCoordinates
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.reach import reach
 from impactopt.robot import Robot
+from impactopt.scenario import Scenario
 from impactopt.stance import BothSoles, Stance
 from impactopt.terms import DEFAULT_TERMS, Term
 
 Array = NDArray[np.float64]
 AnyTerm = TypeVar("AnyTerm", bound=Term)
+COLLISIONS = ("dynamics", "rigid", "virtual mass")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +72,11 @@ class ImpactProblem:
     collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
         sum to 1.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
+    collision : "dynamics", the whole equation of motion while the contact lasts; "rigid", an impact in no
+        time with ``restitution`` (speed of separation over that of approach); "virtual mass", the same with
+        the restitution of two masses under the contact law. The last two know nothing of torque, ZMP and servo
+        during the impact: they are what others plan with, to compare.
+    scenarios : what else may be hit, or not, and has to be survived with the same swing.
     terms : what must hold; kinds that are not given take their defaults.
     smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
         return_price: of ending away from the start posture [N s per rad^2]. They only make the optimum
@@ -94,6 +101,9 @@ class ImpactProblem:
     contact_duration: tuple[float, float] = (0.002, 0.2)
     collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
     collision_stages: int = 3
+    collision: str = "dynamics"
+    restitution: float = 0.0
+    scenarios: tuple[Scenario, ...] = ()
     terms: tuple[Term, ...] = ()
     smoothness: float = 1e-5
     wrench_price: float = 1e-3
@@ -128,6 +138,7 @@ class ImpactProblem:
         for name in ("smoothness", "wrench_price", "return_price"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} must be a number >= 0, not {getattr(self, name)}")
+        self._check_collision()
         if np.any(self.stance.compliance > 0):
             raise InputError(
                 f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
@@ -141,6 +152,28 @@ class ImpactProblem:
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
         _ = self.contact_posture
+
+    def _check_collision(self) -> None:
+        if self.collision not in COLLISIONS:
+            raise InputError(
+                f"unknown collision {self.collision!r}{did_you_mean(self.collision, COLLISIONS)}: there are "
+                f"{', '.join(COLLISIONS)}"
+            )
+        if not 0 <= self.restitution <= 1:
+            raise InputError(f"restitution must be between 0 and 1, not {self.restitution}")
+        if self.restitution and self.collision != "rigid":
+            raise InputError(f'restitution is for collision="rigid"; with {self.collision!r} leave it out')
+        if self.collision == "virtual mass" and not isinstance(self.law, SpringDamper):
+            raise InputError(
+                'collision="virtual mass" has a closed form for the law SpringDamper only, not '
+                f"{type(self.law).__name__}"
+            )
+        if self.scenarios and self.collision != "dynamics":
+            raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
+        names = [s.name for s in self.scenarios]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"two scenarios are called {name!r}: give each a name of its own")
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
         """The term of a kind: the problem's own, or the default."""

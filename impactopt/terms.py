@@ -81,13 +81,14 @@ class ContactWrenchCone(Term):
 class Balance(Term):
     """What may be left after the impact.
 
-    capture_margin [m]: distance of the capture point from the support polygon's edges; vertical_speed [m/s]
-    of the centre of mass; angular_momentum [N m s] about each axis through the centre of mass.
+    capture_margin [m]: distance of the capture point from the support polygon's edges, None: anywhere;
+    vertical_speed [m/s] of the centre of mass; angular_momentum [N m s] about each axis through the centre of
+    mass; inf: any.
     """
 
     name: ClassVar[str] = "balance after impact"
     unit: ClassVar[str] = "m, m/s, N m s"
-    capture_margin: float = 0.02
+    capture_margin: float | None = 0.02
     vertical_speed: float = 0.2
     angular_momentum: float = 10.0
 

@@ -22,14 +22,14 @@ LAYERS = (
     ("collision",),
     ("motion", "cone"),
     ("coordinates", "support", "statics", "reach"),
-    ("terms", "problem", "plan"),
+    ("terms", "scenario", "problem", "plan"),
     ("nlp",),
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),
     ("solution", "baseline", "planner"),
-    ("problem_file", "output", "sweep"),
+    ("problem_file", "output", "replay", "sweep"),
     ("plotting", "report", "screen"),
-    ("cli", "__main__"),
+    ("plain_errors", "_validate_command", "cli", "__main__"),
 )
 RANK = {room: rank for rank, room in enumerate(room for layer in LAYERS for room in layer)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.
@@ -109,5 +109,6 @@ def test_what_follows_the_transcription_is_without_casadi(name: str) -> None:
 def test_engines_share_no_code_with_the_planner() -> None:
     engines = sorted((PACKAGE / "validation").glob("*_engine.py"))
     assert engines
-    for file in [*engines, PACKAGE / "validation" / "result.py"]:
+    shared = [PACKAGE / "validation" / f"{n}.py" for n in ("result", "servo", "soles", "conditions")]
+    for file in [*engines, *shared, PACKAGE / "validation" / "mujoco_world.py"]:
         assert rooms_imported(file) <= ENGINE, file

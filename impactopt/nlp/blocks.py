@@ -46,6 +46,7 @@ def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
         "coasting": {"closure": 6 * soles, "twist": 6 * soles},
         "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n},
         "force": {"law": 1, "target": 1, "rate": 1, "penetration": 1},
+        "impact": {"base": base, "joints": n, "blow": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
     }[block]
 
@@ -208,6 +209,60 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpressio
     return _block([y0, d1, T1, d, T, u, f, v, v1, x, x1], [point, normal, after, inverse_mass, params], out)
 
 
+def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """An impact in no time: impulse balance of the robot on its soles, and the law of the impulse.
+
+    z = y; legs; u0 (ydot) at contact; its change; impulsive sole wrenches [N s, N m s]; impulse I [N s].
+    p = normal (3); 1 for a given restitution, 0 for that of the contact law; that restitution; stiffness
+        [N/m], damping [N s/m] of the law; 1/mass of the target [1/kg]; torque limits (n); weight [N];
+        lever [m].
+    out = base rows, joint rows (over torque limit), separation against approach [m/s].
+    """
+    ny, n = c.ny, c.robot.n
+    y, u0, du = (ca.SX.sym(s, ny) for s in ("y", "u0", "du"))
+    legs, w, blow = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("I")
+    normal, rigid, given = ca.SX.sym("n", 3), ca.SX.sym("rigid"), ca.SX.sym("e")
+    stiffness, damping, inverse_mass = ca.SX.sym("k"), ca.SX.sym("d"), ca.SX.sym("im")
+    limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
+    rb = c.rb
+    q = c.configuration(y, legs)
+    inertia = ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])
+    row = ca.Function("row", [rb.q], [ca.densify(rb.jacobian(f"striker:{striker}")[:3, :])])(q)
+    push = ca.mtimes(row.T, normal)
+    change = c.velocity(y, legs, du)
+    balance = inertia(q, change) + push * blow - c.sole_wrench_map(legs, w)
+    lost = -ca.dot(
+        push, change
+    )  # speed that the impulse takes from the hand; I over it is the effective mass
+    approach = ca.dot(push, c.velocity(y, legs, u0))
+    stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
+    e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
+    out = {
+        "base": balance[: c.base] / (0.1 * _base_scale(c, weight, lever)),
+        "joints": balance[c.base :] / (0.1 * limit),
+        "blow": blow * inverse_mass + lost - (1 + e) * approach,
+    }
+    p = [normal, rigid, given, stiffness, damping, inverse_mass, limit, weight, lever]
+    return _block([y, legs, u0, du, w, blow], p, out)
+
+
+def two_mass_restitution(ratio: Any) -> Any:
+    """Speed of separation over that of approach of two masses with a spring, and a damper in compression.
+
+    ratio: the damping over the critical one, of the reduced mass: zeta = d / (2 sqrt(k mu)).
+    e = exp(-zeta arccos(zeta) / sqrt(1 - zeta^2)), continued through zeta = 1 by its series.
+    """
+    below, above = ca.fmin(ratio, 0.99), ca.fmax(ratio, 1.01)
+    x = 1 - ratio
+    near = 1 + x / 3 + 2 * x**2 / 15 + 2 * x**3 / 35
+    slope = ca.if_else(
+        ratio < 0.99,
+        ca.acos(below) / ca.sqrt(1 - below**2),
+        ca.if_else(ratio > 1.01, ca.acosh(above) / ca.sqrt(above**2 - 1), near),
+    )
+    return ca.exp(-ratio * slope)
+
+
 def link() -> BlockExpression:
     """One coordinate's hand-over from swing to collision, and from the state after it to the follow-through.
 
@@ -242,18 +297,23 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
 
 
 def builders(
-    c: StanceCoordinates, striker: str, law: ContactLaw, edges: int
+    c: StanceCoordinates, striker: str, law: ContactLaw, edges: int, *, instant: bool = False
 ) -> dict[str, Callable[[], BlockExpression]]:
-    """Block's name -> a function that builds its expression.
+    """Block's name -> a function that builds its expression; ``instant``: for an impact without duration.
 
     That is slow: it is only called when the compiled library is not in the cache.
     """
+    hit: dict[str, Callable[[], BlockExpression]] = {
+        "collision": lambda: collision(c, striker),
+        "force": lambda: force(c, striker, law),
+    }
+    if c.legs:
+        hit["coasting"] = lambda: coasting(c)
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),
         "approach": lambda: approach(c, striker),
-        "collision": lambda: collision(c, striker),
-        "force": lambda: force(c, striker, law),
+        **({"impact": lambda: impact(c, striker)} if instant else hit),
         "link": link,
-        **({"coasting": lambda: coasting(c), "balance": lambda: balance(c, edges)} if c.legs else {}),
+        **({"balance": lambda: balance(c, edges)} if c.legs else {}),
     }

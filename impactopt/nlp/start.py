@@ -74,35 +74,7 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
             wrench.write(x, np.array(all_w))
     t.swing_T.write(x, swing_T)
     t.follow_T.write(x, follow_T)
-    _collision(t, x, y_hit, rates, t.swing_legs.read(x)[-1] if c.legs else t.legs0)
-    return np.clip(x, t.layout.lower, t.layout.upper)
-
-
-def _collision(t: Transcription, x: Array, y: Array, rates: Array, legs: Array) -> None:
-    """A uniform push: the target gains 0.8 m/s while the robot loses 0.4 of its rates."""
-    p, c = t.problem, t.coordinates
-    times = np.clip([0.015, 0.02], *p.contact_duration)
-    total = float(times.sum())
-    for group, value in zip(t.phase_T, times, strict=True):
-        group.write(x, value)
-    place = np.array([s.place for s in t.stages])
-    phase = np.array([s.phase for s in t.stages])
-    elapsed = np.where(phase == 0, place * times[0], times[0] + place * times[1])
-    fraction = elapsed / total
-    speed = 0.8
-    t.vt.write(x, (speed * fraction)[:, None])
     t.u0.write(x, rates)
-    t.u.write(x, (1 - 0.4 * fraction)[:, None] * rates)
-    # integrals over each phase of a linear ramp, in the phase's own s
-    start = np.where(phase == 0, 0.0, times[0] / total)
-    mean = (start + fraction) / 2 * place
-    t.xt.write(x, (speed * mean)[:, None])
-    t.d.write(x, (place - 0.4 * mean)[:, None] * rates)
-    t.f.write(x, p.target.mass * speed / total)
-    if c.legs:
-        t.hit_legs.write(x, legs)
-        t.hit_w.write(x, t.swing_w.read(x)[-1:])
-        for k, at in enumerate(elapsed):
-            legs = c.solve_legs(y + rates * at, legs)
-            v = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)[1]
-            x[t.coast_legs.index(k)], x[t.coast_rates.index(k)] = legs, v[c.base + c.dependent]
+    for collision in t.collisions:
+        collision.guess(x, y_hit, rates, t.swing_legs.read(x)[-1] if c.legs else t.legs0)
+    return np.clip(x, t.layout.lower, t.layout.upper)

@@ -8,8 +8,7 @@ with their durations as variables.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,12 @@ from impactopt.cone import contact_wrench_cone, inward_edges
 from impactopt.coordinates import StanceCoordinates
 from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, rate_weights
 from impactopt.nlp import blocks as symbolic
+from impactopt.nlp.collision import DIRECTIONS, Collision
+from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
+from impactopt.nlp.mesh import collision_mesh, with_middles
 from impactopt.nlp.structured import Block, Rows, StructuredProgram, derivative_functions
-from impactopt.plan import Plan, PlannedCollision, total_ground_wrench
+from impactopt.plan import Plan
 from impactopt.problem import ImpactProblem
 from impactopt.statics import static_wrenches
 from impactopt.support import support_polygon
@@ -37,7 +39,6 @@ from impactopt.terms import (
 )
 
 GRAVITY = 9.81
-DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 LEVER = 0.1  # [m] scale of sole moments against forces
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
 
@@ -67,7 +68,9 @@ def block_functions(
         edges,
     )
     out: dict[str, Any] = {}
-    for name, build in symbolic.builders(coordinates, problem.striker, problem.law, edges).items():
+    instant = problem.collision != "dynamics"
+    builders = symbolic.builders(coordinates, problem.striker, problem.law, edges, instant=instant)
+    for name, build in builders.items():
 
         def functions(build: Callable[[], symbolic.BlockExpression] = build, name: str = name) -> list[Any]:
             b = build()
@@ -75,51 +78,6 @@ def block_functions(
 
         out |= cached(f"{robot.name}-{name}", (name, *recipe), functions, report=report)
     return out
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One collocation point of the collision."""
-
-    phase: int  # 0 compression, 1 restitution
-    place: float  # s in the phase
-    weights: Array  # (stages,) of this element's stages in u', d u/ds
-    start: float  # weight of the element's start value in u'
-    members: tuple[int, ...]  # indices of this element's stages
-    previous: int  # index of the stage the element starts from, -1 at contact
-    quadrature: Array  # (stages,) weights of the element's u in d
-    new_phase: bool  # the element begins a phase, so d starts from zero
-
-
-def collision_mesh(elements: tuple[tuple[float, ...], tuple[float, ...]], radau: Radau) -> list[Stage]:
-    """Stages of both contact phases; ``elements`` are the elements' lengths as fractions of each phase."""
-    inverse = np.linalg.inv(radau.a)
-    stages: list[Stage] = []
-    for phase, lengths in enumerate(elements):
-        s = 0.0
-        for e, h in enumerate(lengths):
-            first = len(stages)
-            members = tuple(range(first, first + len(radau.c)))
-            for i, c in enumerate(radau.c):
-                stages.append(
-                    Stage(
-                        phase,
-                        s + c * h,
-                        inverse[i] / h,
-                        -float(inverse[i].sum()) / h,
-                        members,
-                        first - 1,
-                        radau.a[i] * h,
-                        e == 0,
-                    )
-                )
-            s += h
-    return stages
-
-
-def with_middles(breaks: Array) -> Array:
-    """Breaks and the middles between them, in order."""
-    return np.sort(np.concatenate([breaks, (breaks[1:] + breaks[:-1]) / 2]))
 
 
 class Transcription:
@@ -140,7 +98,6 @@ class Transcription:
         self.swing_nodes = with_middles(self.swing_breaks)[1:]
         self.follow_nodes = with_middles(self.follow_breaks)
         self.stages = collision_mesh(problem.collision_elements, Radau.of_stages(problem.collision_stages))
-        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == p) for p in (0, 1)]
         self.layout, self.rows = Layout(), Rows()
         self.blocks: list[Block] = []
         self._limits()
@@ -148,7 +105,7 @@ class Transcription:
         self.contact_state = self.at(self.swing_control, self.swing_breaks, 1.0)
         self._swing_and_follow()
         self._contact()
-        self._collision()
+        self._collisions()
         self._after()
         objective, quadratic, linear = self._objective()
         self.program = StructuredProgram(
@@ -168,19 +125,20 @@ class Transcription:
         self.y_upper = np.concatenate([self.y0[: c.base] + box, upper[c.independent]])
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]
         self.rate_limit = self.velocity.fraction * r.velocity_limit
+        self.units = np.array([self.weight, LEVER])
         self.wrench_scale = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER] * len(c.legs))
 
     def _variables(self) -> None:
         p, add = self.problem, self.layout.add
         c, ny, nl, nw = self.coordinates, self.ny, self.nl, self.nw
-        ns, nf, nc = p.swing.intervals, p.follow.intervals, len(self.stages)
+        ns, nf = p.swing.intervals, p.follow.intervals
         ms, mf = len(self.swing_nodes), len(self.follow_nodes)
-        wrench_labels = [
+        self.wrench_labels = [
             f"{leg.sole.name} sole {k}" for leg in c.legs for k in ("fx", "fy", "fz", "mx", "my", "mz")
         ]
         y: dict[str, Any] = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
         legs: dict[str, Any] = {"lower": self.legs_lower, "upper": self.legs_upper, "labels": c.leg_labels}
-        w: dict[str, Any] = {"scale": self.wrench_scale, "labels": wrench_labels}
+        w: dict[str, Any] = {"scale": self.wrench_scale, "labels": self.wrench_labels}
         self.swing_c = add("swing control point", ns - 1, ny, **y)
         self.swing_legs = add("swing legs", ms, nl, **legs)
         self.swing_w = add("swing sole wrench", ms, nw, **w)
@@ -193,27 +151,20 @@ class Transcription:
             upper=limit,
             labels=self.robot.joint_names,
         )
-        self.swing_T = self._duration("swing duration", p.swing.duration, 0.1)
-        self.phase_T = [
-            self._duration(f"{name} duration", p.contact_duration, 0.01)
-            for name in ("compression", "restitution")
-        ]
+        self.swing_T = self.duration("swing duration", p.swing.duration, 0.1)
         self.u0 = add("rate at contact", 1, ny, labels=c.labels)
-        self.coast_legs = add("coasting legs", nc, nl, labels=c.leg_labels)
-        self.coast_rates = add("coasting leg rates", nc, nl, labels=c.leg_labels)
-        self.u = add("collision rate", nc, ny, labels=c.labels)
-        self.d = add("collision travel", nc, ny, labels=c.labels)
-        self.hit_legs = add("collision legs", nc, nl, **legs)
-        self.f = add("contact force", nc, 1, scale=symbolic.FORCE_SCALE)
-        self.vt = add("target speed", nc, 1)
-        self.xt = add("target travel", nc, 1)
-        self.hit_w = add("collision sole wrench", nc, nw, **w)
+        self.collisions: list[Collision | InstantImpact]
+        if p.collision == "dynamics":
+            self.scenarios = [Collision(self, s) for s in p.scenarios if not s.missing]
+            self.collisions = [Collision(self), *self.scenarios]
+        else:
+            self.scenarios, self.collisions = [], [InstantImpact(self)]
         self.follow_c = add("follow control point", nf + 1, ny, **y)
         self.follow_legs = add("follow legs", mf, nl, **legs)
         self.follow_w = add("follow sole wrench", mf, nw, **w)
-        self.follow_T = self._duration("follow duration", p.follow.duration, 0.1)
+        self.follow_T = self.duration("follow duration", p.follow.duration, 0.1)
 
-    def _duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
+    def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
 
     def swing_control(self, j: int) -> Affine:
@@ -246,10 +197,20 @@ class Transcription:
         return out[0], out[1], out[2]
 
     # ------------------------------------------------------------------ rows
+    def _add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
+        """Append a block; the index of its first output."""
+        at = sum(b.count * b.n_out for b in self.blocks)
+        self.blocks.append(Block.make(name, self.functions, instances, parameters))
+        return at
+
+    def equal(self, term: str, place: str, components: Sequence[str], outputs: Any) -> None:
+        """Rows: outputs of blocks are zero."""
+        self.rows.add(term=term, place=place, components=components, outputs=outputs, lower=0, upper=0)
+
     def _node_parameters(self) -> Array:
         c = self.coordinates
         rates = self.robot.velocity_limit[c.dependent]
-        return np.concatenate([self.robot.torque_limit, rates, [self.weight, LEVER], c.start_determinants])
+        return np.concatenate([self.robot.torque_limit, rates, self.units, c.start_determinants])
 
     def _swing_and_follow(self) -> None:
         """Nodes of swing, contact (coasting) and follow-through: one block for all of them."""
@@ -263,12 +224,11 @@ class Transcription:
             y, y1, y2 = self.at(self.follow_control, self.follow_breaks, at)
             instances.append([y, y1, y2, self.follow_legs[k], self.follow_w[k], self.follow_T[0]])
             places.append(f"follow-through, {100 * at:.0f} %")
-        block = Block.make("node", self.functions, instances, self._node_parameters())
-        self.blocks.append(block)
-        self._node_rows(places, block.n_out)
+        self._add_block("node", instances, self._node_parameters())
+        self._node_rows(places, self.blocks[-1].n_out)
         wrenches = [group[k] for group in (self.swing_w, self.follow_w) for k in range(group.count)]
         for place, wrench in zip(places, wrenches, strict=True):
-            self._cone_rows(wrench, place, self.cone.margin)
+            self.cone_rows(wrench, place, self.cone.margin, self.cone.minimum_force)
         joints = np.arange(self.coordinates.base, self.ny)
         self.rows.add(
             term=self.position.name,
@@ -287,7 +247,7 @@ class Transcription:
 
     def _node_rows(self, places: list[str], n_out: int) -> None:
         c, r = self.coordinates, self.robot
-        part = self._parts("node")
+        part = self.parts("node")
         closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
         last = len(self.swing_nodes) - 1
         for i, place in enumerate(places):
@@ -331,7 +291,7 @@ class Transcription:
             upper=0,
         )
 
-    def _cone_rows(self, wrench: Affine, place: str, margin: float) -> None:
+    def cone_rows(self, wrench: Affine, place: str, margin: float, minimum_force: float) -> None:
         for k, leg in enumerate(self.coordinates.legs):
             w = wrench[6 * k : 6 * k + 6]
             rows = contact_wrench_cone(leg.sole.polygon, self.cone.friction, margin=margin) / self.weight
@@ -347,7 +307,7 @@ class Transcription:
                 place=place,
                 components=[f"{leg.sole.name} sole"],
                 affine=w[2:3] * (1 / self.weight),
-                lower=self.cone.minimum_force / self.weight,
+                lower=minimum_force / self.weight,
             )
 
     def _rate_rows(
@@ -388,11 +348,7 @@ class Transcription:
     def _contact(self) -> None:
         p = self.problem
         y, y1, _ = self.contact_state
-        at = sum(b.count * b.n_out for b in self.blocks)
-        block = Block.make(
-            "contact", self.functions, [[y, y1, self.swing_T[0]]], rotation_rows(p.normal).ravel()
-        )
-        self.blocks.append(block)
+        at = self._add_block("contact", [[y, y1, self.swing_T[0]]], rotation_rows(p.normal).ravel())
         self.rows.add(
             term="hit point",
             place="contact",
@@ -416,11 +372,9 @@ class Transcription:
             lower=-self.incidence.speed,
             upper=self.incidence.speed,
         )
-        at += block.n_out
         nodes = self.swing_nodes[:-1]
         instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
-        block = Block.make("approach", self.functions, instances, p.normal)
-        self.blocks.append(block)
+        at = self._add_block("approach", instances, p.normal)
         for i, s in enumerate(nodes):
             self.rows.add(
                 term="no touch before contact",
@@ -430,215 +384,85 @@ class Transcription:
                 upper=float(p.normal @ p.point),
             )
 
-    def _stage_slots(self, group: Group, i: int, start: Affine) -> tuple[Affine, Affine]:
-        """Value and d/ds of a collocated group (u or target speed) at stage i.
+    def _collisions(self) -> None:
+        """One block for all collisions, each with its rows."""
+        slots: dict[str, list[Any]] = {}
+        parameters: dict[str, list[Any]] = {}
+        first: list[dict[str, int]] = []
+        for collision in self.collisions:
+            found = collision.instances()
+            first.append({name: len(slots.get(name, ())) for name in found})
+            for name, (instances, numbers) in found.items():
+                slots.setdefault(name, []).extend(instances)
+                parameters.setdefault(name, []).extend(numbers)
+        at = {name: self._add_block(name, slots[name], np.array(parameters[name])) for name in slots}
+        sizes = {block.name: block.n_out for block in self.blocks}
+        for collision, index in zip(self.collisions, first, strict=True):
+            collision.add_rows({name: (at[name] + k * sizes[name], sizes[name]) for name, k in index.items()})
 
-        ``start``: its value at contact.
-        """
-        s = self.stages[i]
-        slope = Affine.zeros(group.size)
-        for m, w in zip(s.members, s.weights, strict=True):
-            slope = slope + group[m] * w
-        before = group[s.previous] if s.previous >= 0 else start
-        return group[i], slope + before * s.start
-
-    def _collision(self) -> None:
-        p, r, c = self.problem, self.robot, self.coordinates
-        y, _, _ = self.contact_state
-        u0 = self.u0[0]
-        zero, none = Affine.zeros(self.ny), Affine.zeros(1)
-        coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
-        gains = np.concatenate([r.kp, r.kd, r.torque_limit, [self.weight, LEVER]])
-        for i, s in enumerate(self.stages):
-            u, u1 = self._stage_slots(self.u, i, u0)
-            v, v1 = self._stage_slots(self.vt, i, none)
-            T = self.phase_T[s.phase][0]
-            T1 = self.phase_T[0][0] if s.phase else none
-            d1 = self.d[self.end[0]] if s.phase else zero
-            x1 = self.xt[self.end[0]] if s.phase else none
-            coast = [self.coast_legs[i], self.coast_rates[i]]
-            travel = [d1, T1, self.d[i], T]
-            coasting.append([y, u0, T1, T, *coast])
-            coasting_p.append([s.place, float(s.phase)])
-            ff, hit = self.feedforward[0], [self.hit_legs[i], self.f[i], self.hit_w[i]]
-            collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
-            force.append([y, *travel, u, self.f[i], v, v1, self.xt[i], x1])
-            collision_p.append(np.concatenate([p.normal, [s.place, float(s.phase)], gains]))
-            force_p.append(
-                [*p.point, *p.normal, float(s.phase), 1 / p.target.mass, *p.law.parameters.values()]
-            )
-            self._integral_rows(i)
-        at = sum(b.count * b.n_out for b in self.blocks)
-        if c.legs:
-            block = Block.make("coasting", self.functions, coasting, np.array(coasting_p))
-            self.blocks.append(block)
-            names = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
-            for i in range(block.count):
-                self.rows.add(
-                    term="legs of the coasting reference",
-                    place=self.stage_name(i),
-                    components=[*names, *[f"{n} rate" for n in names]],
-                    outputs=at + i * block.n_out + np.arange(block.n_out),
-                    lower=0,
-                    upper=0,
-                )
-            at += block.count * block.n_out
-        block = Block.make("collision", self.functions, collision, np.array(collision_p))
-        self.blocks.append(block)
-        self._collision_rows(at, block.n_out)
-        at += block.count * block.n_out
-        block = Block.make("force", self.functions, force, np.array(force_p))
-        self.blocks.append(block)
-        self._force_rows(at, block.n_out)
-
-    def _integral_rows(self, i: int) -> None:
-        """d and the target's travel are the integrals of u and of the target's speed in the phase so far."""
-        s = self.stages[i]
-        names = self.coordinates.labels
-        for term, integral, rate, labels in (
-            ("collision kinematics", self.d, self.u, names),
-            ("target kinematics", self.xt, self.vt, ("target",)),
-        ):
-            expression = integral[i]
-            for m, w in zip(s.members, s.quadrature, strict=True):
-                expression = expression - rate[m] * w
-            if not s.new_phase:
-                expression = expression - integral[s.previous]
-            self.rows.add(
-                term=term, place=self.stage_name(i), components=labels, affine=expression, lower=0, upper=0
-            )
-
-    def stage_name(self, i: int) -> str:
-        s = self.stages[i]
-        return f"{('compression', 'restitution')[s.phase]}, {100 * s.place:.0f} %"
-
-    def _collision_rows(self, at: int, n_out: int) -> None:
-        c, r = self.coordinates, self.robot
-        part = self._parts("collision")
-        directions = DIRECTIONS[: c.base]
-        closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
-        for i in range(len(self.stages)):
-            start, place = at + i * n_out, self.stage_name(i)
-            for term, name, components in (
-                ("closed legs", "closure", closure),
-                ("collision dynamics", "base", directions),
-                ("collision dynamics", "joints", r.joint_names),
-            ):
-                self.rows.add(
-                    term=term,
-                    place=place,
-                    components=components,
-                    outputs=start + part[name],
-                    lower=0,
-                    upper=0,
-                )
-            self.rows.add(
-                term=f"{self.torque.name} in collision",
-                place=place,
-                components=r.joint_names,
-                outputs=start + part["torque"],
-                lower=-self.torque.collision,
-                upper=self.torque.collision,
-            )
-            self._cone_rows(self.hit_w[i], f"collision, {place}", self.cone.collision_margin)
-
-    def _parts(self, block: str) -> dict[str, Any]:
+    def parts(self, block: str) -> dict[str, Any]:
         """Indices of the named slices of a block's output."""
         size = symbolic.sizes(self.coordinates, block)
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}
 
-    def _force_rows(self, at: int, n_out: int) -> None:
-        for i in range(len(self.stages)):
-            start, place = at + i * n_out, self.stage_name(i)
-            self.rows.add(
-                term="contact law",
-                place=place,
-                components=["force"],
-                outputs=np.array([start]),
-                lower=0,
-                upper=0,
-            )
-            self.rows.add(
-                term="target's motion",
-                place=place,
-                components=["speed"],
-                outputs=np.array([start + 1]),
-                lower=0,
-                upper=0,
-            )
-        self.rows.add(
-            term="end of compression",
-            components=["approach speed"],
-            outputs=np.array([at + self.end[0] * n_out + 2]),
-            lower=0,
-            upper=0,
-        )
-        self.rows.add(
-            term="separation",
-            components=["penetration"],
-            outputs=np.array([at + self.end[1] * n_out + 3]),
-            lower=0,
-            upper=0,
-        )
-
     def _after(self) -> None:
-        c = self.coordinates
-        y, y1, _ = self.contact_state
+        """What comes after contact: the follow-through starts there, and the robot keeps its balance."""
         yf, yf1, _ = self.at(self.follow_control, self.follow_breaks, 0.0)
-        d1, d2, u = self.d[self.end[0]], self.d[self.end[1]], self.u[self.end[1]]
-        times = [self.swing_T[0], self.phase_T[0][0], self.phase_T[1][0]]
-        instances = []
-        for k in range(self.ny):
-            yf_k, yf1_k, y_k, y1_k, d1_k, d2_k, u0_k, u_k = (
-                e[k : k + 1] for e in (yf, yf1, y, y1, d1, d2, self.u0[0], u)
-            )
-            instances.append([yf_k, yf1_k, self.follow_T[0], y_k, y1_k, *times, d1_k, d2_k, u0_k, u_k])
-        at = sum(b.count * b.n_out for b in self.blocks)
-        block = Block.make("link", self.functions, instances, np.zeros(0))
-        self.blocks.append(block)
-        for k, (term, what) in enumerate(
-            (
-                ("collision starts from the swing's end", "rate"),
-                ("follow-through starts from the predicted state", "position"),
-                ("follow-through starts from the predicted state", "rate"),
-            )
-        ):
-            self.rows.add(
-                term=term,
-                place=what,
-                components=c.labels,
-                outputs=at + k + 3 * np.arange(self.ny),
-                lower=0,
-                upper=0,
-            )
-        if not c.legs:
-            return
-        at += block.count * block.n_out
-        inward, offset = inward_edges(support_polygon(self.robot, c))
-        edges = np.column_stack([inward, offset + self.balance.capture_margin])
-        instance = [yf, yf1, self.follow_legs[0], self.follow_T[0]]
-        self.blocks.append(Block.make("balance", self.functions, [instance], edges.ravel()))
-        k = len(edges)
-        self.rows.add(
-            term="capture point",
-            place="after contact",
-            components=[f"edge {i}" for i in range(k)],
-            outputs=at + np.arange(k),
-            lower=0,
-        )
-        limits = (self.balance.vertical_speed, *[self.balance.angular_momentum] * 3)
-        for i, (term, component, limit) in enumerate(
-            zip(("vertical speed", *["angular momentum"] * 3), ("z", "x", "y", "z"), limits, strict=True)
-        ):
-            self.rows.add(
-                term=term,
-                place="after contact",
-                components=[component],
-                outputs=np.array([at + k + i]),
-                lower=-limit,
-                upper=limit,
-            )
+        instances = self.collisions[0].link(yf, yf1, self.follow_T[0])
+        one = Affine.constant(1.0)
+        for other in self.scenarios:
+            instances += other.link(other.after[0], other.u[other.end[1]], one)
+        at = self._add_block("link", instances, np.zeros(0))
+        labels, places = self.coordinates.labels, at + 3 * np.arange(self.ny)
+        self.equal("collision starts from the swing's end", "rate", labels, places)
+        self.equal("follow-through starts from the predicted state", "position", labels, places + 1)
+        self.equal("follow-through starts from the predicted state", "rate", labels, places + 2)
+        for k, other in enumerate(self.scenarios, start=1):
+            place = f"position{other.suffix}"
+            self.equal("state after contact", place, labels, places + 1 + 3 * self.ny * k)
+        if self.coordinates.legs:
+            self._balance_rows(yf, yf1)
+
+    def _balance_rows(self, yf: Affine, yf1: Affine) -> None:
+        margin, one = self.balance.capture_margin, Affine.constant(1.0)
+        y, y1, _ = self.contact_state
+        found = [([yf, yf1, self.follow_legs[0], self.follow_T[0]], margin, "after contact")]
+        for other in self.scenarios:
+            slots = [other.after[0], other.u[other.end[1]], other.legs[other.end[1]], one]
+            assert other.scenario is not None
+            found.append((slots, other.scenario.capture_margin, f"after contact{other.suffix}"))
+        for s in self.problem.scenarios:
+            if s.missing:
+                slots = [y, y1, self.swing_legs[-1], self.swing_T[0]]
+                found.append((slots, s.capture_margin, f"contact, if {s.name}"))
+        inward, offset = inward_edges(support_polygon(self.robot, self.coordinates))
+        parameters = [np.column_stack([inward, offset + (m or 0.0)]).ravel() for _, m, _ in found]
+        at = self._add_block("balance", [slots for slots, _, _ in found], np.array(parameters))
+        k = len(inward)
+        limits = np.array([self.balance.vertical_speed, *[self.balance.angular_momentum] * 3])
+        for i, (_, margin, place) in enumerate(found):
+            start = at + i * (k + 4)
+            if margin is not None:
+                self.rows.add(
+                    term="capture point",
+                    place=place,
+                    components=[f"edge {e}" for e in range(k)],
+                    outputs=start + np.arange(k),
+                    lower=0,
+                )
+            for j, (term, component) in enumerate(
+                zip(("vertical speed", *["angular momentum"] * 3), ("z", "x", "y", "z"), strict=True)
+            ):
+                if np.isfinite(limits[j]):
+                    self.rows.add(
+                        term=term,
+                        place=place,
+                        components=[component],
+                        outputs=np.array([start + k + j]),
+                        lower=-limits[j],
+                        upper=limits[j],
+                    )
 
     # ------------------------------------------------------------------ objective
     def _objective(self) -> tuple[Affine, Any, Array]:
@@ -647,7 +471,7 @@ class Transcription:
         The price makes the optimum unique.
         """
         p, n = self.problem, self.layout.n
-        impulse = self.vt[self.end[1]] * p.target.mass
+        impulse = self.collisions[0].impulse
         quadratic = sp.csr_array((n, n))
         linear = np.zeros(n)
         for control, breaks, nodes, bounds in (
@@ -663,7 +487,7 @@ class Transcription:
                 quadratic = quadratic + 2 * weight * (m.T @ m)
                 linear += 2 * weight * (m.T @ acc.const)
         diagonal = np.zeros(n)
-        for group in (self.swing_w, self.follow_w, self.hit_w):
+        for group in (self.swing_w, self.follow_w, *[hit.w for hit in self.collisions]):
             span = slice(group.offset, group.offset + group.count * group.size)
             diagonal[span] = p.wrench_price / max(1, group.count)
         end = self.follow_c.index(-1)  # price (y_end - y_start)^2: rest near the start posture
@@ -683,40 +507,23 @@ class Transcription:
 
         swing = spline(self.swing_control, self.swing_breaks, self.swing_T)
         follow = spline(self.follow_control, self.follow_breaks, self.follow_T)
-        durations = [float(g.read(x)[0, 0]) for g in self.phase_T]
         outputs = self.program.outputs(x)
         approach = float(outputs["contact"][0, 3])
+        expected = self.collisions[0]
+        compression, restitution = expected.durations(x)
         swing_w = self.swing_w.read(x)
         start_w = static_wrenches(c, self.y0, self.legs0)
         return Plan(
             problem=p,
             swing=swing,
             follow=follow,
-            compression=durations[0],
-            restitution=durations[1],
+            compression=compression,
+            restitution=restitution,
             swing_nodes=np.concatenate([[0.0], self.swing_nodes]),
             swing_wrench=np.vstack([start_w, swing_w]),
             follow_nodes=self.follow_nodes,
             follow_wrench=self.follow_w.read(x),
-            collision=self._decode_collision(x, outputs, approach, durations),
+            collision=expected.decode(x, outputs, approach),
             hand_speed=approach,
-            impulse=float(self.vt.read(x)[self.end[1], 0]) * p.target.mass,
-        )
-
-    def _decode_collision(
-        self, x: Array, outputs: dict[str, Array], approach: float, durations: list[float]
-    ) -> PlannedCollision:
-        time = [(durations[0] if s.phase else 0.0) + s.place * durations[s.phase] for s in self.stages]
-        first = float(self.problem.law.branch(0.0, approach, True))
-        wrench = self.hit_w.read(x)
-        return PlannedCollision(
-            time=np.array([0.0, *time]),
-            force=np.array([first, *self.f.read(x)[:, 0]]),
-            target_speed=np.array([0.0, *self.vt.read(x)[:, 0]]),
-            torque=np.vstack(
-                [self.feedforward.read(x), outputs["collision"][:, self._parts("collision")["torque"]]]
-            )
-            * self.robot.torque_limit,
-            sole_wrench=wrench,
-            ground=total_ground_wrench(self.coordinates, wrench),
+            impulse=float(expected.impulse.evaluate(x)[0]),
         )

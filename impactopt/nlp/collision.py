@@ -1,0 +1,222 @@
+"""The two contact phases in the program: Radau IIA collocation of the whole equation of motion.
+
+One for the expected target, one for each scenario. They share the state at contact, the feed-forward and the
+servo; durations, motion, force and wrenches are each one's own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impactopt.nlp.blocks import FORCE_SCALE
+from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.plan import PlannedCollision, total_ground_wrench
+from impactopt.scenario import Scenario
+
+if TYPE_CHECKING:
+    from impactopt.nlp.transcription import Transcription
+
+DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+class Collision:
+    """Variables and rows of the contact with one target. ``scenario`` None: the expected one."""
+
+    def __init__(self, t: Transcription, scenario: Scenario | None = None) -> None:
+        self.t, self.scenario, self.stages = t, scenario, t.stages
+        p, c = t.problem, t.coordinates
+        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in (0, 1)]
+        named = f"{scenario.name}: " if scenario is not None else ""
+        self.suffix = f", if {scenario.name}" if scenario is not None else ""
+        factors = (scenario.mass, scenario.stiffness, scenario.damping) if scenario else (1.0, 1.0, 1.0)
+        self.mass = p.target.mass * factors[0]
+        scale = {"stiffness": factors[1], "damping": factors[2]}
+        self.law = [value * scale.get(name, 1.0) for name, value in p.law.parameters.items()]
+        self.torque_fraction = scenario.torque if scenario else t.torque.collision
+        self.cone_margin = scenario.cone_margin if scenario else t.cone.collision_margin
+        n = len(self.stages)
+
+        def add(name: str, size: int, **options: Any) -> Group:
+            return t.layout.add(named + name, n, size, **options)
+
+        self.T = [
+            t.duration(f"{named}{name} duration", p.contact_duration, 0.01)
+            for name in ("compression", "restitution")
+        ]
+        self.coast_legs = add("coasting legs", t.nl, labels=c.leg_labels)
+        self.coast_rates = add("coasting leg rates", t.nl, labels=c.leg_labels)
+        self.u = add("collision rate", t.ny, labels=c.labels)
+        self.d = add("collision travel", t.ny, labels=c.labels)
+        legs = {"lower": t.legs_lower, "upper": t.legs_upper, "labels": c.leg_labels}
+        self.legs = add("collision legs", t.nl, **legs)
+        self.f = add("contact force", 1, scale=FORCE_SCALE)
+        self.vt = add("target speed", 1)
+        self.xt = add("target travel", 1)
+        self.w = add("collision sole wrench", t.nw, scale=t.wrench_scale, labels=t.wrench_labels)
+        if scenario is not None:  # the expected target's is the follow-through's first
+            self.after = t.layout.add(f"{named}position after contact", 1, t.ny, labels=c.labels)
+
+    @property
+    def impulse(self) -> Affine:
+        """To the target [N s]."""
+        return self.vt[self.end[1]] * self.mass
+
+    def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        """Slots and parameters of each block's instances, one a stage."""
+        t, p, r = self.t, self.t.problem, self.t.robot
+        y, u0, ff = t.contact_state[0], t.u0[0], t.feedforward[0]
+        zero, none = Affine.zeros(t.ny), Affine.zeros(1)
+        gains = np.concatenate([r.kp, r.kd, r.torque_limit, t.units])
+        coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
+        for i, s in enumerate(self.stages):
+            u, u1 = self._slots(self.u, i, u0)
+            v, v1 = self._slots(self.vt, i, none)
+            T, T1 = self.T[s.phase][0], self.T[0][0] if s.phase else none
+            d1 = self.d[self.end[0]] if s.phase else zero
+            x1 = self.xt[self.end[0]] if s.phase else none
+            coast, travel = [self.coast_legs[i], self.coast_rates[i]], [d1, T1, self.d[i], T]
+            hit = [self.legs[i], self.f[i], self.w[i]]
+            phase = float(s.phase)
+            coasting.append([y, u0, T1, T, *coast])
+            coasting_p.append([s.place, phase])
+            collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
+            collision_p.append(np.concatenate([p.normal, [s.place, phase], gains]))
+            force.append([y, *travel, u, self.f[i], v, v1, self.xt[i], x1])
+            force_p.append([*p.point, *p.normal, phase, 1 / self.mass, *self.law])
+        out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
+            "collision": (collision, collision_p),
+            "force": (force, force_p),
+        }
+        if t.coordinates.legs:
+            out["coasting"] = coasting, coasting_p
+        return out
+
+    def _slots(self, group: Group, i: int, start: Affine) -> tuple[Affine, Affine]:
+        """Value and d/ds of a collocated group (u or target speed) at stage i; ``start``: at contact."""
+        s = self.stages[i]
+        slope = Affine.zeros(group.size)
+        for m, w in zip(s.members, s.weights, strict=True):
+            slope = slope + group[m] * w
+        before = group[s.previous] if s.previous >= 0 else start
+        return group[i], slope + before * s.start
+
+    # ------------------------------------------------------------------ rows
+    def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
+        """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
+        for i, s in enumerate(self.stages):
+            place = f"{s.name}{self.suffix}"
+            self._integral_rows(i, place)
+            first = {name: start + i * size for name, (start, size) in at.items()}
+            self._dynamics_rows(i, place, first)
+        start, size = at["force"]
+        for term, component, k, part in (
+            ("end of compression", "approach speed", self.end[0], 2),
+            ("separation", "penetration", self.end[1], 3),
+        ):
+            self.t.equal(term, self.suffix.lstrip(", "), [component], np.array([start + k * size + part]))
+
+    def _integral_rows(self, i: int, place: str) -> None:
+        """d and the target's travel are the integrals of u and of the target's speed in the phase so far."""
+        s = self.stages[i]
+        for term, integral, rate, labels in (
+            ("collision kinematics", self.d, self.u, self.t.coordinates.labels),
+            ("target kinematics", self.xt, self.vt, ("target",)),
+        ):
+            expression = integral[i]
+            for m, w in zip(s.members, s.quadrature, strict=True):
+                expression = expression - rate[m] * w
+            if not s.new_phase:
+                expression = expression - integral[s.previous]
+            self.t.rows.add(term=term, place=place, components=labels, affine=expression, lower=0, upper=0)
+
+    def _dynamics_rows(self, i: int, place: str, first: dict[str, int]) -> None:
+        t, c, joints = self.t, self.t.coordinates, self.t.robot.joint_names
+        closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
+        if c.legs:
+            names = [*closure, *[f"{n} rate" for n in closure]]
+            t.equal("legs of the coasting reference", place, names, first["coasting"] + np.arange(len(names)))
+        part = t.parts("collision")
+        t.equal("closed legs", place, closure, first["collision"] + part["closure"])
+        t.equal("collision dynamics", place, DIRECTIONS[: c.base], first["collision"] + part["base"])
+        t.equal("collision dynamics", place, joints, first["collision"] + part["joints"])
+        t.rows.add(
+            term=f"{t.torque.name} in collision",
+            place=place,
+            components=joints,
+            outputs=first["collision"] + part["torque"],
+            lower=-self.torque_fraction,
+            upper=self.torque_fraction,
+        )
+        minimum = t.cone.minimum_force if self.scenario is None else 0.0
+        t.cone_rows(self.w[i], f"collision, {place}", self.cone_margin, minimum)
+        t.equal("contact law", place, ["force"], np.array([first["force"]]))
+        t.equal("target's motion", place, ["speed"], np.array([first["force"] + 1]))
+
+    def link(self, position: Affine, rate: Affine, duration: Affine) -> list[list[Affine]]:
+        """Slots of the block ``link``, coordinate by coordinate: this state after contact to the next phase's
+        start, whose ``rate`` is a d/ds over ``duration`` [s]."""
+        t = self.t
+        y, y1, _ = t.contact_state
+        d1, d2, u = self.d[self.end[0]], self.d[self.end[1]], self.u[self.end[1]]
+        times = [t.swing_T[0], self.T[0][0], self.T[1][0]]
+        out = []
+        for k in range(t.ny):
+            p, r, a, b, one, two, u0, after = (
+                e[k : k + 1] for e in (position, rate, y, y1, d1, d2, t.u0[0], u)
+            )
+            out.append([p, r, duration, a, b, *times, one, two, u0, after])
+        return out
+
+    # ------------------------------------------------------------------ numbers
+    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """A uniform push: the target gains 0.8 m/s while the robot loses 0.4 of its rates."""
+        t, c = self.t, self.t.coordinates
+        times = np.clip([0.015, 0.02], *t.problem.contact_duration)
+        total = float(times.sum())
+        for group, value in zip(self.T, times, strict=True):
+            group.write(x, value)
+        place = np.array([s.place for s in self.stages])
+        phase = np.array([s.phase for s in self.stages])
+        elapsed = np.where(phase == 0, place * times[0], times[0] + place * times[1])
+        fraction = elapsed / total
+        speed = 0.8
+        self.vt.write(x, (speed * fraction)[:, None])
+        self.u.write(x, (1 - 0.4 * fraction)[:, None] * rates)
+        # integrals over each phase of a linear ramp, in the phase's own s
+        start = np.where(phase == 0, 0.0, times[0] / total)
+        mean = (start + fraction) / 2 * place
+        self.xt.write(x, (speed * mean)[:, None])
+        self.d.write(x, (place - 0.4 * mean)[:, None] * rates)
+        self.f.write(x, self.mass * speed / total)
+        if self.scenario is not None:
+            self.after.write(x, y + 0.8 * total * rates)
+        if c.legs:
+            self.legs.write(x, legs)
+            self.w.write(x, t.swing_w.read(x)[-1:])
+            for k, at in enumerate(elapsed):
+                legs = c.solve_legs(y + rates * at, legs)
+                v = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)[1]
+                x[self.coast_legs.index(k)], x[self.coast_rates.index(k)] = legs, v[c.base + c.dependent]
+
+    def durations(self, x: Array) -> tuple[float, float]:
+        """Compression and restitution [s]."""
+        first, second = (float(g.read(x)[0, 0]) for g in self.T)
+        return first, second
+
+    def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
+        """The collision that solver variables (n,) stand for; ``outputs`` are the blocks'."""
+        t, durations = self.t, self.durations(x)
+        time = [(durations[0] if s.phase else 0.0) + s.place * durations[s.phase] for s in self.stages]
+        first = float(t.problem.law.branch(0.0, approach, True))
+        wrench = self.w.read(x)
+        torque = outputs["collision"][: len(self.stages), t.parts("collision")["torque"]]
+        return PlannedCollision(
+            time=np.array([0.0, *time]),
+            force=np.array([first, *self.f.read(x)[:, 0]]),
+            target_speed=np.array([0.0, *self.vt.read(x)[:, 0]]),
+            torque=np.vstack([t.feedforward.read(x), torque]) * t.robot.torque_limit,
+            sole_wrench=wrench,
+            ground=total_ground_wrench(t.coordinates, wrench),
+        )

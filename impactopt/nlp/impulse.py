@@ -1,0 +1,83 @@
+"""An impact without duration in the program: what planners without a collision model use.
+
+H (u+ - u-) = -J^T n I + J_c^T w, joints without torque: the generalized impulse balance. The impulse I comes
+from Newton's restitution ("rigid"), or from the two-mass collision of the virtual mass with the contact law
+("virtual mass"; paper, sec. 2 and fig. 1), in closed form for the spring-damper.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impactopt.nlp.collision import DIRECTIONS
+from impactopt.nlp.layout import Affine, Array
+from impactopt.plan import PlannedCollision
+
+if TYPE_CHECKING:
+    from impactopt.nlp.transcription import Transcription
+
+
+class InstantImpact:
+    """Variables and rows of an impact in no time; no row of torque or wrench while it lasts."""
+
+    def __init__(self, t: Transcription) -> None:
+        self.t, c = t, t.coordinates
+        add = t.layout.add
+        self.mass = t.problem.target.mass
+        self.du = add("change of rate", 1, t.ny, labels=c.labels)
+        self.blow = add("impulse", 1, 1, lower=1e-3, scale=10.0)
+        self.w = add("impulsive sole wrench", 1, t.nw, scale=0.05 * t.wrench_scale, labels=t.wrench_labels)
+
+    @property
+    def impulse(self) -> Affine:
+        """To the target [N s]."""
+        return self.blow[0]
+
+    def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        """Slots and parameters of the block ``impact``."""
+        t, p = self.t, self.t.problem
+        y = t.contact_state[0]
+        slots = [y, t.swing_legs[-1], t.u0[0], self.du[0], self.w[0], self.blow[0]]
+        rigid = float(p.collision == "rigid")
+        law = [p.law.parameters[name] for name in ("stiffness", "damping")]
+        numbers = [*p.normal, rigid, p.restitution, *law, 1 / self.mass]
+        return {"impact": ([slots], [np.concatenate([numbers, t.robot.torque_limit, t.units])])}
+
+    def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
+        t, (start, _) = self.t, at["impact"]
+        part = t.parts("impact")
+        t.equal("impulse balance", "impact", DIRECTIONS[: t.coordinates.base], start + part["base"])
+        t.equal("impulse balance", "impact", t.robot.joint_names, start + part["joints"])
+        t.equal("law of the impact", "impact", ["impulse"], start + part["blow"])
+
+    def link(self, position: Affine, rate: Affine, duration: Affine) -> list[list[Affine]]:
+        """As of :meth:`impactopt.nlp.collision.Collision.link`; no time passes."""
+        t, none = self.t, Affine.zeros(1)
+        y, y1, _ = t.contact_state
+        after = t.u0[0] + self.du[0]
+        out = []
+        for k in range(t.ny):
+            p, r, a, b, u0, u = (e[k : k + 1] for e in (position, rate, y, y1, t.u0[0], after))
+            out.append([p, r, duration, a, b, t.swing_T[0], none, none, none, none, u0, u])
+        return out
+
+    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        self.du.write(x, -0.3 * rates)
+        self.blow.write(x, 0.5 * self.mass)
+
+    def durations(self, x: Array) -> tuple[float, float]:
+        return 0.0, 0.0
+
+    def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
+        t = self.t
+        speed = float(self.blow.read(x)[0, 0]) / self.mass
+        return PlannedCollision(
+            time=np.zeros(2),
+            force=np.zeros(2),
+            target_speed=np.array([0.0, speed]),
+            torque=np.repeat(t.feedforward.read(x), 2, axis=0) * t.robot.torque_limit,
+            sole_wrench=np.zeros((0, t.nw)),
+            ground=np.zeros((0, 6)),
+        )

@@ -15,7 +15,7 @@ PACKAGE = Path(impactopt.__file__).parent
 # Each module or folder may import from those above it; of one line, only from those before it.
 LAYERS = (
     ("__init__", "errors"),
-    ("private_files", "_compiler", "_hashing", "codegen"),
+    ("private_files", "_compiler", "_hashing", "codegen", "_workers"),
     ("_robot_checks", "_robot_parts", "_robot_build", "robot", "presets"),
     ("rigid_body",),
     ("stance", "contact"),
@@ -26,10 +26,10 @@ LAYERS = (
     ("nlp",),
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),
-    ("solution", "baseline", "planner"),
+    ("solution", "baseline", "planner", "robustness"),
     ("problem_file", "output", "replay", "sweep"),
     ("plotting", "report", "screen"),
-    ("plain_errors", "_validate_command", "cli", "__main__"),
+    ("plain_errors", "bench", "_validate_command", "cli", "__main__"),
 )
 RANK = {room: rank for rank, room in enumerate(room for layer in LAYERS for room in layer)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.

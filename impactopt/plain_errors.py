@@ -1,0 +1,40 @@
+"""Bad input and warnings as plain messages on stderr, without tracebacks, for every command."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["BAD_INPUT", "INTERRUPTED", "plain_errors"]
+
+BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
+
+
+@contextlib.contextmanager
+def plain_errors(interrupted: str) -> Iterator[Console]:
+    """A console on stderr, for a command's body.
+
+    interrupted : what Ctrl-C prints, where the body does not catch it.
+    """
+    from rich.console import Console
+
+    from impactopt.errors import InputError
+
+    console = Console(stderr=True)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_a, **_k: console.print(f"warning: {message}", markup=False)
+        try:
+            yield console
+        except InputError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            typer.echo(interrupted, err=True)
+            raise typer.Exit(INTERRUPTED) from None

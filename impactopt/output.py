@@ -24,7 +24,16 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.solution import Solution
 
-__all__ = ["Record", "load_record", "make_directory", "record_of", "save_record", "write_file"]
+__all__ = [
+    "Record",
+    "load_record",
+    "make_directory",
+    "plain",
+    "record_of",
+    "replay_arrays",
+    "save_record",
+    "write_file",
+]
 
 FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
@@ -39,13 +48,16 @@ class Record:
     arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
         corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
         by field, `reference_*` (`impactopt.plan.Trajectory`), `plan_*` (`Plan`), `swing_*`, `follow_*` (its
-        splines), `collision_*` (`PlannedCollision`), `simulated_*` (`Simulation`), `solver_*`
-        (`SolverResult`), `history_*` (its iterations).
+        splines), `collision_*` (`PlannedCollision`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation`
+        on free soles, without positions and torques), `solver_*` (`SolverResult`), `history_*` (its
+        iterations).
+    problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
     summary: dict[str, Any]
     problem: str = ""
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict, repr=False)
+    problem_path: Path | None = None
 
     @property
     def completed(self) -> bool:
@@ -57,9 +69,21 @@ class Record:
         """Whether a re-simulation is part of the record."""
         return "simulated_time" in self.arrays
 
+    @property
+    def replayed(self) -> bool:
+        """Whether a replay on free soles is part of the record."""
+        return "replayed_time" in self.arrays
 
-def record_of(solution: Solution, *, simulation: Any | None = None, problem: str = "") -> Record:
-    """The record of a solution, of its re-simulation if there is one, and of the problem file's text.
+
+def record_of(
+    solution: Solution,
+    *,
+    simulation: Any | None = None,
+    replay: Any | None = None,
+    problem: str = "",
+    problem_path: Path | None = None,
+) -> Record:
+    """The record of a solution, of its re-simulations if there are any, and of the problem file's text.
 
     There is always one: where the solver was stopped so early that legs and base do not fit together, it has
     no `reference_*`, and a summary without the motion's numbers and with a `note` that says why.
@@ -77,11 +101,13 @@ def record_of(solution: Solution, *, simulation: Any | None = None, problem: str
         arrays[f"sole_{leg.sole.name}"] = world[:, :2]
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
     parts |= {"collision": plan.collision, "solver": result}
-    summary = _summary(solution, simulation)
+    summary = _summary(solution, simulation, replay)
     if "note" not in summary:
         parts["reference"] = solution.trajectory
     if simulation is not None:
         parts["simulated"] = simulation
+    if replay is not None:
+        arrays |= replay_arrays(replay)
     for prefix in {"reference", "simulated"} & parts.keys():
         arrays[f"{prefix}_angle"] = np.array([robot.joint_positions(q) for q in parts[prefix].q])
     for prefix, thing in parts.items():
@@ -90,15 +116,22 @@ def record_of(solution: Solution, *, simulation: Any | None = None, problem: str
         history = [_numbers(iteration) for iteration in result.history]
         arrays |= {f"history_{name}": [row[name] for row in history] for name in history[0]}
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
-    return Record(summary=_plain(summary), problem=problem, arrays=arrays)
+    return Record(summary=plain(summary), problem=problem, arrays=arrays, problem_path=problem_path)
 
 
-def _summary(solution: Solution, simulation: Any | None) -> dict[str, Any]:
+def replay_arrays(replay: Any) -> dict[str, Any]:
+    """What a record keeps of a `Simulation` on free soles: forces and the soles' motion, by `replayed_*`."""
+    left_out = {"q", "v", "demand", "torque"}
+    kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
+    return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}
+
+
+def _summary(solution: Solution, simulation: Any | None, replay: Any | None) -> dict[str, Any]:
     try:
-        return solution.summary(simulation)
+        return solution.summary(simulation, replay)
     except InputError as error:
         if simulation is not None:  # such as one that missed the target
-            return {**_summary(solution, None), "simulated": {"error": str(error)}}
+            return {**_summary(solution, None, replay), "simulated": {"error": str(error)}}
         return {**solution.outcome(), "note": f"the plan's motion cannot be completed: {error}"}
 
 
@@ -109,12 +142,12 @@ def _numbers(thing: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if isinstance(value, kinds)}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """`value` as JSON has it; what is not finite becomes null."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not np.isfinite(value) else value
@@ -145,8 +178,10 @@ def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path
     InputError : they cannot be written.
     """
     path = make_directory(directory)
-    summary = json.dumps(_plain(record.summary), indent=2, allow_nan=False)
+    summary = json.dumps(plain(record.summary), indent=2, allow_nan=False)
     extra = {"summary_json": summary, "problem_toml": record.problem, "format": FORMAT}
+    if record.problem_path is not None:  # relative, so that results and problems can move together
+        extra["problem_path"] = os.path.relpath(record.problem_path.resolve(), path.resolve())
     numbers: dict[str, Any] = {**record.arrays, **extra}
     write_file(path / NUMBERS, lambda file: np.savez(file, **numbers))
     write_file(path / SUMMARY, lambda file: file.write(f"{summary}\n".encode()))
@@ -174,13 +209,14 @@ def write_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
 
 
 def load_record(directory: str | os.PathLike[str]) -> Record:
-    """The record that `save_record` left in a directory.
+    """The record that `save_record` left in a directory; its `solution.npz` can be named too.
 
     Raises
     ------
     InputError : there is none, it is damaged, or of a newer impactopt.
     """
-    path = Path(directory) / NUMBERS
+    path = Path(directory)
+    path = path if path.name == NUMBERS and not path.is_dir() else path / NUMBERS
     mend = "solve again with `impactopt solve`"
     try:
         # from memory: np.load leaves a damaged file open
@@ -191,6 +227,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
             arrays = {name: file[name] for name in file.files}
         summary = json.loads(str(arrays.pop("summary_json")))
         problem = str(arrays.pop("problem_toml"))
+        near = str(arrays.pop("problem_path", ""))
         del arrays["format"]
     except InputError:
         raise
@@ -203,4 +240,5 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         raise InputError(f"{path} is damaged ({error}); {mend}") from error
     except (zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path} is damaged ({error}); {mend}") from error
-    return Record(summary=summary, problem=problem, arrays=arrays)
+    place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
+    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)

@@ -79,8 +79,8 @@ class Solution:
             "problem": self.problem.describe(),
         }
 
-    def summary(self, simulation: Any | None = None) -> dict[str, Any]:
-        """The numbers of ``summary.json``; ``simulated`` is there when a simulation is given."""
+    def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
+        """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan
         out: dict[str, Any] = {
             **self.outcome(),
@@ -92,12 +92,15 @@ class Solution:
             **plan.margins(self.trajectory),
             "versions": versions(),
         }
+        known: dict[str, Any] = {
+            "torque_limit": self.problem.robot.torque_limit,
+            "polygon": plan.polygon,
+            "planned_impulse": plan.impulse,
+        }
         if simulation is not None:
-            out["simulated"] = simulation.summary(
-                torque_limit=self.problem.robot.torque_limit,
-                polygon=plan.polygon,
-                planned_impulse=plan.impulse,
-            )
+            out["simulated"] = simulation.summary(**known)
+        if replay is not None:
+            out["replayed"] = replay.report(**known)
         return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,8 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
         demand=demand,
         torque=demand,
         sole_ground=np.repeat(reference.ground[first][:, None] / 2, 2, axis=1),
+        soles=("left", "right"),
+        cop_margin=np.full((len(time), 2), 0.05),
         slip=np.zeros((len(time), 2)),
         lift=np.zeros((len(time), 2)),
         contact_start=start,
@@ -111,8 +114,9 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
 class FakeSolution(Solution):
     """`validate` gives the made-up replay."""
 
-    def validate(self, **options: Any) -> Simulation:
-        return simulation_of(self)
+    def validate(self, *, engine: str = "pinocchio", **options: Any) -> Simulation:
+        made = simulation_of(self)
+        return replace(made, engine=engine, fall=None if engine == "pinocchio" else "")
 
 
 class MissingSolution(Solution):

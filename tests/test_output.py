@@ -30,7 +30,8 @@ def problem() -> ImpactProblem:
 @pytest.fixture(scope="module")
 def record(problem: ImpactProblem) -> Record:
     solution = still_solution(problem=problem)
-    return record_of(solution, simulation=solution.validate(), problem="[problem]  # text\n")
+    replay = solution.validate(engine="mujoco")
+    return record_of(solution, simulation=solution.validate(), replay=replay, problem="[problem]  # text\n")
 
 
 def numbers(summary: Any, path: str = "") -> Iterator[str]:
@@ -53,6 +54,10 @@ def test_the_summary_has_the_keys_that_readers_rely_on(record: Record) -> None:
     assert set(keys) <= set(numbers(record.summary))
     assert record.summary["simulated"]["impulse_error_pct"] == pytest.approx(1.0)
     assert record.summary["simulated"]["torque_ratio"]["collision"] == pytest.approx(0.9)
+    assert record.summary["replayed"]["torque_ratio"] == pytest.approx(0.9), "one number for the motion"
+    assert record.summary["replayed"]["zmp_margin_m"] == min(
+        record.summary["replayed"]["zmp_margin_by_phase_m"].values()
+    )
 
 
 def test_a_record_is_read_back_as_it_was_written(record: Record, tmp_path: Path) -> None:
@@ -61,9 +66,19 @@ def test_a_record_is_read_back_as_it_was_written(record: Record, tmp_path: Path)
     back = load_record(tmp_path / "new" / "place")
     assert back.summary == record.summary == json.loads(files[1].read_text())
     assert back.problem == record.problem
+    assert back.problem_path is None
     assert back.arrays.keys() == record.arrays.keys()
     for name, value in record.arrays.items():
         np.testing.assert_array_equal(back.arrays[name], value, strict=True)
+
+
+def test_a_record_knows_where_its_problem_was_after_both_have_moved(record: Record, tmp_path: Path) -> None:
+    there = dataclasses.replace(record, problem_path=tmp_path / "here" / "problems" / "punch.toml")
+    save_record(there, tmp_path / "here" / "results" / "punch")
+    (tmp_path / "here").rename(tmp_path / "moved")
+    for name in ("", "solution.npz"):
+        back = load_record(tmp_path / "moved" / "results" / "punch" / name)
+        assert back.problem_path == (tmp_path / "moved" / "problems" / "punch.toml").resolve()
 
 
 def test_the_arrays_are_the_plan_and_the_replay(record: Record, problem: ImpactProblem) -> None:
@@ -99,7 +114,7 @@ def test_a_replay_that_misses_the_target_is_kept_with_the_reason(
     record = record_of(solution, simulation=solution.validate())
     assert "never touched" in record.summary["simulated"]["error"]
     assert record.summary["impulse_Ns"] == solution.impulse
-    assert len(save_pictures(record, tmp_path)) == len(PICTURES)
+    assert {path.stem for path in save_pictures(record, tmp_path)} == set(PICTURES) - {"replay"}
 
 
 def test_a_plan_whose_legs_do_not_close_still_leaves_a_record(
@@ -191,7 +206,7 @@ def test_a_place_that_cannot_be_a_directory(record: Record, tmp_path: Path) -> N
 
 def test_pictures_of_a_record(record: Record, tmp_path: Path) -> None:
     written = save_pictures(record, tmp_path)
-    assert {path.stem for path in written} == {"force", "zmp", "torque", "motion"}
+    assert {path.stem for path in written} == {"force", "zmp", "torque", "motion", "replay"}
     for path in written:
         assert path.read_bytes().startswith(b"\x89PNG")
     assert set(tmp_path.iterdir()) == set(written)
@@ -206,6 +221,7 @@ def test_pictures_need_no_replay_and_stale_ones_go(
     on_a_fixed_base = dataclasses.replace(plan, arrays={**plan.arrays, "polygon": np.zeros((0, 2))})
     assert {path.stem for path in save_pictures(on_a_fixed_base, tmp_path)} == {"force", "torque", "motion"}
     assert not (tmp_path / "zmp.png").exists()
+    assert not (tmp_path / "replay.png").exists()
 
 
 def test_every_axis_of_a_picture_has_its_unit(record: Record) -> None:

@@ -6,6 +6,12 @@
 * reading.py    from file to problem
 """
 
-from impactopt.problem_file.reading import ProblemFile, SolverSettings, load_problem, read_problem_file
+from impactopt.problem_file.reading import (
+    ProblemFile,
+    SolverSettings,
+    load_problem,
+    parse_problem_file,
+    read_problem_file,
+)
 
-__all__ = ["ProblemFile", "SolverSettings", "load_problem", "read_problem_file"]
+__all__ = ["ProblemFile", "SolverSettings", "load_problem", "parse_problem_file", "read_problem_file"]

@@ -19,7 +19,7 @@ from impactopt.problem_file.sections import File
 from impactopt.robot import Robot
 from impactopt.stance import BothSoles, FixedBase, OneSole, Stance
 
-__all__ = ["ProblemFile", "SolverSettings", "load_problem", "read_problem_file"]
+__all__ = ["ProblemFile", "SolverSettings", "load_problem", "parse_problem_file", "read_problem_file"]
 
 _T = TypeVar("_T")
 
@@ -89,7 +89,16 @@ def read_problem_file(path: str | os.PathLike[str]) -> ProblemFile:
     InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
     """
     path = Path(path)
-    text = _read(path)
+    return parse_problem_file(_read(path), path)
+
+
+def parse_problem_file(text: str, path: Path) -> ProblemFile:
+    """A problem file's text, checked like the file; `path` is where it was: the place of the files it names.
+
+    Raises
+    ------
+    InputError : the text is wrong; one message with all mistakes and their lines.
+    """
     tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
         data = tomllib.loads(text)

@@ -20,9 +20,10 @@ class Conditions:
     payload [kg] : a point mass at the striking point that the plan does not know of.
     friction : coefficient between soles and floor.  floor_time [s] : time constant of the floor's contact
         (MuJoCo's solref), the softness of floor and soles: a sole sinks by about 9.81 floor_time^2 [m].
+        MuJoCo does not go below two steps.
     kp, kd, torque_limit : of the servo, as factors.
     period [s] : the servo reads the joints and sets torques this often, and holds them between; 0: in every
-        step of the simulation.  delay [s] : between reading and setting.
+        step of the simulation.  delay [s] : between reading and setting. Both are rounded to steps.
 
     Raises
     ------

@@ -36,6 +36,10 @@ def simulate(
     run = ENGINES[engine]
     known = set(run.__kwdefaults__ or {})
     for name in options:
+        if name == "conditions" and name not in known:
+            raise InputError(
+                f"engine {engine!r} replays what was planned, no other conditions; take engine 'mujoco'"
+            )
         if name not in known:
             raise InputError(
                 f"engine {engine!r} has no option {name!r}{did_you_mean(name, known)}: there are "

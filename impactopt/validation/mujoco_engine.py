@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robot import Robot
 from impactopt.validation.conditions import Conditions
-from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module
+from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module, no_log_file
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
+from impactopt.validation.soles import BEARS, cop_margin, sole_names, weight_of
 
 Array = NDArray[np.float64]
-FALLEN_TILT, FALLEN_DROP = 1.0, 0.4  # [rad] of the base from its start; of its height, as a fraction
-LEANS, STIRS = 0.2, 0.05  # [rad] from the reference's last base; [m/s] of the base: more is no standing
-BEARS = 0.02  # of the weight: a sole with less on it does not stand
+FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
+LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
 
 
 class _Replay:
@@ -43,7 +43,9 @@ class _Replay:
         self.place = np.array([joint.qposadr[0] for joint in joints])
         self.floating = robot.model.nv > robot.n
         self.site = self.world.site("striker").id
-        self.target = None if conditions.missing else int(self.world.joint("target").dofadr[0])
+        target = None if conditions.missing else self.world.joint("target")
+        self.target = None if target is None else int(target.dofadr[0])
+        self.travel = None if target is None else int(target.qposadr[0])
         self.row = np.zeros((3, self.world.nv))
         self.held = {name: k for k, name in enumerate(scene.soles)}
         self.geom_sole = np.full(self.world.ngeom, -1)
@@ -56,7 +58,8 @@ class _Replay:
             np.array([f.placement.act(np.array([*c, 0.0])) for c in corners])
             for f, corners in zip(frames, scene.corners, strict=True)
         ]
-        self.start(np.asarray(reference.q[0]))
+        self.reference_q = np.asarray(reference.q)
+        self.start(self.reference_q[0])
 
     def start(self, q: Array) -> None:
         d = self.data
@@ -65,7 +68,6 @@ class _Replay:
         d.qpos[self.place] = self.servo.angles(q)
         self.mujoco.mj_forward(self.world, d)
         self.start_corners = self.corner_places()
-        self.start_base = self.base()
 
     # ------------------------------------------------------------------ what a step needs
     def hand_speed(self) -> float:
@@ -78,7 +80,7 @@ class _Replay:
         if self.target is None:
             return 0.0
         travel = float(self.scene.normal @ (self.data.site_xpos[self.site] - self.scene.point))
-        depth = travel - float(self.data.qpos[self.world.jnt_qposadr[-1]])
+        depth = travel - float(self.data.qpos[self.travel])
         if depth <= 0:
             return 0.0
         approach = speed - float(self.data.qvel[self.target])
@@ -145,16 +147,15 @@ class _Replay:
             out[sole, 3:] += np.cross(place, force)
         return out
 
-    def fallen(self) -> str:
+    def fallen(self, q_planned: Array) -> str:
+        """Whether the base is far from where the reference (nq,) has it: a plan may bow deeply itself."""
         if not self.floating:
             return ""
-        place, rotation, _ = self.base()
-        start, upright, _ = self.start_base
-        tilt = _angle(rotation @ upright.T, axis_free=True)
-        if tilt > FALLEN_TILT:
-            return f"fell: the base leans by {tilt:.1f} rad"
-        if place[2] < (1 - FALLEN_DROP) * start[2]:
-            return f"fell: the base dropped from {start[2]:.2f} to {place[2]:.2f} m"
+        place, lean = self.data.qpos[:3], self.base_error(q_planned, axis_free=True)
+        if lean > FALLEN_TILT:
+            return f"fell: the base leans {lean:.1f} rad from where it should be"
+        if place[2] < (1 - FALLEN_DROP) * q_planned[2]:
+            return f"fell: the base is {place[2]:.2f} m high where it should be {q_planned[2]:.2f} m"
         return ""
 
     def posture_error(self, q_end: Array) -> float:
@@ -166,22 +167,26 @@ class _Replay:
         worst = float(error.max())
         return max(worst, self.base_error(q_end)) if self.floating else worst
 
-    def base_error(self, q_end: Array) -> float:
+    def planned(self, t: float) -> Array:
+        """The reference's configuration (nq,) at a time, or just before it."""
+        return self.reference_q[max(int(np.searchsorted(self.servo.time, t, side="right")) - 1, 0)]
+
+    def base_error(self, q_end: Array, *, axis_free: bool = False) -> float:
         planned = pin.Quaternion(q_end[3:7]).toRotationMatrix()
-        return _angle(self.base()[1] @ planned.T)
+        return _angle(self.base()[1] @ planned.T, axis_free=axis_free)
 
     def not_standing(self, q_end: Array, sole_ground: Array, weight: float) -> str:
         """Why the robot does not stand at the end, "" if it does."""
         if not self.floating:
             return ""
-        lean, speed = self.base_error(q_end), self.base()[2]
+        lean, speed = self.base_error(q_end, axis_free=True), self.base()[2]
         if lean > LEANS:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STIRS:
             return f"still moves at the end: base at {speed:.2f} m/s"
-        for k, name in enumerate(self.scene.soles):
-            if sole_ground[k, 2] < BEARS * weight:
-                return f"{name} bears no load at the end"
+        for name, wrench in zip(sole_names(self.robot, self.scene), sole_ground, strict=True):
+            if wrench[2] < BEARS * weight:
+                return f"the sole {name!r} bears no load at the end"
         return ""
 
 
@@ -221,52 +226,56 @@ def simulate_mujoco(
     world = conditions if conditions is not None else Conditions()
     replay = _Replay(robot, reference, scene, world, Solver(step, iterations, tolerance))
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
-    weight = 9.81 * float(sum(inertia.mass for inertia in robot.model.inertias))
     q_end = np.asarray(reference.q[-1])
     hold = max(1, round(world.period / step))
-    waiting: deque[tuple[Array, Array]] = deque()
-    lag = round(world.delay / step / hold)
+    waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
+    lag = round(world.delay / step)
     demand = torque = np.zeros(robot.n)
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
     contact_start = contact_end = np.nan
     saturated, fall, before = 0.0, "", 0.0
-    for k in range(round((float(reference.end) + settle) / step)):
-        t = k * step
-        mujoco.mj_step1(model, data)
-        if k % hold == 0:
-            waiting.append(servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof]))
-            demand, torque = waiting[0] if len(waiting) <= lag else waiting.popleft()
-        speed = replay.hand_speed()
-        force = replay.contact_force(speed)
-        data.qfrc_applied[:] = -force * replay.push
-        data.qfrc_applied[replay.dof] += torque
-        if replay.target is not None:
-            data.qfrc_applied[replay.target] = force
-        if force > 0 and np.isnan(contact_start):
-            contact_start = t
-        if force <= 0 < before and np.isnan(contact_end):
-            contact_end = t
-        before = force
-        saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
-        target_speed = replay.target_speed()
-        kept = k % record == 0 or force > 0
-        state = replay.state() if kept else None
-        moves = replay.sole_moves() if kept else None
-        mujoco.mj_step2(model, data)
-        if kept:
-            ground = replay.sole_ground()
-            assert state is not None and moves is not None
-            rows.append((t, *state, force, target_speed, speed, demand, torque, ground, *moves))
-            if not np.all(np.isfinite(data.qvel)) or np.abs(data.qvel).max() > 1e4:
-                raise InputError(
-                    f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or "
-                    "softer gains"
-                )
-            fall = replay.fallen()
-            if fall:
-                fall = f"{fall} at t = {t:.2f} s"
-                break
+    with no_log_file():
+        for k in range(round((float(reference.end) + settle) / step)):
+            t = k * step
+            mujoco.mj_step1(model, data)
+            if k % hold == 0:
+                asked = servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof])
+                waiting.append(
+                    (k + lag if k else 0, asked)
+                )  # at rest before the start, it asked for the same
+            while waiting and waiting[0][0] <= k:
+                demand, torque = waiting.popleft()[1]
+            speed = replay.hand_speed()
+            force = replay.contact_force(speed)
+            data.qfrc_applied[:] = -force * replay.push
+            data.qfrc_applied[replay.dof] += torque
+            if replay.target is not None:
+                data.qfrc_applied[replay.target] = force
+            if force > 0 and np.isnan(contact_start):
+                contact_start = t
+            if force <= 0 < before and np.isnan(contact_end):
+                contact_end = t
+            before = force
+            saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
+            target_speed = replay.target_speed()
+            kept = k % record == 0 or force > 0
+            state = replay.state() if kept else None
+            moves = replay.sole_moves() if kept else None
+            mujoco.mj_step2(model, data)
+            if kept:
+                ground = replay.sole_ground()
+                assert state is not None and moves is not None
+                rows.append((t, *state, force, target_speed, speed, demand, torque, ground, *moves))
+                if not np.all(np.isfinite(data.qvel)) or np.abs(data.qvel).max() > 1e4:
+                    raise InputError(
+                        f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or "
+                        "softer gains"
+                    )
+                fall = replay.fallen(replay.planned(t))
+                if fall:
+                    fall = f"{fall} at t = {t:.2f} s"
+                    break
     columns = [np.array(c) for c in zip(*rows, strict=True)]
     time, q, v, forces, target, hand, demands, torques, grounds, slip, lift = columns
     return Simulation(
@@ -280,6 +289,8 @@ def simulate_mujoco(
         demand=demands,
         torque=torques,
         sole_ground=grounds,
+        soles=sole_names(robot, scene),
+        cop_margin=cop_margin(robot, scene, q, grounds),
         slip=slip.reshape(len(time), -1),
         lift=lift.reshape(len(time), -1),
         contact_start=contact_start,
@@ -287,5 +298,5 @@ def simulate_mujoco(
         mass=replay.scene.mass,
         saturated=saturated,
         posture_error=replay.posture_error(q_end),
-        fall=fall or replay.not_standing(q_end, ground, weight),
+        fall=fall or replay.not_standing(q_end, ground, weight_of(robot)),
     )

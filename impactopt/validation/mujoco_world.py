@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +40,18 @@ def mujoco_module() -> Any:
     return mujoco
 
 
+@contextlib.contextmanager
+def no_log_file() -> Iterator[None]:
+    """MuJoCo's warnings are not written to a file in the user's directory: the engine raises its own."""
+    mujoco = mujoco_module()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solver) -> Any:
     """The compiled mujoco.MjModel.
 
@@ -56,10 +70,12 @@ def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solv
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0  # friction as hard as the normal direction: no creep
-    spec.option.gravity = [0.0, 0.0, -9.81]
+    # the engine says so itself when it diverges, and does not begin anew
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    spec.option.gravity = robot.model.gravity.linear
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
-    _surface(floor, conditions)
+    _surface(floor, conditions, sole=False)
     _robot_bodies(mujoco, spec, robot, scene, conditions)
     if not conditions.missing:
         slide = mujoco.mjtJoint.mjJNT_SLIDE
@@ -104,7 +120,7 @@ def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions
                 pos=centre,
                 mass=0.0,
             )
-            _surface(sphere, conditions)
+            _surface(sphere, conditions, sole=True)
     frame = model.frames[model.getFrameId(scene.striker)]
     hand = bodies[frame.parentJoint]
     hand.add_site(name="striker", pos=frame.placement.translation)
@@ -113,7 +129,8 @@ def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions
         _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
 
 
-def _surface(geom: Any, conditions: Conditions) -> None:
+def _surface(geom: Any, conditions: Conditions, *, sole: bool) -> None:
+    geom.contype, geom.conaffinity = int(sole), int(not sole)  # soles meet the floor, not each other
     geom.friction = [conditions.friction, 1e-3, 1e-4]
     geom.condim = 3
     geom.solref = [conditions.floor_time, 1.0]

@@ -18,6 +18,7 @@ from impactopt.errors import InputError
 from impactopt.robot import Robot
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
+from impactopt.validation.soles import cop_margin, sole_names
 
 Array = NDArray[np.float64]
 
@@ -184,6 +185,8 @@ def simulate_pinocchio(
         demand=demand,
         torque=torque,
         sole_ground=ground,
+        soles=sole_names(robot, scene),
+        cop_margin=cop_margin(robot, scene, q, ground),
         slip=slips.reshape(len(time), -1),
         lift=lifts.reshape(len(time), -1),
         contact_start=contact_start,

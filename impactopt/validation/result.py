@@ -12,6 +12,27 @@ from impactopt.errors import InputError
 
 Array = NDArray[np.float64]
 PHASES = ("swing", "collision", "follow")
+REPORT = (
+    "engine",
+    "standing",
+    "reason",
+    "impulse_Ns",
+    "impulse_error_pct",
+    "peak_force_N",
+    "contact_ms",
+    "zmp_margin_m",
+    "sole_slip_mm",
+    "sole_lift_mm",
+    "torque_ratio",
+    "saturated_ms",
+    "final_posture_error_rad",
+    "zmp_margin_by_phase_m",
+    "torque_ratio_by_phase",
+    "sole_lift_collision_mm",
+    "min_normal_force_N",
+    "hand_speed_m_s",
+    "sole_cop_margin_m",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +62,10 @@ class Simulation:
 
     q (k, nq) and v (k, nv), pin's; force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m]
     servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
-    each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; slip,
-    lift (k, soles) [m]: how far the corner of a sole that moved most went along the ground, and rose.
+    each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; soles:
+    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, nan
+    where it bears no load; slip, lift (k, soles) [m]: how far the corner of a sole that moved most went along
+    the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  saturated [s]: how long some joint asked
     for more than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None
     where the engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's
@@ -59,6 +82,8 @@ class Simulation:
     demand: Array
     torque: Array
     sole_ground: Array
+    soles: tuple[str, ...]
+    cop_margin: Array
     slip: Array
     lift: Array
     contact_start: float
@@ -127,18 +152,36 @@ class Simulation:
             n: float(ratio[phase == k].max()) for k, n in enumerate(PHASES) if (phase == k).any()
         }
         if len(polygon):
-            inside = _distance_inside(polygon, self.zmp())
+            inside = distance_inside(polygon, self.zmp())
             out["zmp_margin_m"] = {
                 n: float(np.nanmin(inside[phase == k]))
                 for k, n in enumerate(PHASES)
                 if np.isfinite(inside[phase == k]).any()
             }
             out["min_normal_force_N"] = float(self.sole_normal.min())  # of any one sole
+            out["sole_cop_margin_m"] = {
+                n: float(np.nanmin(m))
+                for n, m in zip(self.soles, self.cop_margin.T, strict=True)
+                if np.isfinite(m).any()
+            }
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())
             out["sole_lift_mm"] = 1e3 * float(self.lift.max())
             collision = self.lift[phase == 1]
             out["sole_lift_collision_mm"] = 1e3 * float(collision.max()) if collision.size else 0.0
         return out
+
+    def report(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
+        """The summary with one number for the whole motion where that one has one for each phase.
+
+        Keys as `impactopt validate --json` prints them: ``zmp_margin_m`` is the least, ``torque_ratio`` the
+        largest; ``zmp_margin_by_phase_m`` and ``torque_ratio_by_phase`` are the summary's.
+        """
+        given = self.summary(torque_limit=torque_limit, polygon=polygon, planned_impulse=planned_impulse)
+        margins, ratios = given.get("zmp_margin_m", {}), given["torque_ratio"]
+        given["zmp_margin_m"] = min(margins.values(), default=None)
+        given["torque_ratio"] = max(ratios.values())
+        given |= {"zmp_margin_by_phase_m": margins, "torque_ratio_by_phase": ratios}
+        return {name: given.get(name) for name in REPORT}
 
 
 def centre_of_pressure(wrench: Array) -> Array:
@@ -147,7 +190,7 @@ def centre_of_pressure(wrench: Array) -> Array:
     return np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / normal[..., None]
 
 
-def _distance_inside(polygon: Array, points: Array) -> Array:
+def distance_inside(polygon: Array, points: Array) -> Array:
     """Distance (k,) [m] of points (k, 2) from a counter-clockwise polygon's nearest edge, < 0 outside."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)

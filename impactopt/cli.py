@@ -1,32 +1,32 @@
-"""The command line: `impactopt solve`, `impactopt check`, `impactopt robots`.
+"""The command line: `impactopt solve`, `impactopt validate`, `impactopt check`, `impactopt robots`.
 
 What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
-Exit codes: 0 solved, 1 not solved, 2 bad input.
+Exit codes: 0 solved, 1 not solved, or fallen in a replay, 2 bad input.
 """
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import json
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from impactopt._validate_command import validate
+from impactopt.bench.command import app as bench_app
+from impactopt.plain_errors import plain_errors
 
+if TYPE_CHECKING:
     from impactopt.output import Record
     from impactopt.problem import ImpactProblem
+    from impactopt.problem_file import ProblemFile
     from impactopt.screen import Progress
     from impactopt.solution import Solution
 
 __all__ = ["app", "main"]
 
-NOT_SOLVED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+NOT_SOLVED = 1
 WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
 
 app = typer.Typer(
@@ -38,7 +38,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-ProblemFile = Annotated[
+app.add_typer(bench_app)
+
+ProblemPath = Annotated[
     Path, typer.Argument(metavar="FILE", help="Problem file, such as problems/punch.toml.")
 ]
 
@@ -64,7 +66,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command()
 def solve(
-    file: ProblemFile,
+    file: ProblemPath,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
@@ -84,7 +86,7 @@ def solve(
 
     Ctrl-C stops the solver; its best iterate is kept. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    with _plain_errors() as console:
+    with plain_errors("interrupted before there was a plan to keep") as console:
         from impactopt.output import make_directory
         from impactopt.planner import solve as plan
         from impactopt.problem_file import read_problem_file
@@ -108,7 +110,7 @@ def solve(
                 callback=progress.iteration,
             )
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
-            record = _record(solution, read.text, validate, progress)
+            record = _record(solution, read, validate, progress)
             if baseline:
                 progress.say("looking for the hardest minimum-jerk reach inside the same limits")
                 record.summary["baseline"] = _baseline(problem)
@@ -118,10 +120,13 @@ def solve(
             raise typer.Exit(NOT_SOLVED)
 
 
+app.command()(validate)
+
+
 @app.command()
-def check(file: ProblemFile) -> None:
+def check(file: ProblemPath) -> None:
     """Say whether a problem file is sound and its target within reach. Exit code: 0 sound, 2 not."""
-    with _plain_errors():
+    with plain_errors("interrupted"):
         from impactopt.problem_file import load_problem
 
         problem = load_problem(file)
@@ -133,7 +138,7 @@ def check(file: ProblemFile) -> None:
 @app.command()
 def robots() -> None:
     """List the robots that problem files can name."""
-    with _plain_errors():
+    with plain_errors("interrupted"):
         from impactopt.presets import load_robot, robot_names
 
         for name in robot_names():
@@ -148,23 +153,35 @@ def robots() -> None:
                 typer.echo(f"  {kind:<9} {', '.join(names)}")
 
 
-def _record(solution: Solution, text: str, validate: bool, progress: Progress) -> Record:
-    """The solution as numbers, with its re-simulation where there is something to simulate."""
+def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Progress) -> Record:
+    """The solution as numbers, with its re-simulations where there is something to simulate."""
     from impactopt.errors import InputError
     from impactopt.output import record_of
+    from impactopt.replay import has_mujoco
 
-    simulation, violation = None, solution.result.max_violation
+    done, violation = {}, solution.result.max_violation
+    engines = {"pinocchio": "in full dynamics", "mujoco": "on free soles"}
     if validate and not violation <= WORTH_REPLAYING:
         progress.say(f"no replay: rows of the plan are off by up to {violation:.2g}")
     elif validate:
-        progress.say("replaying the plan in full dynamics")
-        try:
-            simulation = solution.validate()
-        except KeyboardInterrupt:
-            progress.say("the replay was interrupted; the plan is kept without it")
-        except InputError as error:
-            progress.say(f"the plan is kept without a replay: {error}")
-    return record_of(solution, simulation=simulation, problem=text)
+        for engine, how in engines.items():
+            if engine == "mujoco" and not has_mujoco():
+                continue
+            progress.say(f"replaying the plan {how}")
+            try:
+                done[engine] = solution.validate(engine=engine)
+            except KeyboardInterrupt:
+                progress.say("the replay was interrupted; the plan is kept without it")
+                break
+            except InputError as error:
+                progress.say(f"the plan is kept without a replay {how}: {error}")
+    return record_of(
+        solution,
+        simulation=done.get("pinocchio"),
+        replay=done.get("mujoco"),
+        problem=read.text,
+        problem_path=read.path,
+    )
 
 
 def _baseline(problem: ImpactProblem) -> dict[str, object]:
@@ -217,26 +234,6 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     )
     names = ", ".join(path.name for path in written)
     console.print(f"{written[0].parent}: {names}", highlight=False, soft_wrap=True)
-
-
-@contextlib.contextmanager
-def _plain_errors() -> Iterator[Console]:
-    """A console on stderr; bad input and warnings as plain messages there, without tracebacks."""
-    from rich.console import Console
-
-    from impactopt.errors import InputError
-
-    console = Console(stderr=True)
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_a, **_k: console.print(f"warning: {message}", markup=False)
-        try:
-            yield console
-        except InputError as error:
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(BAD_INPUT) from None
-        except KeyboardInterrupt:
-            typer.echo("interrupted before there was a plan to keep", err=True)
-            raise typer.Exit(INTERRUPTED) from None
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from impactopt.program import IterationRecord
 
-__all__ = ["Progress", "result_table", "violation_table"]
+__all__ = ["Progress", "replay_table", "result_table", "violation_table"]
 
 PHASES = ("swing", "collision", "follow")
 QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
@@ -70,51 +70,78 @@ class Progress:
 
 
 def result_table(summary: Mapping[str, Any]) -> Table:
-    """Planned beside simulated; what is outside its limit is marked."""
-    simulated = summary.get("simulated", {})
-    if "error" in simulated:
-        simulated = {}
+    """Planned beside simulated, and beside the replay on free soles; what is outside its limit is marked."""
+    columns = {"planned": summary, "simulated": summary.get("simulated", {})}
+    return _table(summary, {**columns, "free soles": _by_phase(summary.get("replayed", {}))})
+
+
+def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
+    """A replay beside the plan; `report` as in `impactopt validate --json`."""
+    name = "free soles" if report["engine"] == "mujoco" else "held soles"
+    return _table(summary, {"planned": summary, name: _by_phase(report)})
+
+
+def _by_phase(report: Mapping[str, Any]) -> dict[str, Any]:
+    """A report with its numbers by phase, named as in a summary."""
+    names = {"zmp_margin_m": "zmp_margin_by_phase_m", "torque_ratio": "torque_ratio_by_phase"}
+    return {**report, **{name: report.get(other) or {} for name, other in names.items()}} if report else {}
+
+
+def _table(summary: Mapping[str, Any], sources: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A column for each source that says something; the first is the plan's."""
+    columns = {name: source for name, source in sources.items() if source and "error" not in source}
     table = Table(title=escape(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
     table.add_column("")
-    table.add_column("planned", justify="right")
-    if simulated:
-        table.add_column("simulated", justify="right")
+    for name in columns:
+        table.add_column(name, justify="right")
     for label, key, digits in (
         ("impulse [N s]", "impulse_Ns", 2),
         ("peak force [N]", "peak_force_N", 0),
         ("contact time [ms]", "contact_ms", 1),
         ("hand speed at contact [m/s]", "hand_speed_m_s", 3),
     ):
-        _row(table, label, summary.get(key), simulated, key, digits)
+        _row(table, label, [source.get(key) for source in columns.values()], digits)
     for label, key, digits, scale, least, most in (
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
     ):
         for phase in PHASES:
-            values = [source.get(key, {}).get(phase) for source in (summary, simulated)]
-            if values[0] is not None or values[1] is not None:
-                cells = [_cell(v, digits, scale=scale, good=v is None or least <= v <= most) for v in values]
-                table.add_row(escape(f"{label}, {phase}"), *cells[: 2 if simulated else 1])
-    if simulated:
-        for label, key, digits in (
-            ("least normal force [N]", "min_normal_force_N", 0),
-            ("largest slip of a sole [mm]", "sole_slip_mm", 3),
-            ("largest lift of a sole [mm]", "sole_lift_mm", 3),
-            ("impulse error [%]", "impulse_error_pct", 2),
-        ):
-            if key in simulated:
-                lifted = key == "min_normal_force_N" and (simulated[key] or 0) <= 0
-                table.add_row(escape(label), "", _cell(simulated[key], digits, good=not lifted))
+            values = [source.get(key, {}).get(phase) for source in columns.values()]
+            _row(table, f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
+    replays = list(columns.values())[1:]
+    for label, key, digits in (
+        ("least normal force [N]", "min_normal_force_N", 0),
+        ("largest slip of a sole [mm]", "sole_slip_mm", 2),
+        ("largest lift of a sole [mm]", "sole_lift_mm", 2),
+        ("impulse error [%]", "impulse_error_pct", 2),
+    ):
+        _row(table, label, [None, *(source.get(key) for source in replays)], digits, first="")
+    if any(source.get("standing") is not None for source in replays):
+        _stands(table, replays)
     return table
 
 
+def _stands(table: Table, replays: Sequence[Mapping[str, Any]]) -> None:
+    words = {True: "yes", False: "[bold red]! no[/]", None: "-"}
+    table.add_row("stands at the end", "", *(words[source.get("standing")] for source in replays))
+
+
 def _row(
-    table: Table, label: str, planned: float | None, simulated: Mapping[str, Any], key: str, digits: int
+    table: Table,
+    label: str,
+    values: Sequence[float | None],
+    digits: int,
+    *,
+    scale: float = 1.0,
+    least: float = -np.inf,
+    most: float = np.inf,
+    first: str | None = None,
 ) -> None:
-    cells = [_cell(planned, digits)]
-    if simulated:
-        cells.append(_cell(simulated.get(key), digits))
-    table.add_row(escape(label), *cells)
+    """A row where some column has a number; `first` instead of the first one."""
+    if all(value is None for value in values):
+        return
+    cells = [_cell(v, digits, scale=scale, good=v is None or least <= v <= most) for v in values]
+    table.add_row(escape(label), *([first, *cells[1:]] if first is not None else cells))
 
 
 def _cell(value: float | None, digits: int, *, scale: float = 1.0, good: bool = True) -> str:

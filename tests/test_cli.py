@@ -43,7 +43,7 @@ max_iter = 7
 [solver.sqp]
 price = 50.0
 """
-FILES = {"solution.npz", "summary.json", "force.png", "zmp.png", "torque.png", "motion.png"}
+FILES = {"solution.npz", "summary.json", "force.png", "zmp.png", "torque.png", "motion.png", "replay.png"}
 
 runner = CliRunner()
 
@@ -92,7 +92,7 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReque
     """Empty files in place of pictures; test_output draws them, and here `real_pictures`."""
 
     def save(record: Record, directory: Path) -> list[Path]:
-        paths = [directory / f"{name}.png" for name in ("force", "zmp", "torque", "motion")]
+        paths = [directory / f"{name}.png" for name in ("force", "zmp", "torque", "motion", "replay")]
         for path in paths:
             path.touch()
         return paths

@@ -73,9 +73,9 @@ class ImpactProblem:
         sum to 1.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
     collision : "dynamics", the whole equation of motion while the contact lasts; "rigid", an impact in no
-        time with ``restitution`` (speed of separation over that of approach); "virtual mass", the same with
-        the restitution of two masses under the contact law. The last two know nothing of torque, ZMP and servo
-        during the impact: they are what others plan with, to compare.
+        time with ``coefficient_of_restitution`` (speed of separation over that of approach); "virtual mass",
+        the same with the restitution of two masses under the contact law. The last two know nothing of
+        torque, ZMP and servo during the impact: they are what others plan with, to compare.
     scenarios : what else may be hit, or not, and has to be survived with the same swing.
     terms : what must hold; kinds that are not given take their defaults.
     smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
@@ -102,7 +102,7 @@ class ImpactProblem:
     collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
     collision_stages: int = 3
     collision: str = "dynamics"
-    restitution: float = 0.0
+    coefficient_of_restitution: float = 0.0
     scenarios: tuple[Scenario, ...] = ()
     terms: tuple[Term, ...] = ()
     smoothness: float = 1e-5
@@ -159,10 +159,13 @@ class ImpactProblem:
                 f"unknown collision {self.collision!r}{did_you_mean(self.collision, COLLISIONS)}: there are "
                 f"{', '.join(COLLISIONS)}"
             )
-        if not 0 <= self.restitution <= 1:
-            raise InputError(f"restitution must be between 0 and 1, not {self.restitution}")
-        if self.restitution and self.collision != "rigid":
-            raise InputError(f'restitution is for collision="rigid"; with {self.collision!r} leave it out')
+        e = self.coefficient_of_restitution
+        if not 0 <= e <= 1:
+            raise InputError(f"coefficient_of_restitution must be between 0 and 1, not {e}")
+        if e and self.collision != "rigid":
+            raise InputError(
+                f'coefficient_of_restitution is for collision="rigid"; with {self.collision!r} leave it out'
+            )
         if self.collision == "virtual mass" and not isinstance(self.law, SpringDamper):
             raise InputError(
                 'collision="virtual mass" has a closed form for the law SpringDamper only, not '

@@ -42,7 +42,7 @@ class InstantImpact:
         slots = [y, t.swing_legs[-1], t.u0[0], self.du[0], self.w[0], self.blow[0]]
         rigid = float(p.collision == "rigid")
         law = [p.law.parameters[name] for name in ("stiffness", "damping")]
-        numbers = [*p.normal, rigid, p.restitution, *law, 1 / self.mass]
+        numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
         return {"impact": ([slots], [np.concatenate([numbers, t.robot.torque_limit, t.units])])}
 
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:

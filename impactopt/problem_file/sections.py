@@ -32,6 +32,7 @@ from impactopt.problem_file.values import (
     Vector,
 )
 from impactopt.robot import Robot, Sole, Striker
+from impactopt.scenario import Scenario
 from impactopt.sqp import SQPOptions
 
 
@@ -93,12 +94,29 @@ class PhaseSection(Section):
 
 
 class Collision(Section):
-    """`compression`, `restitution`: lengths of their collocation elements, as fractions; `stages` in each."""
+    """`compression`, `restitution`: lengths of their collocation elements, as fractions; `stages` in each.
 
+    `model`: "dynamics", or an impact without duration, to compare with: "rigid", "virtual mass".
+    """
+
+    collision: Literal["dynamics", "rigid", "virtual mass"] = _optional("model")
+    coefficient_of_restitution: NotNegative = _optional()
     contact_duration: Duration = _optional("duration_s")
     collision_stages: Literal[2, 3] = _optional("stages")
     compression: Fractions = _optional()
     restitution: Fractions = _optional()
+
+
+class ScenarioSection(Section):
+    kind = Scenario
+    name: str
+    mass: Positive = _optional()
+    stiffness: Positive = _optional()
+    damping: NotNegative = _optional()
+    missing: bool = _optional()
+    torque: Positive = _optional()
+    cone_margin: NotNegative = _optional("cone_margin_m")
+    capture_margin: NotNegative = _optional("capture_margin_m")
 
 
 class Objective(Section):
@@ -244,6 +262,7 @@ class File(Section):
     swing: PhaseSection = _optional()
     follow: PhaseSection = _optional()
     collision: Collision = _optional()
+    scenarios: list[ScenarioSection] = _optional()
     objective: Objective = _optional()
     terms: Terms = _optional()
     solver: Solver = _optional()
@@ -265,6 +284,8 @@ class File(Section):
             if "contact_duration" in given:
                 given["contact_duration"] = tuple(given["contact_duration"])
             out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
+        if self.scenarios is not None:
+            out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
         if self.terms is not None:
             found = (getattr(self.terms, name) for name in Terms.model_fields)
             out["terms"] = tuple(term.build() for term in found if term is not None)

@@ -1,0 +1,112 @@
+"""`impactopt bench NAME`: one command a bench.
+
+Exit codes: 0 done, 2 bad input, or nothing to measure.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from impactopt.plain_errors import plain_errors
+
+app = typer.Typer(
+    name="bench",
+    help="Measure plans and replays: is it true, does it stand, how exact is the replay?",
+    no_args_is_help=True,
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON, no tables.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep numbers and pictures there.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn conditions.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of the draws.")]
+Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
+
+
+@app.command()
+def truth(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+    """Every problem of problems/ and variants of the demo: planned, replayed on held and on free soles."""
+    _run(["truth"], {}, as_json, out, quiet)
+
+
+@app.command()
+def robustness(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="Problem file (default: problems/punch_robust.toml)."),
+    ] = None,
+    draws: Draws = 200,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """How often a plan stands, and how hard it hits, where target, servo and floor are not as planned."""
+    options = {"file": file, "draws": draws, "seed": seed, "workers": workers}
+    _run(["robustness"], {"robustness": options}, as_json, out, quiet)
+
+
+@app.command()
+def replay(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+    """The replay's own error: the demo's plan with other steps, solver settings and floors."""
+    _run(["replay"], {}, as_json, out, quiet)
+
+
+@app.command("all")
+def run_all(
+    draws: Draws = 200,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Every bench, one after the other; the JSON has each under its name."""
+    from impactopt.bench.registry import BENCHES
+
+    options = {"draws": draws, "seed": seed, "workers": workers}
+    _run(list(BENCHES), {"robustness": options}, as_json, out, quiet, together=True)
+
+
+def _run(
+    names: list[str],
+    options: dict[str, dict[str, Any]],
+    as_json: bool,
+    out: Path | None,
+    quiet: bool,
+    *,
+    together: bool = False,
+) -> None:
+    """Run benches by name, show each when it is done; ``options`` by bench."""
+    with plain_errors("interrupted before the bench was done") as console:
+        from rich.console import Console
+
+        from impactopt.bench.registry import run_bench
+        from impactopt.bench.report import save_report
+        from impactopt.output import make_directory, plain
+        from impactopt.screen import Progress
+
+        directory = make_directory(out) if out is not None else None
+        found = {}
+        for name in names:
+            with Progress(console, quiet=quiet) as progress:
+                report = run_bench(name, progress.say, **options.get(name, {}))
+                written = save_report(report, directory) if directory is not None else []
+            found[name] = plain(report.numbers)
+            if as_json:
+                continue
+            screen = Console()
+            for table in report.tables:
+                screen.print(table)
+            if written:
+                files = ", ".join(path.name for path in written)
+                screen.print(f"{written[0].parent}: {files}", highlight=False, soft_wrap=True)
+        if as_json:
+            typer.echo(json.dumps(found if together else found[names[0]], indent=2))

@@ -1,0 +1,108 @@
+"""What a bench gives, and how it is kept."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table
+
+__all__ = ["Report", "Say", "machine", "make_table", "save_report", "timed"]
+
+Say = Callable[[str], None]  # told in words what is being done
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What a bench found.
+
+    name : of the bench, and of its files.  numbers : for JSON.  tables : for the screen.
+    figures : makes the pictures, by file name without .png; made only where they are kept.
+    """
+
+    name: str
+    numbers: Mapping[str, Any]
+    tables: Sequence[Table] = ()
+    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+
+
+def timed(run: Callable[..., Report], say: Say, **options: Any) -> Report:
+    """A bench's report; how long it took, on what and with which versions stand in its numbers."""
+    began = time.perf_counter()
+    report = run(say, **options)
+    extra = {"seconds": round(time.perf_counter() - began, 1), "versions": _versions(), "machine": machine()}
+    return replace(report, numbers={**report.numbers, **extra})
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cpus": os.cpu_count(),
+    }
+
+
+def _processor() -> str:
+    try:  # platform.processor() says little, or nothing, on Linux
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _versions() -> dict[str, str]:
+    from impactopt.solution import versions
+
+    found = versions()
+    with contextlib.suppress(PackageNotFoundError):
+        found["mujoco"] = version("mujoco")
+    return found
+
+
+def make_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Cells as plain text: the first column to the left, the others to the right."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=escape(title), title_justify="left", show_header=any(columns))
+    for k, column in enumerate(columns):
+        table.add_column(escape(column), justify="right" if k else "left", no_wrap=k == 0 and any(columns))
+    for row in rows:
+        table.add_row(*(escape(cell) for cell in row))
+    return table
+
+
+def save_report(report: Report, directory: Path) -> list[Path]:
+    """Write the numbers and pictures of a report.
+
+    Raises
+    ------
+    InputError : they cannot be written.
+    """
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from impactopt.output import plain, write_file
+    from impactopt.plotting.style import STYLE
+
+    written = [directory / f"{report.name}.json"]
+    text = json.dumps(plain(report.numbers), indent=2, allow_nan=False)
+    write_file(written[0], lambda file: file.write(f"{text}\n".encode()))
+    for name, draw in report.figures.items():
+        with matplotlib.rc_context(STYLE):
+            canvas = FigureCanvasAgg(draw())
+            write_file(directory / f"{name}.png", canvas.print_png)
+        written.append(directory / f"{name}.png")
+    return written

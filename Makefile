@@ -56,11 +56,8 @@ types: $(STAMP) ## check types with mypy
 format: $(STAMP) ## rewrite the sources in the project's style
 	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
-bench: $(STAMP) ## run the benchmarks, one after another
-	@set -e; for file in benchmarks/bench_*.py; do \
-		[ -e "$$file" ] || { echo "no benchmarks/bench_*.py yet"; exit 0; }; \
-		echo "== $$file"; $(BIN)/python "$$file" $(ARGS); \
-	done
+bench: $(STAMP) ## run every benchmark, some minutes; tables, JSON and pictures in results/bench
+	@$(BIN)/impactopt bench all --out results/bench $(ARGS)
 
 clean: ## remove results and caches of the tools; .venv and compiled functions stay
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

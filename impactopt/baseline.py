@@ -33,12 +33,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """The reach: duration [s] of the swing, speed [m/s] of the striking point that it was planned with, and
-    what came of it.
+    """The reach: duration [s] of the swing, speed [m/s] of the striking point that it was planned with, the
+    servo's reference, and what came of it.
     """
 
     duration: float
     speed: float
+    reference: Trajectory
     simulation: Simulation
     summary: dict[str, Any]
 
@@ -79,14 +80,17 @@ def _hardest(problem: ImpactProblem, duration: float, fastest: float, tolerance:
         slow, fast = (middle, fast) if _holds(problem, duration, middle) else (slow, middle)
     speed, scene = slow, scene_of(problem)
     while speed >= 0.01:
-        simulation = simulate_pinocchio(problem.robot, _reference(problem, duration, speed), scene, step=2e-4)
+        reference = _reference(problem, duration, speed)
+        simulation = simulate_pinocchio(problem.robot, reference, scene, step=2e-4)
         summary = simulation.summary(
             torque_limit=problem.robot.torque_limit, polygon=scene.polygon, planned_impulse=np.nan
         )
         del summary["impulse_error_pct"]  # nothing was planned
         margins, ratios = summary.get("zmp_margin_m", {"": 0.0}), summary["torque_ratio"]
         if min(margins.values()) >= 0 and max(ratios.values()) <= 1.0:
-            return Baseline(duration=duration, speed=speed, simulation=simulation, summary=summary)
+            return Baseline(
+                duration=duration, speed=speed, reference=reference, simulation=simulation, summary=summary
+            )
         speed *= 0.93
     return None
 

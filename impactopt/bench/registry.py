@@ -17,6 +17,7 @@ BENCHES = {
     "truth": "truth",
     "robustness": "robustness",
     "replay": "replay",
+    "baselines": "baselines",
 }
 
 

@@ -79,7 +79,8 @@ def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solv
     _robot_bodies(mujoco, spec, robot, scene, conditions)
     if not conditions.missing:
         slide = mujoco.mjtJoint.mjJNT_SLIDE
-        body = spec.worldbody.add_body(name="target", pos=scene.point)
+        # without weight, as it was planned for: it waits where it is whichever way the normal points
+        body = spec.worldbody.add_body(name="target", pos=scene.point, gravcomp=1.0)
         body.add_joint(name="target", type=slide, axis=scene.normal)
         _inertial(body, scene.mass, np.zeros(3), 0.01 * scene.mass * np.eye(3))
     return spec.compile()

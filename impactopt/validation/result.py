@@ -143,7 +143,8 @@ class Simulation:
             "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1),
             "peak_force_N": float(self.force.max()),
             "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
-            "hand_speed_m_s": float(self.hand_speed[phase == 0][-1]),
+            # a target that comes early may touch at once
+            "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]),
             "saturated_ms": 1e3 * self.saturated,
             "final_posture_error_rad": self.posture_error,
         }

@@ -59,9 +59,24 @@ def replay(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None
     _run(["replay"], {}, as_json, out, quiet)
 
 
+@app.command()
+def baselines(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Problem file.")] = Path("problems/punch.toml"),
+    draws: Draws = 50,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """What people do today, on the same robot and in the same limits, beside our plans."""
+    options = {"file": file, "draws": draws, "seed": seed, "workers": workers}
+    _run(["baselines"], {"baselines": options}, as_json, out, quiet)
+
+
 @app.command("all")
 def run_all(
-    draws: Draws = 200,
+    draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
     seed: Seed = 0,
     workers: Workers = 2,
     as_json: Json = False,
@@ -71,8 +86,9 @@ def run_all(
     """Every bench, one after the other; the JSON has each under its name."""
     from impactopt.bench.registry import BENCHES
 
-    options = {"draws": draws, "seed": seed, "workers": workers}
-    _run(list(BENCHES), {"robustness": options}, as_json, out, quiet, together=True)
+    drawn = {"seed": seed, "workers": workers}
+    options = {"robustness": {"draws": draws, **drawn}, "baselines": drawn}
+    _run(list(BENCHES), options, as_json, out, quiet, together=True)
 
 
 def _run(

@@ -11,8 +11,8 @@ import numpy as np
 from impactopt.bench.planning import DEMO, plan_of
 from impactopt.bench.report import Report, Say, make_table
 from impactopt.plotting.robustness import robustness_picture
-from impactopt.robustness import Robustness, robustness
-from impactopt.validation import Conditions
+from impactopt.robustness import STEP, Robustness, Spread, robustness
+from impactopt.validation import Conditions, Simulation
 
 ROBUST = Path("problems/punch_robust.toml")
 SAID_EVERY = 20  # draws
@@ -25,8 +25,8 @@ def run(say: Say, *, file: Path | None = None, draws: int = 200, seed: int = 0, 
     """
     chosen = file if file is not None else ROBUST if ROBUST.exists() else DEMO
     solution = plan_of(chosen, say)
-    planned = Conditions(period=1e-3)
-    nominal = solution.validate(engine="mujoco", step=5e-4, conditions=planned)
+    as_planned = Conditions(period=Spread().period)
+    nominal = solution.validate(engine="mujoco", step=STEP, conditions=as_planned)
 
     def progress(done: int, of: int) -> None:
         if done % SAID_EVERY == 0 or done == of:
@@ -51,7 +51,7 @@ def run(say: Say, *, file: Path | None = None, draws: int = 200, seed: int = 0, 
     return Report(
         name="robustness",
         numbers=numbers,
-        tables=tables_of(result, str(chosen)),
+        tables=tables_of(result, str(chosen), nominal),
         figures={"robustness": lambda: robustness_picture(result)},
     )
 
@@ -82,7 +82,7 @@ def numbers_of(result: Robustness) -> dict[str, Any]:
     }
 
 
-def tables_of(result: Robustness, title: str) -> tuple[Any, ...]:
+def tables_of(result: Robustness, title: str, nominal: Simulation) -> tuple[Any, ...]:
     """Rate, impulse and reasons; and what tells the draws apart that stand and that do not."""
     low, high = result.interval
     stands = f"{int(result.standing.sum())} of {result.draws}"
@@ -90,6 +90,7 @@ def tables_of(result: Robustness, title: str) -> tuple[Any, ...]:
         ["stand", f"{stands}: {100 * result.rate:.0f} % (95 %: {100 * low:.0f} to {100 * high:.0f})"],
         ["impulse [N s]", f"{result.impulse_mean:.2f} +- {result.impulse_std:.2f}"],
         ["planned [N s]", f"{result.planned_impulse:.2f}"],
+        ["as planned", f"{nominal.fall or 'stands'}, {nominal.impulse:.2f} N s"],
         *([reason, str(count)] for reason, count in result.reasons().items()),
     ]
     thirds = result.by_third()

@@ -180,6 +180,7 @@ class _Stage:
             low, high = flat.min(axis=0), flat.max(axis=0)
             box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
             moving += axes.fill(*box.T, facecolor=LIGHT, edgecolor=GREY, zorder=1)
+            self._plane(axes, view, scene.box, moving)
         for stick, strikes in zip(scene.sticks @ view.T, self.strikes, strict=True):
             colour, order = (BLUE, 4) if strikes else (BLACK, 3)
             moving += axes.plot(*stick.T, color=colour, linewidth=3.0, solid_capstyle="round", zorder=order)
@@ -188,6 +189,14 @@ class _Stage:
         moving += axes.plot(*(view @ scene.hand), "o", color=BLUE, markersize=6, zorder=5)
         if np.any(scene.push):
             moving.append(_arrow(axes, view @ scene.hand, view @ scene.push, VERMILION))
+
+    def _plane(self, axes: Any, view: Array, box: Array, moving: list[Any]) -> None:
+        """Where it is seen edge-on, the plane of contact: a hand meets it beside the box too."""
+        normal = view @ self.scene.normal
+        if np.linalg.norm(normal) > 0.9:
+            face, way = view @ box[:4].mean(axis=0), np.array([-normal[1], normal[0]])
+            ends = np.array([face - 3 * way, face + 3 * way])
+            moving += axes.plot(*ends.T, ":", color=GREY, linewidth=1.0, scalex=False, scaley=False, zorder=0)
 
 
 def _arrow(axes: Any, start: Array, way: Array, colour: str) -> Any:

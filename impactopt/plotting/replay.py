@@ -74,7 +74,11 @@ def _centres(axes: Any, a: Any) -> None:
             points: Array = zmp(a["replayed_sole_ground"][keep, k])
             axes.plot(-points[:, 1], points[:, 0], ".", color=colour, markersize=2.5, zorder=3 + (which == 1))
     axes.set_aspect("equal")
-    axes.set(xlabel="y, to the right [m]", ylabel="x, forward [m]", title="centre of pressure of each sole\n")
+    axes.set(
+        xlabel="y, to the right [m]",
+        ylabel="x, forward [m]",
+        title="centre of pressure; soles where they are planned\n",
+    )
     axes.grid(False)
     key = [
         Line2D([], [], linestyle="", marker="o", color=colour, label=name)

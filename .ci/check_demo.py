@@ -1,4 +1,4 @@
-"""Check the numbers of the demo's summary.json: is the plan feasible, and true in full dynamics?
+"""Check the numbers of the demo's summary.json: is the plan feasible, true in full dynamics, and does it stand?
 
 Times are printed, not checked: they are the machine's as much as ours.
 """
@@ -37,6 +37,12 @@ def failures(summary: dict[str, Any]) -> list[str]:
     for phase in PHASES:
         check(f"simulated.zmp_margin_m.{phase}", 0, math.inf)
         check(f"simulated.torque_ratio.{phase}", 0, 1.02)
+    check("replayed.impulse_error_pct", -3, 3)
+    check("replayed.sole_slip_mm", 0, 5)
+    check("replayed.sole_lift_collision_mm", 0, 2)
+    replayed = summary.get("replayed", {})
+    if replayed.get("standing") is not True:
+        wrong.append(f"on free soles it does not stand: {replayed.get('reason', 'it was not replayed')}")
     return wrong
 
 

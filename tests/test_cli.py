@@ -83,6 +83,7 @@ def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem) -> Planner:
     """No solver and no big robot: files are read, but the problem is a small one."""
     planner = Planner()
     monkeypatch.setattr("impactopt.planner.solve", planner)
+    monkeypatch.setattr("impactopt.replay.has_mujoco", lambda: True)
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     return planner
 
@@ -160,6 +161,20 @@ def test_without_replay_there_are_planned_numbers_only(planner: Planner, file: P
     out, _ = run("solve", file, "--out", tmp_path / "out", "--no-validate")
     assert "simulated" not in out and "planned" in out
     assert "simulated" not in json.loads((tmp_path / "out" / "summary.json").read_text())
+
+
+def test_free_soles_have_a_column_where_mujoco_is_installed(
+    planner: Planner, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, _ = run("solve", file, "--out", tmp_path / "with")
+    (row,) = (line for line in out.splitlines() if "stands at the end" in line)
+    assert "free soles" in out and "yes" in row
+    summary = json.loads((tmp_path / "with" / "summary.json").read_text())
+    assert summary["replayed"]["engine"] == "mujoco" and summary["simulated"]["engine"] == "pinocchio"
+    monkeypatch.setattr("impactopt.replay.has_mujoco", lambda: False)
+    out, err = run("solve", file, "--out", tmp_path / "without")
+    assert "free soles" not in out and "mujoco" not in (out + err).lower()
+    assert "replayed" not in json.loads((tmp_path / "without" / "summary.json").read_text())
 
 
 def test_the_baseline_is_reported_beside_the_plan(

@@ -1,4 +1,4 @@
-"""Check the numbers of the demo's summary.json: is the plan feasible, true in full dynamics, and does it stand?
+"""Check the demo's summary.json: is the plan feasible, true in full dynamics, and does it stand?
 
 Times are printed, not checked: they are the machine's as much as ours.
 """

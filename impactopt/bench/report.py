@@ -73,10 +73,13 @@ def _versions() -> dict[str, str]:
 
 def make_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """Cells as plain text: the first column to the left, the others to the right."""
+    from rich.box import SIMPLE_HEAD
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=escape(title), title_justify="left", show_header=any(columns))
+    # without lines between columns ten of them fit into a terminal
+    style: Any = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "title_justify": "left"}
+    table = Table(title=escape(title), show_header=any(columns), **style)
     for k, column in enumerate(columns):
         table.add_column(escape(column), justify="right" if k else "left", no_wrap=k == 0 and any(columns))
     for row in rows:

@@ -41,9 +41,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 # heading, key, factor, digits
 HELD = (
-    ("iterations", "iterations", 1, 0),
-    ("solve s", "solve_seconds", 1, 1),
-    ("impulse N s", "impulse_planned_Ns", 1, 2),
+    ("steps", "iterations", 1, 0),
+    ("s", "solve_seconds", 1, 1),
+    ("N s", "impulse_planned_Ns", 1, 2),
     ("error %", "impulse_error_pct", 1, 2),
     ("ZMP mm", "zmp_margin_m", 1e3, 1),
     ("torque", "torque_ratio", 1, 2),

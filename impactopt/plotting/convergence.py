@@ -39,7 +39,7 @@ def convergence_picture(steps: Sequence[Mapping[str, Any]], settings: Sequence[M
         height = np.arange(len(shown)) + 0.25 * (1 - k)
         right.barh(height, [abs(r[key]) for r in shown], 0.25, color=color, label=label)
     right.set_yticks(np.arange(len(shown)), [r["setting"] for r in shown])
-    right.set(xlim=(0.0, None), title="change by other settings, same step")
+    right.set(xlabel="[%] or [mm]", xlim=(0.0, None), title="change by other settings, same step")
     right.grid(axis="y", visible=False)
     right.legend(loc="upper right")
     return figure

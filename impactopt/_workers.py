@@ -10,6 +10,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -125,6 +126,7 @@ def _interrupts_held_back() -> Iterator[None]:
     """Ctrl-C waits. Processes started here never see it, from their first instant on: who asked for them
     does, and ends them.
     """
+    resource_tracker.ensure_running()  # started with the first process, it would let SIGINT in again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

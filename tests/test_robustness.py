@@ -243,7 +243,11 @@ def run_script(folder: Path, text: str) -> subprocess.Popen[str]:
     script = folder / "script.py"
     script.write_text(textwrap.dedent(text), encoding="utf-8")
     return subprocess.Popen(
-        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
 
 
@@ -284,7 +288,7 @@ def test_ctrl_c_ends_the_processes_and_is_raised(tmp_path: Path) -> None:
     )
     assert process.stdout is not None
     workers = [int(process.stdout.readline()) for _ in range(2)]
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all processes of the command
     output, errors = process.communicate(timeout=30)
     assert (output, errors, process.returncode) == ("stopped\n", "", 0)
     for pid in workers:

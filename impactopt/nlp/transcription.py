@@ -39,6 +39,9 @@ from impactopt.terms import (
 )
 
 GRAVITY = 9.81
+# the striking point stays this far behind the target [m], and less only at this speed [m/s] towards it: what
+# hovers at the plane would touch it between the nodes
+CLEARANCE, HASTE = 0.02, 0.1
 LEVER = 0.1  # [m] scale of sole moments against forces
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
 
@@ -375,13 +378,14 @@ class Transcription:
         nodes = self.swing_nodes[:-1]
         instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
         at = self._add_block("approach", instances, p.normal)
+        plane, ahead = float(p.normal @ p.point), float(np.mean(p.swing.duration))
         for i, s in enumerate(nodes):
             self.rows.add(
                 term="no touch before contact",
                 place=f"swing, {100 * s:.0f} %",
                 components=[p.striker],
                 outputs=np.array([at + i]),
-                upper=float(p.normal @ p.point),
+                upper=plane - min(CLEARANCE, HASTE * (1 - s) * ahead),
             )
 
     def _collisions(self) -> None:

@@ -21,6 +21,7 @@ from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
 from impactopt.validation.soles import BEARS, cop_margin, sole_names, weight_of
+from impactopt.validation.touch import FACE, Touches
 
 Array = NDArray[np.float64]
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
@@ -79,9 +80,10 @@ class _Replay:
     def contact_force(self, speed: float) -> float:
         if self.target is None:
             return 0.0
-        travel = float(self.scene.normal @ (self.data.site_xpos[self.site] - self.scene.point))
+        way = self.data.site_xpos[self.site] - self.scene.point
+        travel = float(self.scene.normal @ way)
         depth = travel - float(self.data.qpos[self.travel])
-        if depth <= 0:
+        if depth <= 0 or np.linalg.norm(way - travel * self.scene.normal) > FACE:
             return 0.0
         approach = speed - float(self.data.qvel[self.target])
         return self.scene.stiffness * depth + self.scene.damping * max(approach, 0.0)
@@ -233,17 +235,15 @@ def simulate_mujoco(
     demand = torque = np.zeros(robot.n)
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
-    contact_start = contact_end = np.nan
-    saturated, fall, before = 0.0, "", 0.0
+    touches, saturated, fall = Touches(), 0.0, ""
     with no_log_file():
         for k in range(round((float(reference.end) + settle) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
             if k % hold == 0:
                 asked = servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof])
-                waiting.append(
-                    (k + lag if k else 0, asked)
-                )  # at rest before the start, it asked for the same
+                # at rest before the start, it asked for the same
+                waiting.append((k + lag if k else 0, asked))
             while waiting and waiting[0][0] <= k:
                 demand, torque = waiting.popleft()[1]
             speed = replay.hand_speed()
@@ -252,11 +252,7 @@ def simulate_mujoco(
             data.qfrc_applied[replay.dof] += torque
             if replay.target is not None:
                 data.qfrc_applied[replay.target] = force
-            if force > 0 and np.isnan(contact_start):
-                contact_start = t
-            if force <= 0 < before and np.isnan(contact_end):
-                contact_end = t
-            before = force
+            touches.add(t, force, step)
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             target_speed = replay.target_speed()
             kept = k % record == 0 or force > 0
@@ -278,6 +274,7 @@ def simulate_mujoco(
                     break
     columns = [np.array(c) for c in zip(*rows, strict=True)]
     time, q, v, forces, target, hand, demands, torques, grounds, slip, lift = columns
+    contact_start, contact_end = touches.blow()
     return Simulation(
         engine="mujoco",
         time=time,

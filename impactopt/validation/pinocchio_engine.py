@@ -19,6 +19,7 @@ from impactopt.robot import Robot
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
 from impactopt.validation.soles import cop_margin, sole_names
+from impactopt.validation.touch import FACE, Touches
 
 Array = NDArray[np.float64]
 
@@ -70,7 +71,6 @@ class _World:
         pin.initConstraintDynamics(self.model, self.data, self.contacts, self.contact_data)
         self.proximal = pin.ProximalSettings(1e-12, 1e-12, 1)
         self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
-        self.touched = self.released = False
 
     def rates(self, t: float, s: _State) -> _Rates:
         model, data, scene = self.model, self.data, self.scene
@@ -80,13 +80,12 @@ class _World:
         point = pin.updateFramePlacement(model, data, self.hand).translation
         row = scene.normal @ jac
         speed = float(row @ s.v)
-        depth = float(scene.normal @ (point - scene.point)) - s.x
+        way = point - scene.point
+        travel = float(scene.normal @ way)
+        depth = travel - s.x
+        hits = depth > 0 and np.linalg.norm(way - travel * scene.normal) <= FACE
         approach = speed - s.vt
-        force = (
-            scene.stiffness * depth + scene.damping * max(approach, 0.0)
-            if depth > 0 and not self.released
-            else 0.0
-        )
+        force = scene.stiffness * depth + scene.damping * max(approach, 0.0) if hits else 0.0
         demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
         tau = -row * force
         tau[self.base :] += torque
@@ -142,19 +141,15 @@ def simulate_pinocchio(
     rows: list[tuple[Any, ...]] = []
     saturated = 0.0
     start_soles: list[Array] | None = None
-    contact_start = contact_end = np.nan
+    touches = Touches()
     for k in range(round(end / step)):
         t = k * step
         first = world.rates(t, state)
         ground, soles = world.ground(), world.corners()
         start_soles = soles if start_soles is None else start_soles
         saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
-        if first.force > 0 and not world.touched:
-            world.touched, contact_start = True, t
-        if world.touched and not world.released and first.force <= 0 and t > contact_start + 2 * step:
-            world.released, contact_end = True, t
-        in_contact = world.touched and not world.released
-        if in_contact or k % record == 0:
+        touches.add(t, first.force, step)
+        if first.force > 0 or k % record == 0:
             moves = [now - then for now, then in zip(soles, start_soles, strict=True)]
             slip = [float(np.linalg.norm(m[:, :2], axis=1).max()) for m in moves]
             lift = [max(0.0, float(m[:, 2].max())) for m in moves]
@@ -173,6 +168,7 @@ def simulate_pinocchio(
                 "gains"
             )
     columns = [np.array(c) for c in zip(*rows, strict=True)]
+    contact_start, contact_end = touches.blow()
     time, q, v, force, vt, hand, demand, torque, ground, slips, lifts = columns
     return Simulation(
         engine="pinocchio",

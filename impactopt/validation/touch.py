@@ -1,0 +1,32 @@
+"""When striker and target touched."""
+
+from __future__ import annotations
+
+import numpy as np
+
+FACE = 0.2  # [m] how far from the hit point, across the normal, there is something to hit
+
+
+class Touches:
+    """Intervals of contact, told step by step. A graze before or after the blow is an interval of its own."""
+
+    def __init__(self) -> None:
+        self.intervals: list[list[float]] = []  # start [s], end [s], impulse [N s]
+        self.touching = False
+
+    def add(self, t: float, force: float, step: float) -> None:
+        """The contact force [N] at time t [s]."""
+        if force > 0:
+            if not self.touching:
+                self.intervals.append([t, t, 0.0])
+            self.intervals[-1][2] += force * step
+        if self.touching or force > 0:
+            self.intervals[-1][1] = t
+        self.touching = force > 0
+
+    def blow(self) -> tuple[float, float]:
+        """Start and end [s] of the contact with the largest impulse; nan if there was none."""
+        if not self.intervals:
+            return np.nan, np.nan
+        start, end, _ = max(self.intervals, key=lambda interval: interval[2])
+        return start, end

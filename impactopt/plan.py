@@ -62,6 +62,30 @@ class PlannedCollision:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlannedScenario:
+    """What the plan predicts if the target of the :class:`impactopt.Scenario` of this name is hit.
+
+    impulse [N s] to that target.
+    """
+
+    name: str
+    impulse: float
+    collision: PlannedCollision
+
+    def summary(self, *, torque_limit: Array, polygon: Array) -> dict[str, Any]:
+        """The numbers of ``summary.json``; torque_limit (n,) [N m]; polygon (k, 2) [m], of the soles."""
+        hit = self.collision
+        out = {
+            "name": self.name,
+            "impulse_Ns": self.impulse,
+            "peak_force_N": float(hit.force.max()),
+            "contact_ms": 1e3 * float(hit.time[-1]),
+            "torque_ratio": float(np.abs(hit.torque / torque_limit).max()),
+        }
+        return out | ({"zmp_margin_m": float(margin(polygon, zmp(hit.ground)).min())} if len(polygon) else {})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """A planned impact motion.
 
@@ -69,7 +93,8 @@ class Plan:
     swing_nodes (k,), swing_wrench (k, 6 a sole): where on [0, 1] the program had nodes, and the wrenches
     there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
     through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
-    [N s] to the target.
+    [N s] to the target. scenarios: what is predicted of other targets, in the problem's order; a missing one
+    is not hit, so it is not among them.
     """
 
     problem: ImpactProblem
@@ -84,6 +109,7 @@ class Plan:
     collision: PlannedCollision
     hand_speed: float
     impulse: float
+    scenarios: tuple[PlannedScenario, ...] = ()
 
     @property
     def coordinates(self) -> StanceCoordinates:
@@ -165,12 +191,16 @@ class Plan:
         )
 
     def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:
-        """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through."""
+        """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through.
+
+        Of an impact without duration the plan knows neither, so there is no number for the collision.
+        """
         ref = self.trajectory() if trajectory is None else trajectory
         limit = self.problem.robot.torque_limit
         phase = ref.phase
         grounds = [ref.ground[phase == 0], self.collision.ground, ref.ground[phase == 2]]
-        torques = [ref.torque[phase == 0], self.collision.torque, ref.torque[phase == 2]]
+        during = self.collision.torque if len(self.collision.ground) else self.collision.torque[:0]
+        torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
         names = ("swing", "collision", "follow")
         ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
         out = {"torque_ratio": ratio}

@@ -138,6 +138,10 @@ class ImpactProblem:
         for name in ("smoothness", "wrench_price", "return_price"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} must be a number >= 0, not {getattr(self, name)}")
+        listed = isinstance(self.scenarios, (list, tuple))
+        if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
+            raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
+        put(self, "scenarios", tuple(self.scenarios))
         self._check_collision()
         if np.any(self.stance.compliance > 0):
             raise InputError(
@@ -173,6 +177,12 @@ class ImpactProblem:
             )
         if self.scenarios and self.collision != "dynamics":
             raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
+        for s in self.scenarios:
+            for name in ("stiffness", "damping"):
+                if getattr(s, name) != 1.0 and name not in self.law.parameters:
+                    raise InputError(
+                        f"scenario {s.name!r}: the law {type(self.law).__name__} has no {name}; leave it out"
+                    )
         names = [s.name for s in self.scenarios]
         for name in names:
             if names.count(name) > 1:
@@ -207,7 +217,7 @@ class ImpactProblem:
 
     def describe(self) -> dict[str, Any]:
         """The problem in a few plain words and numbers, for reports."""
-        return {
+        out: dict[str, Any] = {
             "name": self.name,
             "robot": self.robot.name,
             "striker": self.striker,
@@ -216,3 +226,9 @@ class ImpactProblem:
             "target": repr(self.target),
             "law": repr(self.law),
         }
+        if self.collision != "dynamics":
+            restitution = f", restitution {self.coefficient_of_restitution:g}"
+            out["collision"] = self.collision + (restitution if self.collision == "rigid" else "")
+        if self.scenarios:
+            out["scenarios"] = [str(s) for s in self.scenarios]
+        return out

@@ -14,7 +14,8 @@ class Scenario:
     """A target that differs from the expected one: the same swing has to be safe with it too.
 
     The impulse to the expected target is what is maximized; in a scenario the collision's rows (torque,
-    wrench cones) and the balance after it hold, with margins of their own, under the same reference and servo.
+    wrench cones) and the balance after it hold, with margins of their own, under the same reference and
+    servo.
 
     Attributes
     ----------
@@ -27,7 +28,8 @@ class Scenario:
 
     Raises
     ------
-    InputError : a factor that is not positive, a negative margin, ``missing`` with factors.
+    InputError : no name; a factor that is not positive (damping: negative), a negative margin; ``missing``
+        with numbers of a collision.
     """
 
     name: str
@@ -40,6 +42,8 @@ class Scenario:
     capture_margin: float = 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise InputError(f"a scenario's name is {self.name!r}; give a word that reports can call it by")
         where = f"scenario {self.name!r}"
         for f in fields(self)[1:]:
             value = getattr(self, f.name)
@@ -48,7 +52,14 @@ class Scenario:
         for name in ("mass", "stiffness", "torque"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{where}: {name} is {getattr(self, name):g}; give a number > 0")
-        if self.missing and (self.mass, self.stiffness, self.damping) != (1.0, 1.0, 1.0):
+        changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
+        unused = [name for name in changed if name not in ("missing", "capture_margin")]
+        if self.missing and unused:
             raise InputError(
-                f"{where}: a target that is missing has no mass, stiffness or damping; drop them"
+                f"{where}: with a target that is missing there is no collision; drop {unused[0]}"
             )
+
+    def __str__(self) -> str:
+        factors = [f"{getattr(self, name):g} x {name}" for name in ("mass", "stiffness", "damping")]
+        changed = [text for text in factors if not text.startswith("1 x ")]
+        return f"{self.name}: {'no target' if self.missing else ', '.join(changed) or 'as expected'}"

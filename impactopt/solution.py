@@ -85,7 +85,8 @@ class Solution:
         out: dict[str, Any] = {
             **self.outcome(),
             "impulse_Ns": plan.impulse,
-            "peak_force_N": float(plan.collision.force.max()),
+            # a plan of an impact without duration knows no force
+            "peak_force_N": float(plan.collision.force.max()) if len(plan.collision.ground) else None,
             "contact_ms": 1e3 * (plan.compression + plan.restitution),
             "hand_speed_m_s": plan.hand_speed,
             "duration_s": plan.duration,
@@ -97,6 +98,9 @@ class Solution:
             "polygon": plan.polygon,
             "planned_impulse": plan.impulse,
         }
+        if plan.scenarios:
+            limits = {name: known[name] for name in ("torque_limit", "polygon")}
+            out["scenarios"] = [scenario.summary(**limits) for scenario in plan.scenarios]
         if simulation is not None:
             out["simulated"] = simulation.summary(**known)
         if replay is not None:

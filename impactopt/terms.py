@@ -92,6 +92,11 @@ class Balance(Term):
     vertical_speed: float = 0.2
     angular_momentum: float = 10.0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.capture_margin == float("inf"):
+            raise InputError("Balance.capture_margin is inf, which nothing can keep; give None for anywhere")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Incidence(Term):

@@ -209,9 +209,11 @@ class Collision:
         """The collision that solver variables (n,) stand for; ``outputs`` are the blocks'."""
         t, durations = self.t, self.durations(x)
         time = [(durations[0] if s.phase else 0.0) + s.place * durations[s.phase] for s in self.stages]
-        first = float(t.problem.law.branch(0.0, approach, True))
+        law = dict(zip(t.problem.law.parameters, self.law, strict=True))
+        first = float(t.problem.law.branch(0.0, approach, True, law))
         wrench = self.w.read(x)
-        torque = outputs["collision"][: len(self.stages), t.parts("collision")["torque"]]
+        start = t.collisions.index(self) * len(self.stages)  # of its instances in the blocks
+        torque = outputs["collision"][start : start + len(self.stages), t.parts("collision")["torque"]]
         return PlannedCollision(
             time=np.array([0.0, *time]),
             force=np.array([first, *self.f.read(x)[:, 0]]),

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import scipy.sparse as sp
 
 from impactopt.codegen import cached, model_hash
@@ -24,7 +25,7 @@ from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
 from impactopt.nlp.mesh import collision_mesh, with_middles
 from impactopt.nlp.structured import Block, Rows, StructuredProgram, derivative_functions
-from impactopt.plan import Plan
+from impactopt.plan import Plan, PlannedScenario
 from impactopt.problem import ImpactProblem
 from impactopt.statics import static_wrenches
 from impactopt.support import support_polygon
@@ -379,14 +380,22 @@ class Transcription:
         instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
         at = self._add_block("approach", instances, p.normal)
         plane, ahead = float(p.normal @ p.point), float(np.mean(p.swing.duration))
+        nearest = min(CLEARANCE, self._start_gap())
         for i, s in enumerate(nodes):
             self.rows.add(
                 term="no touch before contact",
                 place=f"swing, {100 * s:.0f} %",
                 components=[p.striker],
                 outputs=np.array([at + i]),
-                upper=plane - min(CLEARANCE, HASTE * (1 - s) * ahead),
+                upper=plane - min(nearest, HASTE * (1 - s) * ahead),
             )
+
+    def _start_gap(self) -> float:
+        """How far [m] behind the target's plane the striking point starts: it may stay as near as that."""
+        p, c = self.problem, self.coordinates
+        pin.framesForwardKinematics(c.model, c.data, p.start_posture)
+        at = c.data.oMf[c.model.getFrameId(f"striker:{p.striker}")].translation
+        return max(float(p.normal @ (p.point - at)), 0.0)
 
     def _collisions(self) -> None:
         """One block for all collisions, each with its rows."""
@@ -530,4 +539,15 @@ class Transcription:
             collision=expected.decode(x, outputs, approach),
             hand_speed=approach,
             impulse=float(expected.impulse.evaluate(x)[0]),
+            scenarios=tuple(self._decode_scenario(other, x, outputs, approach) for other in self.scenarios),
+        )
+
+    def _decode_scenario(
+        self, other: Collision, x: Array, outputs: dict[str, Array], approach: float
+    ) -> PlannedScenario:
+        assert other.scenario is not None
+        return PlannedScenario(
+            name=other.scenario.name,
+            impulse=float(other.impulse.evaluate(x)[0]),
+            collision=other.decode(x, outputs, approach),
         )

@@ -20,6 +20,9 @@ def force(record: Record) -> Figure:
     label = f"planned: {_impulse(summary)}"
     axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", color=PLANNED, label=label, zorder=3)
     end = 1e3 * float(a["collision_time"][-1])
+    if not end:  # an impact without duration: the simulation's contact is all there is to see
+        end = 1e3 * float(a.get("simulated_contact_end", 0.0) - a.get("simulated_contact_start", 0.0))
+        end = end if np.isfinite(end) else 0.0
     if record.simulated and np.isfinite(a["simulated_contact_start"]):
         time = 1e3 * (a["simulated_time"] - a["simulated_contact_start"])
         keep = (time >= 0) & (time < 1.08 * end)

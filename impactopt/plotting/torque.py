@@ -22,7 +22,7 @@ def torque(record: Record) -> Figure:
     colours = matplotlib.colormaps["cividis"].with_extremes(over=OVER)
     mesh: Any = None
     for k, (axes, (time, ratio)) in enumerate(zip(panels, histories, strict=True)):
-        if len(time) < 2:  # as after a contact that never ends
+        if len(time) < 2 or time[0] == time[-1]:  # after a contact that never ends; in one without duration
             axes.set_visible(False)
             continue
         edges, values = _binned(time, ratio)

@@ -68,7 +68,8 @@ def _zmp_paths(record: Record) -> dict[tuple[str, int], tuple[Array, Array]]:
     for k in (0, 2):
         keep = (a["reference_phase"] == k) & (a["reference_time"] <= a["reference_end"])
         out["planned", k] = a["reference_time"][keep], zmp(a["reference_ground"][keep])
-    out["planned", 1] = 1e3 * a["collision_time"][1:], zmp(a["collision_ground"])
+    if len(a["collision_ground"]):  # no path of an impact without duration
+        out["planned", 1] = 1e3 * a["collision_time"][1:], zmp(a["collision_ground"])
     if record.simulated:
         time, phase = a["simulated_time"], simulated_phases(record)
         for k in range(3):

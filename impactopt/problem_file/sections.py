@@ -28,6 +28,7 @@ from impactopt.problem_file.values import (
     Positive,
     Preset,
     Range,
+    Restitution,
     UnitVector,
     Vector,
 )
@@ -100,7 +101,7 @@ class Collision(Section):
     """
 
     collision: Literal["dynamics", "rigid", "virtual mass"] = _optional("model")
-    coefficient_of_restitution: NotNegative = _optional()
+    coefficient_of_restitution: Restitution = _optional()
     contact_duration: Duration = _optional("duration_s")
     collision_stages: Literal[2, 3] = _optional("stages")
     compression: Fractions = _optional()

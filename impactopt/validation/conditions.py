@@ -19,7 +19,7 @@ class Conditions:
     missing : there is no target.
     payload [kg] : a point mass at the striking point that the plan does not know of.
     friction : coefficient between soles and floor.  floor_time [s] : time constant of the floor's contact
-        (MuJoCo's solref), the softness of floor and soles: the depth that a sole sinks by grows with its square.
+        (MuJoCo's solref), the softness of floor and soles: a sole sinks by as much as its square grows.
         MuJoCo does not go below two steps.
     kp, kd, torque_limit : of the servo, as factors.
     period [s] : the servo reads the joints and sets torques this often, and holds them between; 0: in every

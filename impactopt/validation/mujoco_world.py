@@ -136,8 +136,8 @@ def _surface(geom: Any, conditions: Conditions, *, sole: bool) -> None:
     geom.condim = 3
     geom.solref = [conditions.floor_time, 1.0]
     # as soft as a rubber sole: with more impedance the corners leave the floor by micrometres, many times a
-    # millisecond, and the force and ZMP of one step say nothing (the motion hardly changes). One impedance at all
-    # depths makes a linear floor.
+    # millisecond, and the force and ZMP of one step say nothing (the motion hardly changes). One impedance at
+    # all depths makes a linear floor.
     geom.solimp = [0.5, 0.5, 5e-4, 0.5, 2.0]
 
 

@@ -1,11 +1,13 @@
-"""What several test files share, and is dear: the demo's plan."""
+"""What several test files share, and is dear: the plans of the demo and of the small robots."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
 
+from impactopt.nlp.transcription import Transcription
 from impactopt.planner import solve
 from impactopt.problem_file import load_problem
 from impactopt.solution import Solution
@@ -15,3 +17,23 @@ from impactopt.solution import Solution
 def punch() -> Solution:
     """The plan of `make demo`; its functions come from the cache after the first time."""
     return solve(load_problem(Path(__file__).resolve().parents[1] / "problems" / "punch.toml"))
+
+
+@pytest.fixture(scope="session")
+def biped_transcription() -> Transcription:
+    return transcribed(biped_problem())
+
+
+@pytest.fixture(scope="session")
+def arm_transcription() -> Transcription:
+    return transcribed(arm_problem())
+
+
+@pytest.fixture(scope="session")
+def biped_plan(biped_transcription: Transcription) -> Planned:
+    return planned(biped_transcription, OPTIONS)
+
+
+@pytest.fixture(scope="session")
+def arm_plan(arm_transcription: Transcription) -> Planned:
+    return planned(arm_transcription, {})

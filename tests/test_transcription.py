@@ -1,7 +1,6 @@
 """From problem to program and back: derivatives, names, and plans that are true of the robot.
 
-The functions run in CasADi's virtual machine: building them for the small biped takes some ten seconds, and
-compiling them would take longer.
+The programs and plans of both small robots are in `small_plans.py`.
 """
 
 from __future__ import annotations
@@ -14,110 +13,41 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from small_robots import arm, biped, striking_point
+from small_plans import LAW, Planned, changed
 
 from impactopt.cone import contact_wrench_cone
-from impactopt.contact.laws import SpringDamper
-from impactopt.contact.targets import FreeMass
 from impactopt.ipopt import solve_ipopt
 from impactopt.motion import Radau
-from impactopt.nlp.blocks import builders
 from impactopt.nlp.start import first_iterate
-from impactopt.nlp.structured import derivative_functions
 from impactopt.nlp.transcription import Transcription, collision_mesh, rotation_rows, with_middles
-from impactopt.plan import Plan, Trajectory, total_ground_wrench
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.program import SolverResult, Status, check_program
-from impactopt.stance import FixedBase
-from impactopt.support import support_polygon, zmp
+from impactopt.plan import total_ground_wrench
+from impactopt.problem import Phase
+from impactopt.program import Status, check_program
+from impactopt.scenario import Scenario
+from impactopt.support import zmp
 from impactopt.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
-from impactopt.validation import Simulation, scene_of, simulate_pinocchio
 
 Array = NDArray[np.float64]
-LAW = SpringDamper(stiffness=1e4, damping=300.0)
 
 
-def functions_of(problem: ImpactProblem) -> dict[str, Any]:
-    """The problem's blocks in CasADi's virtual machine."""
-    c = problem.coordinates
-    edges = len(support_polygon(problem.robot, c))
-    out = {}
-    for name, build in builders(c, problem.striker, problem.law, edges).items():
-        block = build()
-        out |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out)}
-    return out
+VARIANTS: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "with scenarios": {
+        "scenarios": (
+            Scenario(name="heavy", mass=2.0),
+            Scenario(name="missing", missing=True),
+            Scenario(name="hard", stiffness=3.0, damping=0.5),
+        )
+    },
+    "rigid": {"collision": "rigid", "coefficient_of_restitution": 0.3},
+    "virtual mass": {"collision": "virtual mass"},
+}
 
 
-@dataclasses.dataclass
-class Planned:
-    problem: ImpactProblem
-    transcription: Transcription
-    start: Array
-    result: SolverResult
-    plan: Plan
-    trajectory: Trajectory
-    simulation: Simulation
-
-
-def planned(transcription: Transcription, options: dict[str, Any]) -> Planned:
-    problem = transcription.problem
-    start = first_iterate(transcription)
-    result = solve_ipopt(transcription.program, start, options=options)
-    plan = transcription.decode(result.x)
-    trajectory = plan.trajectory()
-    simulation = simulate_pinocchio(problem.robot, trajectory, scene_of(problem), settle=0.0)
-    return Planned(problem, transcription, start, result, plan, trajectory, simulation)
-
-
-@pytest.fixture(scope="module")
-def biped_transcription() -> Transcription:
-    robot = biped()
-    problem = ImpactProblem(
-        robot=robot,
-        striker="fist",
-        point=striking_point(robot, "half_sitting", "fist") + np.array([0.06, 0.03, 0.0]),
-        normal=[1.0, 0.0, 0.0],
-        law=LAW,
-        target=FreeMass(mass=3.0),
-        swing=Phase(duration=0.6, intervals=6),
-        follow=Phase(duration=(0.5, 0.8), intervals=6),
-        smoothness=1e-4,
-        wrench_price=0.1,
-    )
-    return Transcription(problem, problem.coordinates, functions_of(problem))
-
-
-@pytest.fixture(scope="module")
-def arm_transcription() -> Transcription:
-    robot = arm()
-    problem = ImpactProblem(
-        robot=robot,
-        striker="hand",
-        start="start",
-        stance=FixedBase(),
-        point=striking_point(robot, "start", "hand") + np.array([0.05, 0.05, 0.1]),
-        normal=[0.0, 1.0, 0.0],
-        law=LAW,
-        target=FreeMass(mass=3.0),
-        swing=Phase(duration=(0.4, 0.6), intervals=8),
-        follow=Phase(duration=0.8, intervals=8),
-    )
-    return Transcription(problem, problem.coordinates, functions_of(problem))
-
-
-@pytest.fixture(params=["biped", "arm"])
+@pytest.fixture(params=[(robot, kind) for kind in VARIANTS for robot in ("biped", "arm")], ids=", ".join)
 def transcription(request: pytest.FixtureRequest) -> Transcription:
-    return request.getfixturevalue(f"{request.param}_transcription")
-
-
-@pytest.fixture(scope="module")
-def biped_plan(biped_transcription: Transcription) -> Planned:
-    return planned(biped_transcription, {"tol": 1e-4})
-
-
-@pytest.fixture(scope="module")
-def arm_plan(arm_transcription: Transcription) -> Planned:
-    return planned(arm_transcription, {})
+    robot, kind = request.param
+    return changed(request.getfixturevalue(f"{robot}_transcription"), **VARIANTS[kind])
 
 
 @pytest.fixture(params=["biped", "arm"])

@@ -25,7 +25,7 @@ from impactopt.problem import ImpactProblem, Phase
 from impactopt.program import SolverResult
 from impactopt.stance import FixedBase
 from impactopt.support import support_polygon
-from impactopt.validation import Simulation, scene_of, simulate_pinocchio
+from impactopt.validation import Scene, Simulation, scene_of, simulate_pinocchio
 
 Array = NDArray[np.float64]
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
@@ -95,11 +95,12 @@ class Planned:
     simulation: Simulation
 
 
-def planned(transcription: Transcription, options: dict[str, Any]) -> Planned:
+def planned(transcription: Transcription, options: dict[str, Any], scene: Scene | None = None) -> Planned:
+    """Solved and simulated; ``scene``: if not the problem's."""
     problem = transcription.problem
     start = first_iterate(transcription)
     result = solve_ipopt(transcription.program, start, options=options)
     plan = transcription.decode(result.x)
     trajectory = plan.trajectory()
-    simulation = simulate_pinocchio(problem.robot, trajectory, scene_of(problem), settle=0.0)
+    simulation = simulate_pinocchio(problem.robot, trajectory, scene or scene_of(problem), settle=0.0)
     return Planned(problem, transcription, start, result, plan, trajectory, simulation)

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from small_robots import arm, biped
 
 from impactopt import codegen
-from impactopt.contact.laws import SpringDamper
+from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.planner import solve
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.robot import Robot
+from impactopt.scenario import Scenario
 from impactopt.stance import BothSoles, FixedBase, OneSole
 from impactopt.terms import (
     DEFAULT_TERMS,
@@ -32,6 +33,16 @@ from impactopt.terms import (
 )
 
 Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Spring(ContactLaw):
+    """A law of one's own, with a number of its own."""
+
+    rate: float
+
+    def branch(self, penetration: Any, rate: Any, compressing: bool, parameters: Any = None) -> Any:
+        return (parameters or self.parameters)["rate"] * penetration
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +153,27 @@ def test_a_fixed_base_holds_no_soles() -> None:
         ({"smoothness": -1.0}, "smoothness"),
         ({"wrench_price": np.nan}, "wrench_price"),
         ({"stance": BothSoles(base_mass=1e6, base_inertia=1e6)}, "virtual base"),
+        (
+            {"collision": "rigd"},
+            "unknown collision 'rigd'.*did you mean 'rigid'.*dynamics, rigid, virtual mass",
+        ),
+        ({"collision": "rigid", "coefficient_of_restitution": -0.1}, "between 0 and 1, not -0.1"),
+        ({"collision": "rigid", "coefficient_of_restitution": 1.1}, "between 0 and 1, not 1.1"),
+        ({"collision": "rigid", "coefficient_of_restitution": np.nan}, "between 0 and 1, not nan"),
+        ({"coefficient_of_restitution": 0.5}, "for collision=\"rigid\"; with 'dynamics' leave it out"),
+        (
+            {"collision": "virtual mass", "coefficient_of_restitution": 0.5},
+            "with 'virtual mass' leave it out",
+        ),
+        ({"collision": "virtual mass", "law": Spring(rate=1e4)}, "SpringDamper only, not Spring"),
+        ({"collision": "rigid", "scenarios": (Scenario(name="a"),)}, "scenarios need.*dynamics.*not 'rigid'"),
+        ({"scenarios": (Scenario(name="a"), Scenario(name="a", mass=2.0))}, "two scenarios are called 'a'"),
+        ({"scenarios": Scenario(name="a")}, r"a tuple of Scenario, not Scenario\("),
+        ({"scenarios": ("heavy",)}, r"a tuple of Scenario, not \('heavy',\)"),
+        (
+            {"law": Spring(rate=1e4), "scenarios": (Scenario(name="stiff", stiffness=2.0),)},
+            "scenario 'stiff': the law Spring has no stiffness; leave it out",
+        ),
     ],
 )
 def test_bad_input_is_named(robot: Robot, changes: dict[str, Any], says: str) -> None:
@@ -206,6 +238,20 @@ def test_a_robot_without_soles_or_free_flyer_is_named(robot: Robot) -> None:
         (lambda: Phase(duration=0.8, intervals=7.5), "intervals"),
         (lambda: Phase(duration=0.8, grading=0.5), "grading"),
         (lambda: Phase(duration=0.8, grading=np.nan), "grading"),
+        (lambda: Balance(capture_margin=np.inf), "capture_margin is inf.*give None for anywhere"),
+        (lambda: Balance(capture_margin=-0.1), "Balance.capture_margin.*negative.*-0.1"),
+        (lambda: Balance(vertical_speed=np.nan), "Balance.vertical_speed"),
+        (lambda: Scenario(name=" "), "name is ' '.*give a word"),
+        (lambda: Scenario(name=3), "name is 3"),  # type: ignore[arg-type]
+        (lambda: Scenario(name="a", mass=np.nan), "scenario 'a': mass is nan; give a finite number"),
+        (lambda: Scenario(name="a", cone_margin=np.inf), "scenario 'a': cone_margin is inf"),
+        (lambda: Scenario(name="a", damping=-1.0), "scenario 'a': damping is -1.0; give.*>= 0"),
+        (lambda: Scenario(name="a", capture_margin=-0.01), "scenario 'a': capture_margin is -0.01"),
+        (lambda: Scenario(name="a", mass=0.0), "scenario 'a': mass is 0; give a number > 0"),
+        (lambda: Scenario(name="a", stiffness=0.0), "scenario 'a': stiffness is 0; give a number > 0"),
+        (lambda: Scenario(name="a", torque=0.0), "scenario 'a': torque is 0; give a number > 0"),
+        (lambda: Scenario(name="a", missing=True, mass=2.0), "missing there is no collision; drop mass"),
+        (lambda: Scenario(name="a", missing=True, torque=0.9), "missing there is no collision; drop torque"),
     ],
 )
 def test_bad_parts_are_named(make: Any, says: str) -> None:
@@ -258,3 +304,28 @@ def test_every_term_has_a_name_and_a_unit() -> None:
 def test_an_unknown_solver_is_named_before_anything_is_built(robot: Robot) -> None:
     with pytest.raises(InputError, match=r"unknown solver 'ipot'.*did you mean 'ipopt'"):
         solve(problem(robot), solver="ipot")
+
+
+# ---- scenarios and models of the collision
+
+
+def test_scenarios_and_the_collision_are_described(robot: Robot) -> None:
+    assert not {"scenarios", "collision"} & problem(robot).describe().keys()
+    scenarios = [
+        Scenario(name="soft", stiffness=0.5, damping=0.0),
+        Scenario(name="gone", missing=True, capture_margin=0.05),
+        Scenario(name="strict", torque=0.7),
+    ]
+    p = problem(robot, scenarios=scenarios)
+    assert p.scenarios == tuple(scenarios)
+    wanted = ["soft: 0.5 x stiffness, 0 x damping", "gone: no target", "strict: as expected"]
+    assert p.describe()["scenarios"] == wanted
+    json.dumps(p.describe())
+    rigid = problem(robot, collision="rigid", coefficient_of_restitution=0.25)
+    assert rigid.describe()["collision"] == "rigid, restitution 0.25"
+    assert problem(robot, collision="virtual mass").describe()["collision"] == "virtual mass"
+
+
+def test_balance_may_ask_for_nothing() -> None:
+    term = Balance(capture_margin=None, vertical_speed=np.inf, angular_momentum=np.inf)
+    assert term.capture_margin is None

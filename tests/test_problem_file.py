@@ -15,9 +15,10 @@ import impactopt.problem_file.sections as sections
 from impactopt import terms
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.problem import ImpactProblem, Phase
+from impactopt.problem import COLLISIONS, ImpactProblem, Phase
 from impactopt.problem_file import load_problem, read_problem_file
 from impactopt.problem_file.mistakes import key_lines
+from impactopt.scenario import Scenario
 from impactopt.stance import FixedBase, OneSole
 
 PUNCH = Path(__file__).parents[1] / "problems" / "punch.toml"
@@ -117,6 +118,17 @@ duration_s = 1.5
 duration_s = [0.004, 0.1]
 stages = 3
 restitution = [0.25, 0.75]
+[[scenarios]]
+name = "all of it"
+mass = 1.5
+stiffness = 2
+damping = 0
+torque = 0.9
+cone_margin_m = 0.01
+capture_margin_m = 0.03
+[[scenarios]]
+name = "nothing there"
+missing = true
 [objective]
 smoothness = 1e-5
 wrench_price = 2e-3
@@ -157,6 +169,19 @@ price = 50.0
     assert problem.contact_duration == (0.004, 0.1)
     assert problem.collision_stages == 3
     assert problem.collision_elements == (default, (0.25, 0.75))
+    assert (problem.collision, problem.coefficient_of_restitution) == ("dynamics", 0.0)
+    assert problem.scenarios == (
+        Scenario(
+            name="all of it",
+            mass=1.5,
+            stiffness=2,
+            damping=0,
+            torque=0.9,
+            cone_margin=0.01,
+            capture_margin=0.03,
+        ),
+        Scenario(name="nothing there", missing=True),
+    )
     assert (problem.smoothness, problem.wrench_price) == (1e-5, 2e-3)
     assert problem.term(terms.TorqueLimit) == terms.TorqueLimit(fraction=0.7, collision=0.8)
     assert problem.term(terms.VelocityLimit) == terms.VelocityLimit(fraction=0.6)
@@ -185,11 +210,26 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
     for term in terms.DEFAULT_TERMS:
         assert type(term) in kinds
         assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
-    for kind in (Phase, FreeMass, SpringDamper):
+    for kind in (Phase, FreeMass, SpringDamper, Scenario):
         assert {f.name for f in dataclasses.fields(kind)} == set(kinds[kind].model_fields)
     keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
     keys |= {*sections.Collision.model_fields, "law", "collision_elements"}
     assert {f.name for f in dataclasses.fields(ImpactProblem)} <= keys
+
+
+def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
+    rigid = '[collision]\nmodel = "rigid"\ncoefficient_of_restitution = 0.4\n'
+    problem = load_problem(write(tmp_path, GOOD + rigid))
+    assert (problem.collision, problem.coefficient_of_restitution) == ("rigid", 0.4)
+    assert problem.collision_elements == ImpactProblem.collision_elements
+    problem = load_problem(write(tmp_path, GOOD + '[collision]\nmodel = "virtual mass"\n'))
+    assert problem.collision == "virtual mass"
+    for name in COLLISIONS:
+        load_problem(write(tmp_path, GOOD + f'[collision]\nmodel = "{name}"\n'))
+    assert "leave it out" in message(write(tmp_path, GOOD + rigid.replace('"rigid"', '"dynamics"')))
+    scenario = "[[scenarios]]\nname = 'a'\n"
+    assert "scenarios need" in message(write(tmp_path, GOOD + rigid + scenario))
+    assert "two scenarios are called 'a'" in message(write(tmp_path, GOOD + 2 * scenario))
 
 
 @pytest.mark.usefixtures("no_robots")
@@ -224,6 +264,32 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
             ["[terms] torque", "did you mean 'torque_limit'"],
         ),
         ("[target]", "[collision]\ncompression = [0.5, 0.6]\n[target]", ["compression", "1.1", "sum to 1"]),
+        (
+            "[target]",
+            "[collision]\nmodel = 'rigit'\n[target]",
+            ["line 8", "[collision] model", "did you mean 'rigid'", "'virtual mass'"],
+        ),
+        (
+            "[target]",
+            "[collision]\ncoefficient_of_restitution = 1.5\n[target]",
+            ["coefficient_of_restitution", "1.5", ">= 0 and <= 1"],
+        ),
+        (
+            "[target]",
+            "[[scenarios]]\nname = 'a'\nmas = 2\n[target]",
+            ["line 9", "[scenarios] mas", "did you mean 'mass'"],
+        ),
+        ("[target]", "[[scenarios]]\nmass = 2\n[target]", ["line 7", "[scenarios] name", "missing"]),
+        ("[target]", "[[scenarios]]\nname = 'a'\nmass = 0\n[target]", ["line 9", "mass", "> 0"]),
+        ("[target]", "[[scenarios]]\nname = 'a'\nmissing = 1\n[target]", ["missing", "true or false"]),
+        ("[target]", "[[scenarios]]\nname = 'a'\ntorque = inf\n[target]", ["torque", "inf", "finite"]),
+        (
+            "[target]",
+            "[[scenarios]]\nname = 'a'\nmissing = true\nmass = 2\n[target]",
+            ["line 7", "scenario 'a'", "drop mass"],
+        ),
+        ("[target]", "[[scenarios]]\nname = ''\n[target]", ["scenario's name", "give a word"]),
+        ("[target]", "[scenarios]\nname = 'a'\n[target]", ["scenarios", "list"]),
         ("[target]", "[solver]\nname = 'ipotp'\n[target]", ["ipotp", "did you mean 'ipopt'"]),
         ("[target]", "[solver.ipopt]\nmax_itr = 3\n[target]", ["[solver]", "max_itr"]),
         ("[target]", "[solver.sqp]\nradus = 3\n[target]", ["[solver.sqp]", "radus", "did you mean 'radius'"]),

@@ -27,6 +27,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn conditions.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
+FEW_DRAWS = 10  # of the bench margins among all others, which has a dozen plans to replay
 
 
 @app.command()
@@ -74,6 +75,21 @@ def baselines(
     _run(["baselines"], {"baselines": options}, as_json, out, quiet)
 
 
+@app.command()
+def margins(
+    draws: Draws = 40,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    few: Annotated[bool, typer.Option("--quick", help="Fewer values of each option.")] = False,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """What planning with margin costs in impulse, and what it buys in robustness, one option at a time."""
+    options = {"draws": draws, "seed": seed, "workers": workers, "quick": few}
+    _run(["margins"], {"margins": options}, as_json, out, quiet)
+
+
 @app.command("all")
 def run_all(
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
@@ -87,7 +103,11 @@ def run_all(
     from impactopt.bench.registry import BENCHES
 
     drawn = {"seed": seed, "workers": workers}
-    options = {"robustness": {"draws": draws, **drawn}, "baselines": drawn}
+    options = {
+        "robustness": {"draws": draws, **drawn},
+        "baselines": drawn,
+        "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
+    }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)
 
 

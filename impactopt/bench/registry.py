@@ -18,6 +18,7 @@ BENCHES = {
     "robustness": "robustness",
     "replay": "replay",
     "baselines": "baselines",
+    "margins": "margins",
 }
 
 

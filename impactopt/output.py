@@ -47,10 +47,10 @@ class Record:
     problem : text of the problem file, "" if there was none.
     arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
         corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
-        by field, `reference_*` (`impactopt.plan.Trajectory`), `plan_*` (`Plan`), `swing_*`, `follow_*` (its
-        splines), `collision_*` (`PlannedCollision`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation`
-        on free soles, without positions and torques), `solver_*` (`SolverResult`), `history_*` (its
-        iterations).
+        by field, `reference_*` (`impactopt.plan.Trajectory`) and, of a plan with a brake, `missed_*`,
+        `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
+        `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without positions and
+        torques), `solver_*` (`SolverResult`), `history_*` (its iterations).
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
@@ -104,6 +104,8 @@ def record_of(
     summary = _summary(solution, simulation, replay)
     if "note" not in summary:
         parts["reference"] = solution.trajectory
+        if plan.brake is not None:
+            parts["missed"] = solution.missed_trajectory
     if simulation is not None:
         parts["simulated"] = simulation
     if replay is not None:

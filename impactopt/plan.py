@@ -14,6 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.coordinates import StanceCoordinates
+from impactopt.errors import InputError
 from impactopt.motion import CubicSpline
 from impactopt.problem import ImpactProblem
 from impactopt.support import margin, support_polygon, zmp
@@ -94,7 +95,8 @@ class Plan:
     there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
     through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
     [N s] to the target. scenarios: what is predicted of other targets, in the problem's order; a missing one
-    is not hit, so it is not among them.
+    is not hit, so it is not among them. brake, brake_wrench: as follow, after a blow that met nothing; None
+    if the problem does not ask for it.
     """
 
     problem: ImpactProblem
@@ -110,6 +112,8 @@ class Plan:
     hand_speed: float
     impulse: float
     scenarios: tuple[PlannedScenario, ...] = ()
+    brake: CubicSpline | None = None
+    brake_wrench: Array | None = None
 
     @property
     def coordinates(self) -> StanceCoordinates:
@@ -133,12 +137,14 @@ class Plan:
         """Support polygon (k, 2) [m]."""
         return support_polygon(self.problem.robot, self.coordinates)
 
-    def independent(self, phase: int, time: Array) -> tuple[Array, Array, Array, Array]:
+    def independent(
+        self, phase: int, time: Array, *, missed: bool = False
+    ) -> tuple[Array, Array, Array, Array]:
         """Reference y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) of a phase.
 
         time (k,) [s] : since the motion's start.
         phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
-        then rest.
+        then rest; ``missed``: the brake instead.
         """
         ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
         if phase == 1:
@@ -146,31 +152,45 @@ class Plan:
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
-        curve, start, nodes, wrench = (
-            (self.swing, 0.0, self.swing_nodes, self.swing_wrench)
-            if phase == 0
-            else (self.follow, self.contact_end, self.follow_nodes, self.follow_wrench)
-        )
+        curve, start, nodes, wrench = self.swing, 0.0, self.swing_nodes, self.swing_wrench
+        if phase == 2:
+            start, nodes = self.contact_end, self.follow_nodes
+            curve, wrench = self._last(missed)
         local = np.clip(ts - start, 0.0, curve.duration)
         y, yd, ydd = curve.sample(local)
         at = nodes * curve.duration
         w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
         return y, yd, ydd, w
 
-    def trajectory(self, *, step: float = 1e-3, hold: float = 0.5) -> Trajectory:
+    def _last(self, missed: bool) -> tuple[CubicSpline, Array]:
+        if not missed:
+            return self.follow, self.follow_wrench
+        if self.brake is None or self.brake_wrench is None:
+            raise InputError(
+                "this plan has no motion for a blow that meets nothing: solve the problem with a scenario "
+                "Scenario(name=..., missing=True, brake=True)"
+            )
+        return self.brake, self.brake_wrench
+
+    def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
+
+        missed : the one that a robot goes on with which has felt nothing by the end of the planned contact:
+        the same until then, and then the brake.
 
         Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
         dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.
         The instants of contact and of its end are there twice: the reference jumps from the coasting one to
         the predicted state.
         """
-        t0, t1, end = self.contact_start, self.contact_end, self.duration + hold
+        last, _ = self._last(missed)
+        t0, t1, rest = self.contact_start, self.contact_end, self.contact_end + last.duration
+        end = rest + hold
         legs = self.coordinates.split(self.problem.start_posture)[1]
         parts: list[tuple[Any, ...]] = []
         for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
             times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
-            rows = complete_reference(self.problem, *self.independent(phase, times), legs)
+            rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
             parts.append((phase, times, *rows))
             legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
@@ -187,7 +207,7 @@ class Plan:
             ground=ground,
             contact_start=t0,
             contact_end=t1,
-            end=self.duration,
+            end=rest,
         )
 
     def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:

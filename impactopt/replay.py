@@ -23,11 +23,14 @@ __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "replay"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Planned:
-    """What there is to replay: a record, its problem, and the reference that the servo is to follow."""
+    """What there is to replay: a record, its problem, the reference that the servo is to follow, and the one
+    that it goes on with if it hits nothing, where the plan has one.
+    """
 
     record: Record
     problem: ImpactProblem
     reference: Trajectory
+    missed: Trajectory | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,9 +74,14 @@ def load_planned(
             f"{result} was planned for another robot than {robot.name!r} is today: its joints differ; "
             "solve again, or give the file of its problem with --problem"
         )
-    given = {f.name: a[f"reference_{f.name}"] for f in dataclasses.fields(Trajectory)}
+    missed = _trajectory(record, "missed") if "missed_time" in a else None
+    return Planned(record=record, problem=problem, reference=_trajectory(record, "reference"), missed=missed)
+
+
+def _trajectory(record: Record, prefix: str) -> Trajectory:
+    given = {f.name: record.arrays[f"{prefix}_{f.name}"] for f in dataclasses.fields(Trajectory)}
     fields: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in given.items()}
-    return Planned(record=record, problem=problem, reference=Trajectory(**fields))
+    return Trajectory(**fields)
 
 
 def _problem(record: Record, result: Path, problem_file: str | os.PathLike[str] | None) -> ImpactProblem:
@@ -106,6 +114,8 @@ def replay(
     world = conditions if conditions is not None else Conditions()
     if world != Conditions():
         options["conditions"] = world
+    if engine == "mujoco" and planned.missed is not None:
+        options["missed"] = planned.missed
     problem = planned.problem
     simulation = simulate(problem, planned.reference, engine=engine, **options)
     report = plain(

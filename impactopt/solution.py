@@ -51,6 +51,11 @@ class Solution:
         """The servo's reference, sampled."""
         return self.plan.trajectory()
 
+    @cached_property
+    def missed_trajectory(self) -> Trajectory:
+        """The servo's reference if nothing is hit; InputError if the plan has no brake."""
+        return self.plan.trajectory(missed=True)
+
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.validation.Simulation`.
 
@@ -63,6 +68,8 @@ class Solution:
         """
         from impactopt.validation import simulate
 
+        if engine == "mujoco" and self.plan.brake is not None:
+            options.setdefault("missed", self.missed_trajectory)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
 
     def outcome(self) -> dict[str, Any]:

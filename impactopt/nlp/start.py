@@ -58,10 +58,11 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     t.swing_c.write(x, curve.control[3:-1])
     values = quintic(y_hit, 0.5 * rates, t.y0, zero, follow_T, t.follow_breaks)
     back = CubicSpline.fit(values, t.follow_breaks, 0.5 * rates, zero, follow_T)
-    t.follow_c.write(x, np.vstack([back.control[: t.follow_c.count - 1], t.y0]))
+    for follow in t.follows:
+        follow.guess(x, back, t.y0)
     for group, wrench, spline, nodes in (
         (t.swing_legs, t.swing_w, curve, t.swing_nodes),
-        (t.follow_legs, t.follow_w, back, t.follow_nodes),
+        *((follow.legs, follow.w, back, t.follow_nodes) for follow in t.follows),
     ):
         legs, all_legs, all_w = t.legs0, [], []
         for y in spline.sample(nodes * spline.duration)[0]:
@@ -72,8 +73,9 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
         if c.legs:
             group.write(x, np.array(all_legs))
             wrench.write(x, np.array(all_w))
+    if t.brake is not None and c.legs:
+        t.coast_w.write(x, t.swing_w.read(x)[-1:])
     t.swing_T.write(x, swing_T)
-    t.follow_T.write(x, follow_T)
     t.u0.write(x, rates)
     for collision in t.collisions:
         collision.guess(x, y_hit, rates, t.swing_legs.read(x)[-1] if c.legs else t.legs0)

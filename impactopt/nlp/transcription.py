@@ -21,6 +21,7 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.collision import DIRECTIONS, Collision
+from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
 from impactopt.nlp.mesh import collision_mesh, with_middles
@@ -135,8 +136,7 @@ class Transcription:
     def _variables(self) -> None:
         p, add = self.problem, self.layout.add
         c, ny, nl, nw = self.coordinates, self.ny, self.nl, self.nw
-        ns, nf = p.swing.intervals, p.follow.intervals
-        ms, mf = len(self.swing_nodes), len(self.follow_nodes)
+        ns, ms = p.swing.intervals, len(self.swing_nodes)
         self.wrench_labels = [
             f"{leg.sole.name} sole {k}" for leg in c.legs for k in ("fx", "fy", "fz", "mx", "my", "mz")
         ]
@@ -163,10 +163,11 @@ class Transcription:
             self.collisions = [Collision(self), *self.scenarios]
         else:
             self.scenarios, self.collisions = [], [InstantImpact(self)]
-        self.follow_c = add("follow control point", nf + 1, ny, **y)
-        self.follow_legs = add("follow legs", mf, nl, **legs)
-        self.follow_w = add("follow sole wrench", mf, nw, **w)
-        self.follow_T = self.duration("follow duration", p.follow.duration, 0.1)
+        self.follow = FollowThrough(self, "follow", "follow-through")
+        brakes = any(s.brake for s in p.scenarios) and p.collision == "dynamics"
+        self.brake = FollowThrough(self, "brake", "brake") if brakes else None
+        self.follows = [self.follow, *([self.brake] if self.brake is not None else [])]
+        self.coast_w = add("coasting sole wrench", int(brakes), nw, **w)
 
     def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
@@ -185,10 +186,6 @@ class Transcription:
         factors = rate_weights(self.swing_breaks)
         step = self.swing_control(j - 1) - self.swing_control(j - 2)
         return self.swing_control(j - 1) + step * float(factors[-2] / factors[-1])
-
-    def follow_control(self, j: int) -> Affine:
-        """Control point j = 0 .. N+2 of the follow-through; the last three coincide: it ends at rest."""
-        return self.follow_c[min(j, self.follow_c.count - 1)]
 
     def at(self, control: Callable[[int], Affine], breaks: Array, s: float) -> tuple[Affine, Affine, Affine]:
         """y, y', y'' at s of the spline with these control points."""
@@ -224,13 +221,19 @@ class Transcription:
             y, y1, y2 = self.at(self.swing_control, self.swing_breaks, at)
             instances.append([y, y1, y2, self.swing_legs[k], self.swing_w[k], self.swing_T[0]])
             places.append(f"swing, {100 * at:.0f} %")
-        for k, at in enumerate(self.follow_nodes):
-            y, y1, y2 = self.at(self.follow_control, self.follow_breaks, at)
-            instances.append([y, y1, y2, self.follow_legs[k], self.follow_w[k], self.follow_T[0]])
-            places.append(f"follow-through, {100 * at:.0f} %")
+        for follow in self.follows:
+            slots, names = follow.nodes()
+            instances += slots
+            places += names
+        groups = [self.swing_w, *[follow.w for follow in self.follows]]
+        if self.brake is not None:
+            coasting, name = self.brake.coasting_node(self.coast_w)
+            instances.append(coasting)
+            places.append(name)
+            groups.append(self.coast_w)
         self._add_block("node", instances, self._node_parameters())
         self._node_rows(places, self.blocks[-1].n_out)
-        wrenches = [group[k] for group in (self.swing_w, self.follow_w) for k in range(group.count)]
+        wrenches = [group[k] for group in groups for k in range(group.count)]
         for place, wrench in zip(places, wrenches, strict=True):
             self.cone_rows(wrench, place, self.cone.margin, self.cone.minimum_force)
         joints = np.arange(self.coordinates.base, self.ny)
@@ -242,12 +245,11 @@ class Transcription:
             lower=self.y_lower[joints],
             upper=self.y_upper[joints],
         )
-        # the first two and the last two velocity control points are zero by construction
-        last = [p.swing.intervals + 2, p.follow.intervals]
-        self._rate_rows("swing", self.swing_control, range(2, last[0]), self.swing_breaks, self.swing_T)
-        self._rate_rows(
-            "follow-through", self.follow_control, range(last[1]), self.follow_breaks, self.follow_T
-        )
+        # the first two velocity control points are zero by construction
+        last = p.swing.intervals + 2
+        self.rate_rows("swing", self.swing_control, range(2, last), self.swing_breaks, self.swing_T)
+        for follow in self.follows:
+            follow.add_rate_rows()
 
     def _node_rows(self, places: list[str], n_out: int) -> None:
         c, r = self.coordinates, self.robot
@@ -314,7 +316,7 @@ class Transcription:
                 lower=minimum_force / self.weight,
             )
 
-    def _rate_rows(
+    def rate_rows(
         self, phase: str, control: Callable[[int], Affine], js: range, breaks: Array, duration: Group
     ) -> None:
         """Velocity control points within the limit; multiplied by T they are linear."""
@@ -421,16 +423,22 @@ class Transcription:
 
     def _after(self) -> None:
         """What comes after contact: the follow-through starts there, and the robot keeps its balance."""
-        yf, yf1, _ = self.at(self.follow_control, self.follow_breaks, 0.0)
-        instances = self.collisions[0].link(yf, yf1, self.follow_T[0])
+        yf, yf1 = self.follow.start
+        instances = self.collisions[0].link(yf, yf1, self.follow.T[0])
         one = Affine.constant(1.0)
         for other in self.scenarios:
             instances += other.link(other.after[0], other.u[other.end[1]], one)
+        if self.brake is not None:
+            instances += self.brake.link_from_coasting()
         at = self._add_block("link", instances, np.zeros(0))
         labels, places = self.coordinates.labels, at + 3 * np.arange(self.ny)
         self.equal("collision starts from the swing's end", "rate", labels, places)
         self.equal("follow-through starts from the predicted state", "position", labels, places + 1)
         self.equal("follow-through starts from the predicted state", "rate", labels, places + 2)
+        if self.brake is not None:
+            after = places + 3 * self.ny * (1 + len(self.scenarios))
+            self.equal("brake starts where coasting ends", "position", labels, after + 1)
+            self.equal("brake starts where coasting ends", "rate", labels, after + 2)
         for k, other in enumerate(self.scenarios, start=1):
             place = f"position{other.suffix}"
             self.equal("state after contact", place, labels, places + 1 + 3 * self.ny * k)
@@ -440,7 +448,7 @@ class Transcription:
     def _balance_rows(self, yf: Affine, yf1: Affine) -> None:
         margin, one = self.balance.capture_margin, Affine.constant(1.0)
         y, y1, _ = self.contact_state
-        found = [([yf, yf1, self.follow_legs[0], self.follow_T[0]], margin, "after contact")]
+        found = [([yf, yf1, self.follow.legs[0], self.follow.T[0]], margin, "after contact")]
         for other in self.scenarios:
             slots = [other.after[0], other.u[other.end[1]], other.legs[other.end[1]], one]
             assert other.scenario is not None
@@ -489,7 +497,7 @@ class Transcription:
         linear = np.zeros(n)
         for control, breaks, nodes, bounds in (
             (self.swing_control, self.swing_breaks, self.swing_nodes, p.swing.duration),
-            (self.follow_control, self.follow_breaks, self.follow_nodes, p.follow.duration),
+            *((f.control, self.follow_breaks, self.follow_nodes, p.follow.duration) for f in self.follows),
         ):
             typical = float(np.mean(bounds))
             lengths = np.gradient(nodes)
@@ -500,13 +508,14 @@ class Transcription:
                 quadratic = quadratic + 2 * weight * (m.T @ m)
                 linear += 2 * weight * (m.T @ acc.const)
         diagonal = np.zeros(n)
-        for group in (self.swing_w, self.follow_w, *[hit.w for hit in self.collisions]):
+        for group in (self.swing_w, self.coast_w, *[part.w for part in (*self.follows, *self.collisions)]):
             span = slice(group.offset, group.offset + group.count * group.size)
             diagonal[span] = p.wrench_price / max(1, group.count)
-        end = self.follow_c.index(-1)  # price (y_end - y_start)^2: rest near the start posture
-        diagonal[end] += 2 * p.return_price
-        linear[end] -= 2 * p.return_price * self.y0
-        away = Affine.constant(p.return_price * float(self.y0 @ self.y0))
+        for follow in self.follows:  # price (y_end - y_start)^2: rest near the start posture
+            end = follow.c.index(-1)
+            diagonal[end] += 2 * p.return_price
+            linear[end] -= 2 * p.return_price * self.y0
+        away = Affine.constant(len(self.follows) * p.return_price * float(self.y0 @ self.y0))
         return away - impulse, quadratic + sp.diags_array(diagonal), linear
 
     # ------------------------------------------------------------------ solution
@@ -519,7 +528,8 @@ class Transcription:
             return CubicSpline(control=control, breaks=breaks, duration=float(duration.read(x)[0, 0]))
 
         swing = spline(self.swing_control, self.swing_breaks, self.swing_T)
-        follow = spline(self.follow_control, self.follow_breaks, self.follow_T)
+        follow, follow_w = self.follow.decode(x)
+        brake, brake_w = self.brake.decode(x) if self.brake is not None else (None, None)
         outputs = self.program.outputs(x)
         approach = float(outputs["contact"][0, 3])
         expected = self.collisions[0]
@@ -535,7 +545,9 @@ class Transcription:
             swing_nodes=np.concatenate([[0.0], self.swing_nodes]),
             swing_wrench=np.vstack([start_w, swing_w]),
             follow_nodes=self.follow_nodes,
-            follow_wrench=self.follow_w.read(x),
+            follow_wrench=follow_w,
+            brake=brake,
+            brake_wrench=brake_w,
             collision=expected.decode(x, outputs, approach),
             hand_speed=approach,
             impulse=float(expected.impulse.evaluate(x)[0]),

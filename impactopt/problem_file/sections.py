@@ -115,6 +115,7 @@ class ScenarioSection(Section):
     stiffness: Positive = _optional()
     damping: NotNegative = _optional()
     missing: bool = _optional()
+    brake: bool = _optional()
     torque: Positive = _optional()
     cone_margin: NotNegative = _optional("cone_margin_m")
     capture_margin: NotNegative = _optional("capture_margin_m")

@@ -36,9 +36,7 @@ class _Replay:
         self.robot, self.scene, self.conditions = robot, conditions.scene(scene), conditions
         self.world = build_world(robot, self.scene, conditions, solver)
         self.data = self.mujoco.MjData(self.world)
-        self.servo = Servo(
-            robot, reference, kp=conditions.kp, kd=conditions.kd, limit=conditions.torque_limit
-        )
+        self.follow(reference)
         joints = [self.world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.place = np.array([joint.qposadr[0] for joint in joints])
@@ -59,8 +57,13 @@ class _Replay:
             np.array([f.placement.act(np.array([*c, 0.0])) for c in corners])
             for f, corners in zip(frames, scene.corners, strict=True)
         ]
-        self.reference_q = np.asarray(reference.q)
         self.start(self.reference_q[0])
+
+    def follow(self, reference: Any) -> None:
+        """What the servo follows from now on."""
+        world = self.conditions
+        self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
+        self.reference_q = np.asarray(reference.q)
 
     def start(self, q: Array) -> None:
         d = self.data
@@ -209,6 +212,7 @@ def simulate_mujoco(
     settle: float = 2.0,
     record: int = 5,
     conditions: Conditions | None = None,
+    missed: Any = None,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
 
@@ -216,6 +220,8 @@ def simulate_mujoco(
     step [s], iterations, tolerance : of MuJoCo (semi-implicit Euler, Newton, elliptic cones).
     record : steps between recorded instants; every step is recorded in contact.
     conditions : where the world differs from what was planned; default: nowhere.
+    missed : the reference that the robot goes on with if it has touched nothing by ``reference.contact_end``;
+        default: it does not notice.
 
     A fall ends the simulation early; the result says so.
 
@@ -240,6 +246,9 @@ def simulate_mujoco(
         for k in range(round((float(reference.end) + settle) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
+            if missed is not None and t >= reference.contact_end and not touches.intervals:
+                replay.follow(missed)
+                servo, q_end, missed = replay.servo, np.asarray(missed.q[-1]), None
             if k % hold == 0:
                 asked = servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof])
                 # at rest before the start, it asked for the same

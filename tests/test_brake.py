@@ -1,0 +1,88 @@
+"""A robot that has hit nothing stops by a motion of its own, planned with the swing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from small_plans import Planned, changed
+
+from impactopt.errors import InputError
+from impactopt.nlp.transcription import Transcription
+from impactopt.output import load_record, record_of, save_record
+from impactopt.replay import load_planned
+from impactopt.scenario import Scenario
+from impactopt.solution import Solution
+from impactopt.validation import Conditions
+
+PROBLEM = Path(__file__).resolve().parents[1] / "problems" / "punch.toml"
+
+
+def test_until_the_planned_contact_is_over_nothing_is_known(punch: Solution) -> None:
+    hit, missed = punch.trajectory, punch.missed_trajectory
+    assert missed.contact_start == hit.contact_start and missed.contact_end == hit.contact_end
+    same = hit.phase < 2
+    for name in ("time", "phase", "q", "v", "a", "torque", "ground"):
+        np.testing.assert_array_equal(getattr(missed, name)[: same.sum()], getattr(hit, name)[same])
+
+
+def test_the_brake_goes_on_from_coasting_and_comes_to_rest(punch: Solution) -> None:
+    missed, model = punch.missed_trajectory, punch.problem.robot.model
+    last, first = np.flatnonzero(missed.phase == 1)[-1], np.flatnonzero(missed.phase == 2)[0]
+    assert missed.time[last] == missed.time[first] == missed.contact_end
+    # the program's rows hold to its tolerance; a blow, in contrast, changes some rate by far more
+    step = np.abs(pin.difference(model, missed.q[last], missed.q[first])).max()
+    assert step < 1e-4 and np.abs(missed.v[last] - missed.v[first]).max() < 1e-3
+    hit = punch.trajectory
+    assert np.abs(hit.v[first] - hit.v[last]).max() > 0.3
+    np.testing.assert_allclose(missed.v[missed.time >= missed.end], 0.0, atol=1e-12)
+    # its feed-forward balances gravity and motion under the wrenches that it assumes
+    data, k = model.createData(), (first + len(missed.time)) // 2
+    tau = pin.rnea(model, data, missed.q[k], missed.v[k], missed.a[k])
+    force = pin.SE3(np.eye(3), missed.q[k, :3]).actInv(pin.Force(missed.ground[k, :3], missed.ground[k, 3:]))
+    turn = pin.Quaternion(missed.q[k, 3:7]).toRotationMatrix().T
+    np.testing.assert_allclose(tau[:6], [*(turn @ force.linear), *(turn @ force.angular)], atol=1e-6)
+
+
+def test_its_nodes_have_the_rows_of_a_follow_through(biped_transcription: Transcription) -> None:
+    scenario = Scenario(name="gone", missing=True, brake=True)
+    program = changed(biped_transcription, scenarios=(scenario,)).program
+    places: dict[str, set[str]] = {}
+    for i in range(program.m):
+        term, place, *_ = program.row_name(i).split(", ")
+        places.setdefault(place, set()).add(term)
+    assert places["brake"] == places["follow-through"]
+    assert {"contact wrench cone", "torque limit"} < places["end of coasting"]
+    before = biped_transcription.program
+    assert not any("brake" in before.row_name(i) for i in range(before.m))
+
+
+def test_the_punch_into_the_air_stands(punch: Solution) -> None:
+    air = punch.validate(engine="mujoco", conditions=Conditions(missing=True))
+    assert air.standing, air.fall
+    assert air.impulse == 0.0 and air.slip.max() < 5e-3 and air.lift.max() < 2e-3
+    np.testing.assert_allclose(
+        air.q[-1, 7:], punch.missed_trajectory.q[-1, 7:], atol=0.02
+    )  # where the brake ends, not where the follow-through does
+    assert np.abs(punch.trajectory.q[-1, 7:] - punch.missed_trajectory.q[-1, 7:]).max() > 0.05
+
+
+def test_who_hits_does_not_brake(punch: Solution) -> None:
+    with_brake = punch.validate(engine="mujoco", step=5e-4, settle=0.0)
+    without = punch.validate(engine="mujoco", step=5e-4, settle=0.0, missed=None)
+    np.testing.assert_array_equal(with_brake.q, without.q)
+
+
+def test_the_record_keeps_it(punch: Solution, tmp_path: Path) -> None:
+    save_record(record_of(punch, problem=PROBLEM.read_text(), problem_path=PROBLEM), tmp_path)
+    assert "missed_time" in load_record(tmp_path).arrays
+    found = load_planned(tmp_path).missed
+    assert found is not None and found.end == punch.missed_trajectory.end
+    np.testing.assert_array_equal(found.q, punch.missed_trajectory.q)
+
+
+def test_a_plan_without_a_brake_says_how_to_get_one(arm_plan: Planned) -> None:
+    with pytest.raises(InputError, match="brake=True"):
+        arm_plan.plan.trajectory(missed=True)

@@ -154,37 +154,39 @@ class Plan:
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
         curve, start, nodes, wrench = self.swing, 0.0, self.swing_nodes, self.swing_wrench
         if phase == 2:
-            start, nodes = self.contact_end, self.follow_nodes
-            curve, wrench = self._last(missed)
+            nodes = self.follow_nodes
+            curve, wrench, start = self._last(missed)
         local = np.clip(ts - start, 0.0, curve.duration)
         y, yd, ydd = curve.sample(local)
         at = nodes * curve.duration
         w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
         return y, yd, ydd, w
 
-    def _last(self, missed: bool) -> tuple[CubicSpline, Array]:
+    def _last(self, missed: bool) -> tuple[CubicSpline, Array, float]:
+        """Spline, wrenches and start [s] of the way to rest."""
         if not missed:
-            return self.follow, self.follow_wrench
-        if self.brake is None or self.brake_wrench is None:
+            return self.follow, self.follow_wrench, self.contact_end
+        after = self.problem.brake_after
+        if self.brake is None or self.brake_wrench is None or after is None:
             raise InputError(
                 "this plan has no motion for a blow that meets nothing: solve the problem with a scenario "
-                "Scenario(name=..., missing=True, brake=True)"
+                "Scenario(name=..., missing=True, brake_after=0.025)"
             )
-        return self.brake, self.brake_wrench
+        return self.brake, self.brake_wrench, self.contact_start + after
 
     def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
 
-        missed : the one that a robot goes on with which has felt nothing by the end of the planned contact:
-        the same until then, and then the brake.
+        missed : the one that a robot goes on with which has felt nothing: the same until its contact_end, and
+        then the brake.
 
         Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
         dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.
         The instants of contact and of its end are there twice: the reference jumps from the coasting one to
         the predicted state.
         """
-        last, _ = self._last(missed)
-        t0, t1, rest = self.contact_start, self.contact_end, self.contact_end + last.duration
+        last, _, t1 = self._last(missed)
+        t0, rest = self.contact_start, t1 + last.duration
         end = rest + hold
         legs = self.coordinates.split(self.problem.start_posture)[1]
         parts: list[tuple[Any, ...]] = []

@@ -188,6 +188,11 @@ class ImpactProblem:
             if names.count(name) > 1:
                 raise InputError(f"two scenarios are called {name!r}: give each a name of its own")
 
+    @property
+    def brake_after(self) -> float | None:
+        """When after the planned contact [s] a robot that has felt nothing brakes; None: it feels nothing."""
+        return next((s.brake_after for s in self.scenarios if s.brake_after is not None), None)
+
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
         """The term of a kind: the problem's own, or the default."""
         for t in (*self.terms, *DEFAULT_TERMS):

@@ -22,8 +22,9 @@ class Scenario:
     name : for reports.
     mass, stiffness, damping : factors of the target's mass and the contact's numbers.
     missing : there is nothing to hit; what the robot has at contact it has to stop by itself.
-    brake : with ``missing``: a robot that has felt nothing by the end of the planned contact goes on to a
-        motion to rest that is planned with the swing, not to the follow-through of a blow that was none.
+    brake_after [s] : with ``missing``: a robot that has felt nothing by then after the planned contact goes
+        on to a motion to rest that is planned with the swing, not to the follow-through of a blow that was
+        none; None: it feels nothing.
     torque : fraction of each joint's limit in the collision.
     cone_margin [m] : of each sole's CoP in the collision.
     capture_margin [m] : of the capture point after it; with ``missing``, of that at contact.
@@ -39,7 +40,7 @@ class Scenario:
     stiffness: float = 1.0
     damping: float = 1.0
     missing: bool = False
-    brake: bool = False
+    brake_after: float | None = None
     torque: float = 1.0
     cone_margin: float = 0.005
     capture_margin: float = 0.0
@@ -50,20 +51,23 @@ class Scenario:
         where = f"scenario {self.name!r}"
         for f in fields(self)[1:]:
             value = getattr(self, f.name)
+            if value is None and f.default is None:
+                continue
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"{where}: {f.name} is {value}; give a finite number >= 0")
         for name in ("mass", "stiffness", "torque"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{where}: {name} is {getattr(self, name):g}; give a number > 0")
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
-        unused = [name for name in changed if name not in ("missing", "brake", "capture_margin")]
+        unused = [name for name in changed if name not in ("missing", "brake_after", "capture_margin")]
         if self.missing and unused:
             raise InputError(
                 f"{where}: with a target that is missing there is no collision; drop {unused[0]}"
             )
-
-        if self.brake and not self.missing:
-            raise InputError(f"{where}: brake is for a missing target; drop it, or give missing=True")
+        if self.brake_after is not None and not (self.missing and self.brake_after > 0):
+            raise InputError(
+                f"{where}: brake_after is a time > 0 s, for a missing target; drop it, or give missing=True"
+            )
 
     def __str__(self) -> str:
         factors = [f"{getattr(self, name):g} x {name}" for name in ("mass", "stiffness", "damping")]

@@ -76,14 +76,13 @@ class FollowThrough:
         self.c.write(x, np.vstack([curve.control[: self.c.count - 1], end]))
         self.T.write(x, curve.duration)
 
-    def link_from_coasting(self) -> list[list[Affine]]:
-        """Slots of the block ``link``: it starts where coasting through the planned contact ends."""
+    def link_from_coasting(self, after: float) -> list[list[Affine]]:
+        """Slots of the block ``link``: it starts where coasting for ``after`` [s] from contact ends."""
         t = self.t
         y, y1, _ = t.contact_state
         u0 = t.u0[0]
-        expected: Any = t.collisions[0]
         position, rate = self.start
-        times = [t.swing_T[0], expected.T[0][0], expected.T[1][0]]
+        times = [t.swing_T[0], Affine.constant(after), Affine.zeros(1)]
         out = []
         for k in range(t.ny):
             p, r, a, b, u = (e[k : k + 1] for e in (position, rate, y, y1, u0))

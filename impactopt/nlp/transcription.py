@@ -164,10 +164,10 @@ class Transcription:
         else:
             self.scenarios, self.collisions = [], [InstantImpact(self)]
         self.follow = FollowThrough(self, "follow", "follow-through")
-        brakes = any(s.brake for s in p.scenarios) and p.collision == "dynamics"
-        self.brake = FollowThrough(self, "brake", "brake") if brakes else None
+        self.brake_after = p.brake_after
+        self.brake = FollowThrough(self, "brake", "brake") if self.brake_after is not None else None
         self.follows = [self.follow, *([self.brake] if self.brake is not None else [])]
-        self.coast_w = add("coasting sole wrench", int(brakes), nw, **w)
+        self.coast_w = add("coasting sole wrench", int(self.brake is not None), nw, **w)
 
     def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
@@ -428,8 +428,8 @@ class Transcription:
         one = Affine.constant(1.0)
         for other in self.scenarios:
             instances += other.link(other.after[0], other.u[other.end[1]], one)
-        if self.brake is not None:
-            instances += self.brake.link_from_coasting()
+        if self.brake is not None and self.brake_after is not None:
+            instances += self.brake.link_from_coasting(self.brake_after)
         at = self._add_block("link", instances, np.zeros(0))
         labels, places = self.coordinates.labels, at + 3 * np.arange(self.ny)
         self.equal("collision starts from the swing's end", "rate", labels, places)

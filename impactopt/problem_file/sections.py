@@ -115,7 +115,7 @@ class ScenarioSection(Section):
     stiffness: Positive = _optional()
     damping: NotNegative = _optional()
     missing: bool = _optional()
-    brake: bool = _optional()
+    brake_after: Positive = _optional("brake_after_s")
     torque: Positive = _optional()
     cone_margin: NotNegative = _optional("cone_margin_m")
     capture_margin: NotNegative = _optional("capture_margin_m")

@@ -220,7 +220,7 @@ def simulate_mujoco(
     step [s], iterations, tolerance : of MuJoCo (semi-implicit Euler, Newton, elliptic cones).
     record : steps between recorded instants; every step is recorded in contact.
     conditions : where the world differs from what was planned; default: nowhere.
-    missed : the reference that the robot goes on with if it has touched nothing by ``reference.contact_end``;
+    missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
         default: it does not notice.
 
     A fall ends the simulation early; the result says so.
@@ -246,7 +246,7 @@ def simulate_mujoco(
         for k in range(round((float(reference.end) + settle) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
-            if missed is not None and t >= reference.contact_end and not touches.intervals:
+            if missed is not None and t >= missed.contact_end and not touches.intervals:
                 replay.follow(missed)
                 servo, q_end, missed = replay.servo, np.asarray(missed.q[-1]), None
             if k % hold == 0:

@@ -179,11 +179,11 @@ def test_one_worker_and_two_give_the_same_numbers(still: tuple[Any, Any]) -> Non
 
 def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:
     """A still robot stands by its servo, and falls without it; the payload is not the reason."""
-    calm = Spread(mass=(1.0, 1.0), payload=(0.0, 0.0), distance=(0.02, 0.02), kp=(1.0, 1.0), kd=(1.0, 1.0))
+    calm = Spread(mass=(1.0, 1.0), payload=(0.0, 0.0), distance=(0.1, 0.1), kp=(1.0, 1.0), kd=(1.0, 1.0))
     stands = robustness(*still, 1.0, draws=1, spread=calm, workers=1, step=STEP)
     assert stands.rate == 1.0 and stands.reason == ("",)
     assert stands.impulse[0] == 0.0  # the target waits farther than the fist gets
-    weak = Spread(torque_limit=(0.01, 0.01), distance=(0.02, 0.02))
+    weak = Spread(torque_limit=(0.01, 0.01), distance=(0.1, 0.1))
     falls = robustness(*still, 1.0, draws=1, spread=weak, workers=1, step=STEP)
     assert falls.rate == 0.0 and falls.reason[0].startswith("fell")
     assert falls.lift[0] >= 0.0 and np.isfinite(falls.slip[0])

@@ -43,7 +43,7 @@ from impactopt.terms import (
 GRAVITY = 9.81
 # the striking point stays this far behind the target [m], and less only at this speed [m/s] towards it: what
 # hovers at the plane would touch it between the nodes
-CLEARANCE, HASTE = 0.02, 0.1
+CLEARANCE, HASTE = 0.02, 0.04
 LEVER = 0.1  # [m] scale of sole moments against forces
 BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base may go from its start
 

@@ -276,13 +276,16 @@ def swing_gaps(t: Transcription, x: Array) -> dict[float, float]:
     return out
 
 
+LEISURE = 1.5  # [s] for a way of centimetres
+
+
 def hovering(t: Transcription, *, gap: float) -> tuple[Transcription, Array]:
     """A hand that starts near the target, with time to spare; winding up is dear, so it does not go back."""
     c = t.coordinates
     data = c.model.createData()
     pin.framesForwardKinematics(c.model, data, t.problem.start_posture)
     start = data.oMf[c.model.getFrameId(f"striker:{t.problem.striker}")].translation
-    swing = dataclasses.replace(t.problem.swing, duration=0.6)
+    swing = dataclasses.replace(t.problem.swing, duration=LEISURE)
     near = changed(t, point=start + gap * t.problem.normal, swing=swing, smoothness=10.0)
     result = solve_ipopt(near.program, first_iterate(near))
     assert result.status is Status.SOLVED
@@ -292,12 +295,12 @@ def hovering(t: Transcription, *, gap: float) -> tuple[Transcription, Array]:
 def test_the_hand_keeps_clear_of_the_target_until_just_before_contact(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    near, x = hovering(arm_transcription, gap=0.03)
-    wanted = {float(s): min(nlp.CLEARANCE, nlp.HASTE * (1 - s) * 0.6) for s in near.swing_nodes}
+    near, x = hovering(arm_transcription, gap=0.022)
+    wanted = {float(s): min(nlp.CLEARANCE, nlp.HASTE * (1 - s) * LEISURE) for s in near.swing_nodes}
     assert max(wanted.values()) == nlp.CLEARANCE
     assert all(gap >= wanted[s] - 1e-5 for s, gap in swing_gaps(near, x).items())
     monkeypatch.setattr(nlp, "CLEARANCE", 0.0)
-    free, x = hovering(arm_transcription, gap=0.03)
+    free, x = hovering(arm_transcription, gap=0.022)
     assert any(gap < wanted[s] - 1e-3 for s, gap in swing_gaps(free, x).items()), "it would not have hovered"
 
 

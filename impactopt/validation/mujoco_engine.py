@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robot import Robot
 from impactopt.validation.conditions import Conditions
+from impactopt.validation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module, no_log_file
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
-from impactopt.validation.soles import BEARS, cop_margin, sole_names, weight_of
+from impactopt.validation.soles import BEARS, sole_names, weight_of
 from impactopt.validation.touch import FACE, Touches
 
 Array = NDArray[np.float64]
@@ -129,9 +130,7 @@ class _Replay:
 
     def sole_moves(self) -> tuple[list[float], list[float]]:
         """Slip and lift [m] of each held sole."""
-        moves = [now - then for now, then in zip(self.corner_places(), self.start_corners, strict=True)]
-        slip = [float(np.linalg.norm(m[:, :2], axis=1).max()) for m in moves]
-        return slip, [max(0.0, float(m[:, 2].max())) for m in moves]
+        return slip_and_lift(self.corner_places(), self.start_corners)
 
     def sole_ground(self) -> Array:
         """(soles, 6) wrench of the floor on each held sole about the world's origin; after the step's forces
@@ -156,35 +155,27 @@ class _Replay:
         """Whether the base is far from where the reference (nq,) has it: a plan may bow deeply itself."""
         if not self.floating:
             return ""
-        place, lean = self.data.qpos[:3], self.base_error(q_planned, axis_free=True)
+        place, lean = self.data.qpos[:3], self.base_error(q_planned)
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
         if place[2] < (1 - FALLEN_DROP) * q_planned[2]:
             return f"fell: the base is {place[2]:.2f} m high where it should be {q_planned[2]:.2f} m"
         return ""
 
-    def posture_error(self, q_end: Array) -> float:
-        """[rad] of the joint, or of the base, that is farthest from where the reference ends."""
-        error = np.abs(self.data.qpos[self.place] - self.servo.reference[-1, : self.robot.n])
-        error[self.servo.continuous] = np.abs(
-            np.remainder(error[self.servo.continuous] + np.pi, 2 * np.pi) - np.pi
-        )
-        worst = float(error.max())
-        return max(worst, self.base_error(q_end)) if self.floating else worst
-
     def planned(self, t: float) -> Array:
         """The reference's configuration (nq,) at a time, or just before it."""
         return self.reference_q[max(int(np.searchsorted(self.servo.time, t, side="right")) - 1, 0)]
 
-    def base_error(self, q_end: Array, *, axis_free: bool = False) -> float:
-        planned = pin.Quaternion(q_end[3:7]).toRotationMatrix()
-        return _angle(self.base()[1] @ planned.T, axis_free=axis_free)
+    def base_error(self, q_planned: Array) -> float:
+        """Angle [rad] between the verticals of the base and of a configuration's."""
+        planned = pin.Quaternion(q_planned[3:7]).toRotationMatrix()
+        return float(np.arccos(np.clip((self.base()[1] @ planned.T)[2, 2], -1.0, 1.0)))
 
-    def not_standing(self, q_end: Array, sole_ground: Array, weight: float) -> str:
+    def not_standing(self, sole_ground: Array, weight: float) -> str:
         """Why the robot does not stand at the end, "" if it does."""
         if not self.floating:
             return ""
-        lean, speed = self.base_error(q_end, axis_free=True), self.base()[2]
+        lean, speed = self.base_error(self.reference_q[-1]), self.base()[2]
         if lean > LEANS:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STIRS:
@@ -193,12 +184,6 @@ class _Replay:
             if wrench[2] < BEARS * weight:
                 return f"the sole {name!r} bears no load at the end"
         return ""
-
-
-def _angle(rotation: Array, *, axis_free: bool = False) -> float:
-    """Angle [rad] of a rotation; ``axis_free``: of the world's vertical only."""
-    cosine = rotation[2, 2] if axis_free else (np.trace(rotation) - 1) / 2
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def simulate_mujoco(
@@ -234,7 +219,6 @@ def simulate_mujoco(
     world = conditions if conditions is not None else Conditions()
     replay = _Replay(robot, reference, scene, world, Solver(step, iterations, tolerance))
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
-    q_end = np.asarray(reference.q[-1])
     hold = max(1, round(world.period / step))
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
     lag = round(world.delay / step)
@@ -248,7 +232,7 @@ def simulate_mujoco(
             mujoco.mj_step1(model, data)
             if missed is not None and t >= missed.contact_end and not touches.intervals:
                 replay.follow(missed)
-                servo, q_end, missed = replay.servo, np.asarray(missed.q[-1]), None
+                servo, missed = replay.servo, None
             if k % hold == 0:
                 asked = servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof])
                 # at rest before the start, it asked for the same
@@ -272,37 +256,18 @@ def simulate_mujoco(
                 ground = replay.sole_ground()
                 assert state is not None and moves is not None
                 rows.append((t, *state, force, target_speed, speed, demand, torque, ground, *moves))
-                if not np.all(np.isfinite(data.qvel)) or np.abs(data.qvel).max() > 1e4:
-                    raise InputError(
-                        f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or "
-                        "softer gains"
-                    )
+                check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(replay.planned(t))
                 if fall:
                     fall = f"{fall} at t = {t:.2f} s"
                     break
-    columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, v, forces, target, hand, demands, torques, grounds, slip, lift = columns
-    contact_start, contact_end = touches.blow()
-    return Simulation(
+    return simulation_of(
+        robot,
+        replay.scene,
+        rows,
+        touches,
         engine="mujoco",
-        time=time,
-        q=q,
-        v=v,
-        force=forces,
-        target_speed=target,
-        hand_speed=hand,
-        demand=demands,
-        torque=torques,
-        sole_ground=grounds,
-        soles=sole_names(robot, scene),
-        cop_margin=cop_margin(robot, scene, q, grounds),
-        slip=slip.reshape(len(time), -1),
-        lift=lift.reshape(len(time), -1),
-        contact_start=contact_start,
-        contact_end=contact_end,
-        mass=replay.scene.mass,
         saturated=saturated,
-        posture_error=replay.posture_error(q_end),
-        fall=fall or replay.not_standing(q_end, ground, weight_of(robot)),
+        posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
+        fall=fall or replay.not_standing(ground, weight_of(robot)),
     )

@@ -14,11 +14,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError
 from impactopt.robot import Robot
+from impactopt.validation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
-from impactopt.validation.soles import cop_margin, sole_names
 from impactopt.validation.touch import FACE, Touches
 
 Array = NDArray[np.float64]
@@ -140,21 +139,19 @@ def simulate_pinocchio(
     end = float(reference.end) + settle
     rows: list[tuple[Any, ...]] = []
     saturated = 0.0
-    start_soles: list[Array] | None = None
+    start: list[Array] | None = None
     touches = Touches()
     for k in range(round(end / step)):
         t = k * step
         first = world.rates(t, state)
-        ground, soles = world.ground(), world.corners()
-        start_soles = soles if start_soles is None else start_soles
         saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
         touches.add(t, first.force, step)
         if first.force > 0 or k % record == 0:
-            moves = [now - then for now, then in zip(soles, start_soles, strict=True)]
-            slip = [float(np.linalg.norm(m[:, :2], axis=1).max()) for m in moves]
-            lift = [max(0.0, float(m[:, 2].max())) for m in moves]
+            corners = world.corners()
+            start = corners if start is None else start
             motion = (state.q, state.v, first.force, state.vt, first.hand_speed)
-            rows.append((t, *motion, first.demand, first.torque, ground, slip, lift))
+            moves = slip_and_lift(corners, start)
+            rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves))
         middle = world.rates(t + step / 2, world.advance(state, first, step / 2))
         state = _State(
             pin.integrate(robot.model, state.q, step * middle.v),
@@ -162,41 +159,14 @@ def simulate_pinocchio(
             state.x + step * middle.vt,
             state.vt + step * middle.at,
         )
-        if not np.all(np.isfinite(state.v)) or np.abs(state.v).max() > 1e4:
-            raise InputError(
-                f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or softer "
-                "gains"
-            )
-    columns = [np.array(c) for c in zip(*rows, strict=True)]
-    contact_start, contact_end = touches.blow()
-    time, q, v, force, vt, hand, demand, torque, ground, slips, lifts = columns
-    return Simulation(
+        check_not_diverged(state.v, t, step)
+    return simulation_of(
+        robot,
+        scene,
+        rows,
+        touches,
         engine="pinocchio",
-        time=time,
-        q=q,
-        v=v,
-        force=force,
-        target_speed=vt,
-        hand_speed=hand,
-        demand=demand,
-        torque=torque,
-        sole_ground=ground,
-        soles=sole_names(robot, scene),
-        cop_margin=cop_margin(robot, scene, q, ground),
-        slip=slips.reshape(len(time), -1),
-        lift=lifts.reshape(len(time), -1),
-        contact_start=contact_start,
-        contact_end=contact_end,
-        mass=scene.mass,
         saturated=saturated,
-        posture_error=_posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
+        posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
         fall=None,
     )
-
-
-def _posture_error(model: Any, q: Array, planned: Array) -> float:
-    """[rad] of the joint, or of the base's orientation, that is farthest from where it should be."""
-    error = np.abs(pin.difference(model, planned, q))
-    if model.joints[1].nv == 6:
-        return float(max(np.linalg.norm(error[3:6]), error[6:].max(initial=0.0)))
-    return float(error.max())

@@ -16,7 +16,7 @@ class Servo:
     """Feed-forward, stiffness and damping about a sampled reference, saturated.
 
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n). An instant that stands twice is a jump.
-    gain, rate_gain, limit : factors of the robot's kp, kd and torque limit.
+    kp, kd, limit : factors of the robot's kp, kd and torque limit.
     """
 
     def __init__(

@@ -15,7 +15,7 @@ import numpy as np
 
 from impactopt.baseline import minimum_jerk_baseline
 from impactopt.bench.planning import DEMO, plan_of
-from impactopt.bench.report import Report, Say, make_table
+from impactopt.bench.report import Report, Say, cell, make_table
 from impactopt.errors import InputError
 from impactopt.plan import Trajectory
 from impactopt.planner import solve
@@ -49,7 +49,7 @@ def run(say: Say, *, file: Path = DEMO, draws: int = 50, seed: int = 0, workers:
         except InputError as error:  # a method that finds no plan stays in
             say(f"{name}: {error}")
             rows.append({**dict.fromkeys(KEYS), "method": name, "reason": str(error), "standing": False})
-    cells = [[r["method"], *(_cell(r.get(key), digits) for _, key, digits in COLUMNS)] for r in rows]
+    cells = [[r["method"], *(cell(r.get(key), digits) for _, key, digits in COLUMNS)] for r in rows]
     title = f"what people do today, and ours: {file}, replayed on free soles"
     table = make_table(title, ["method", *(heading for heading, _, _ in COLUMNS)], cells)
     numbers = {"rows": rows, "problem": str(file), "draws": draws, "seed": seed}
@@ -123,11 +123,3 @@ def row(method: Method, say: Say, draws: int, seed: int, workers: int) -> dict[s
         )
         out["standing_rate"] = many.rate
     return out
-
-
-def _cell(value: Any, digits: int) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.{digits}f}"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.bench.planning import DEMO
-from impactopt.bench.report import Report, Say, make_table
+from impactopt.bench.report import Report, Say, cell, make_table
 from impactopt.errors import InputError
 from impactopt.planner import solve
 from impactopt.plotting.margins import margins_picture
@@ -244,7 +244,7 @@ def tables_of(rows: list[dict[str, Any]]) -> tuple[Any, ...]:
         chosen = [r for r in rows if r["option"] == option]
         cells = []
         for r in chosen:
-            numbers = [_cell(r[key], digits) for _, key, digits in COLUMNS]
+            numbers = [cell(r[key], digits) for _, key, digits in COLUMNS]
             if r["impulse_planned_Ns"] is None:
                 numbers[0] = r["status"]
             cells.append([f"{r['value']}{' (base)' if r['base'] else ''}", *numbers])
@@ -252,11 +252,3 @@ def tables_of(rows: list[dict[str, Any]]) -> tuple[Any, ...]:
         headings = [heading for heading, _, _ in COLUMNS]
         tables.append(make_table(f"margins: {option}{unit}", ["value", *headings], cells))
     return tuple(tables)
-
-
-def _cell(value: Any, digits: int) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.{digits}f}"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.bench.planning import DEMO, plan_of
-from impactopt.bench.report import Report, Say, make_table
+from impactopt.bench.report import Report, Say, cell, make_table
 from impactopt.errors import InputError
 from impactopt.plotting.convergence import convergence_picture
 from impactopt.solution import Solution
@@ -113,18 +113,16 @@ def order(rows: list[dict[str, Any]], key: str) -> float | None:
 
 
 def _cells(found: dict[str, Any]) -> list[str]:
-    numbers = [
-        "-" if found.get(key) is None else f"{found[key]:.{digits}f}"
-        for key, digits in (
-            ("impulse_Ns", 3),
-            ("impulse_change_pct", 3),
-            ("peak_force_N", 1),
-            ("peak_force_change_pct", 2),
-            ("slip_mm", 2),
-            ("base_change_mm", 2),
-        )
-    ]
-    return [*numbers, "-" if found.get("standing") is None else "yes" if found["standing"] else "no"]
+    columns = (
+        ("impulse_Ns", 3),
+        ("impulse_change_pct", 3),
+        ("peak_force_N", 1),
+        ("peak_force_change_pct", 2),
+        ("slip_mm", 2),
+        ("base_change_mm", 2),
+        ("standing", 0),
+    )
+    return [cell(found.get(key), digits) for key, digits in columns]
 
 
 def _replay(solution: Solution, say: Say, **options: Any) -> Simulation | str:

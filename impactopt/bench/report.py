@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
-__all__ = ["Report", "Say", "machine", "make_table", "save_report", "timed"]
+__all__ = ["Report", "Say", "cell", "machine", "make_table", "save_report", "timed"]
 
 Say = Callable[[str], None]  # told in words what is being done
 
@@ -85,6 +85,15 @@ def make_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     return table
+
+
+def cell(value: Any, digits: int) -> str:
+    """A number, or yes or no, as a table has it; "-" for what there is not."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.{digits}f}"
 
 
 def save_report(report: Report, directory: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from impactopt.bench.planning import DEMO, solved
-from impactopt.bench.report import Report, Say, make_table
+from impactopt.bench.report import Report, Say, cell, make_table
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
@@ -60,7 +60,7 @@ def run(say: Say, *, folder: Path = DEMO.parent) -> Report:
     """Every problem file of the folder, and the variants of the demo's punch."""
     rows = [row(name, solution, say) for name, solution in problems(folder, say)]
     held = [[r["problem"], r["status"], *_cells(r, HELD)] for r in rows]
-    free = [[r["problem"], *_cells(r, FREE), _standing(r)] for r in rows]
+    free = [[r["problem"], *_cells(r, FREE), cell(r.get("standing"), 0)] for r in rows]
     tables = (
         make_table("planned, and replayed on held soles", ["problem", "status", *(c[0] for c in HELD)], held),
         make_table("replayed on free soles", ["problem", *(c[0] for c in FREE), "stands"], free),
@@ -128,10 +128,4 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
 
 def _cells(row: dict[str, Any], columns: tuple[tuple[str, str, float, int], ...]) -> list[str]:
     values = [(row.get(key), factor, digits) for _, key, factor, digits in columns]
-    return ["-" if value is None else f"{factor * value:.{digits}f}" for value, factor, digits in values]
-
-
-def _standing(row: dict[str, Any]) -> str:
-    if row.get("standing") is None:
-        return "-"
-    return "yes" if row["standing"] else "no"
+    return [cell(None if value is None else factor * value, digits) for value, factor, digits in values]

@@ -49,12 +49,11 @@ class Collision:
         self.coast_rates = add("coasting leg rates", t.nl, labels=c.leg_labels)
         self.u = add("collision rate", t.ny, labels=c.labels)
         self.d = add("collision travel", t.ny, labels=c.labels)
-        legs = {"lower": t.legs_lower, "upper": t.legs_upper, "labels": c.leg_labels}
-        self.legs = add("collision legs", t.nl, **legs)
+        self.legs = add("collision legs", t.nl, **t.of_legs)
         self.f = add("contact force", 1, scale=FORCE_SCALE)
         self.vt = add("target speed", 1)
         self.xt = add("target travel", 1)
-        self.w = add("collision sole wrench", t.nw, scale=t.wrench_scale, labels=t.wrench_labels)
+        self.w = add("collision sole wrench", t.nw, **t.of_wrenches)
         if scenario is not None:  # the expected target's is the follow-through's first
             self.after = t.layout.add(f"{named}position after contact", 1, t.ny, labels=c.labels)
 
@@ -154,20 +153,11 @@ class Collision:
         t.equal("contact law", place, ["force"], np.array([first["force"]]))
         t.equal("target's motion", place, ["speed"], np.array([first["force"] + 1]))
 
-    def link(self, position: Affine, rate: Affine, duration: Affine) -> list[list[Affine]]:
-        """Slots of the block ``link``, coordinate by coordinate: this state after contact to the next phase's
-        start, whose ``rate`` is a d/ds over ``duration`` [s]."""
-        t = self.t
-        y, y1, _ = t.contact_state
-        d1, d2, u = self.d[self.end[0]], self.d[self.end[1]], self.u[self.end[1]]
-        times = [t.swing_T[0], self.T[0][0], self.T[1][0]]
-        out = []
-        for k in range(t.ny):
-            p, r, a, b, one, two, u0, after = (
-                e[k : k + 1] for e in (position, rate, y, y1, d1, d2, t.u0[0], u)
-            )
-            out.append([p, r, duration, a, b, *times, one, two, u0, after])
-        return out
+    def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
+        """Slots of the block ``link``: this state after contact to a ``start`` (y, d y/ds, duration [s])."""
+        first, second = self.end
+        times = self.T[0][0], self.T[1][0]
+        return self.t.link_slots(start, times, (self.d[first], self.d[second]), self.u[second])
 
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:

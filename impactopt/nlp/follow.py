@@ -5,7 +5,7 @@ There is one after the expected blow and, where a problem asks for it, one for a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,13 +24,11 @@ class FollowThrough:
 
     def __init__(self, t: Transcription, name: str, place: str) -> None:
         self.t, self.place = t, place
-        c, p, add = t.coordinates, t.problem, t.layout.add
+        p, add = t.problem, t.layout.add
         nodes = len(t.follow_nodes)
-        y: dict[str, Any] = {"lower": t.y_lower, "upper": t.y_upper, "labels": c.labels}
-        legs: dict[str, Any] = {"lower": t.legs_lower, "upper": t.legs_upper, "labels": c.leg_labels}
-        self.c = add(f"{name} control point", p.follow.intervals + 1, t.ny, **y)
-        self.legs = add(f"{name} legs", nodes, t.nl, **legs)
-        self.w = add(f"{name} sole wrench", nodes, t.nw, scale=t.wrench_scale, labels=t.wrench_labels)
+        self.c = add(f"{name} control point", p.follow.intervals + 1, t.ny, **t.of_y)
+        self.legs = add(f"{name} legs", nodes, t.nl, **t.of_legs)
+        self.w = add(f"{name} sole wrench", nodes, t.nw, **t.of_wrenches)
         self.T = t.duration(f"{name} duration", p.follow.duration, 0.1)
 
     def control(self, j: int) -> Affine:
@@ -67,9 +65,7 @@ class FollowThrough:
     def decode(self, x: Array) -> tuple[CubicSpline, Array]:
         """The spline, and the sole wrenches at the nodes (k, 6 a sole)."""
         t = self.t
-        control = np.array([self.control(j).evaluate(x) for j in range(len(t.follow_breaks) + 2)])
-        duration = float(self.T.read(x)[0, 0])
-        return CubicSpline(control=control, breaks=t.follow_breaks, duration=duration), self.w.read(x)
+        return t.spline(x, self.control, t.follow_breaks, self.T), self.w.read(x)
 
     def guess(self, x: Array, curve: CubicSpline, end: Array) -> None:
         """Write a spline that ends at ``end`` (ny,), and its duration."""
@@ -78,13 +74,6 @@ class FollowThrough:
 
     def link_from_coasting(self, after: float) -> list[list[Affine]]:
         """Slots of the block ``link``: it starts where coasting for ``after`` [s] from contact ends."""
-        t = self.t
-        y, y1, _ = t.contact_state
-        u0 = t.u0[0]
-        position, rate = self.start
-        times = [t.swing_T[0], Affine.constant(after), Affine.zeros(1)]
-        out = []
-        for k in range(t.ny):
-            p, r, a, b, u = (e[k : k + 1] for e in (position, rate, y, y1, u0))
-            out.append([p, r, self.T[0], a, b, *times, u, u, u, u])
-        return out
+        u0 = self.t.u0[0]
+        times = Affine.constant(after), Affine.zeros(1)
+        return self.t.link_slots((*self.start, self.T[0]), times, (u0, u0), u0)

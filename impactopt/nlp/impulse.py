@@ -28,7 +28,7 @@ class InstantImpact:
         self.mass = t.problem.target.mass
         self.du = add("change of rate", 1, t.ny, labels=c.labels)
         self.blow = add("impulse", 1, 1, lower=1e-3, scale=10.0)
-        self.w = add("impulsive sole wrench", 1, t.nw, scale=0.05 * t.wrench_scale, labels=t.wrench_labels)
+        self.w = add("impulsive sole wrench", 1, t.nw, **{**t.of_wrenches, "scale": 0.05 * t.wrench_scale})
 
     @property
     def impulse(self) -> Affine:
@@ -52,16 +52,10 @@ class InstantImpact:
         t.equal("impulse balance", "impact", t.robot.joint_names, start + part["joints"])
         t.equal("law of the impact", "impact", ["impulse"], start + part["blow"])
 
-    def link(self, position: Affine, rate: Affine, duration: Affine) -> list[list[Affine]]:
+    def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
         """As of :meth:`impactopt.nlp.collision.Collision.link`; no time passes."""
-        t, none = self.t, Affine.zeros(1)
-        y, y1, _ = t.contact_state
-        after = t.u0[0] + self.du[0]
-        out = []
-        for k in range(t.ny):
-            p, r, a, b, u0, u = (e[k : k + 1] for e in (position, rate, y, y1, t.u0[0], after))
-            out.append([p, r, duration, a, b, t.swing_T[0], none, none, none, none, u0, u])
-        return out
+        none, still = Affine.zeros(1), Affine.zeros(self.t.ny)
+        return self.t.link_slots(start, (none, none), (still, still), self.t.u0[0] + self.du[0])
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         self.du.write(x, -0.3 * rates)

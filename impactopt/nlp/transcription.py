@@ -137,15 +137,20 @@ class Transcription:
         p, add = self.problem, self.layout.add
         c, ny, nl, nw = self.coordinates, self.ny, self.nl, self.nw
         ns, ms = p.swing.intervals, len(self.swing_nodes)
-        self.wrench_labels = [
+        # what every group of coordinates, of legs and of sole wrenches has
+        self.of_y: dict[str, Any] = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
+        self.of_legs: dict[str, Any] = {
+            "lower": self.legs_lower,
+            "upper": self.legs_upper,
+            "labels": c.leg_labels,
+        }
+        wrench_labels = [
             f"{leg.sole.name} sole {k}" for leg in c.legs for k in ("fx", "fy", "fz", "mx", "my", "mz")
         ]
-        y: dict[str, Any] = {"lower": self.y_lower, "upper": self.y_upper, "labels": c.labels}
-        legs: dict[str, Any] = {"lower": self.legs_lower, "upper": self.legs_upper, "labels": c.leg_labels}
-        w: dict[str, Any] = {"scale": self.wrench_scale, "labels": self.wrench_labels}
-        self.swing_c = add("swing control point", ns - 1, ny, **y)
-        self.swing_legs = add("swing legs", ms, nl, **legs)
-        self.swing_w = add("swing sole wrench", ms, nw, **w)
+        self.of_wrenches: dict[str, Any] = {"scale": self.wrench_scale, "labels": wrench_labels}
+        self.swing_c = add("swing control point", ns - 1, ny, **self.of_y)
+        self.swing_legs = add("swing legs", ms, nl, **self.of_legs)
+        self.swing_w = add("swing sole wrench", ms, nw, **self.of_wrenches)
         limit = self.torque.fraction
         self.feedforward = add(
             "feed-forward at contact",
@@ -167,7 +172,7 @@ class Transcription:
         self.brake_after = p.brake_after
         self.brake = FollowThrough(self, "brake", "brake") if self.brake_after is not None else None
         self.follows = [self.follow, *([self.brake] if self.brake is not None else [])]
-        self.coast_w = add("coasting sole wrench", int(self.brake is not None), nw, **w)
+        self.coast_w = add("coasting sole wrench", int(self.brake is not None), nw, **self.of_wrenches)
 
     def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
@@ -424,10 +429,10 @@ class Transcription:
     def _after(self) -> None:
         """What comes after contact: the follow-through starts there, and the robot keeps its balance."""
         yf, yf1 = self.follow.start
-        instances = self.collisions[0].link(yf, yf1, self.follow.T[0])
+        instances = self.collisions[0].link((yf, yf1, self.follow.T[0]))
         one = Affine.constant(1.0)
         for other in self.scenarios:
-            instances += other.link(other.after[0], other.u[other.end[1]], one)
+            instances += other.link((other.after[0], other.u[other.end[1]], one))
         if self.brake is not None and self.brake_after is not None:
             instances += self.brake.link_from_coasting(self.brake_after)
         at = self._add_block("link", instances, np.zeros(0))
@@ -485,6 +490,27 @@ class Transcription:
                         upper=limits[j],
                     )
 
+    def link_slots(
+        self,
+        start: tuple[Affine, Affine, Affine],
+        times: tuple[Affine, Affine],
+        travel: tuple[Affine, Affine],
+        rate: Affine,
+    ) -> list[list[Affine]]:
+        """Slots of the block ``link``, coordinate by coordinate: from the state at contact to a later start.
+
+        start : y and d y/ds of what starts, and its duration [s].  times [s], travel : of two phases between,
+        whose ways are time x travel.  rate : ydot after them.
+        """
+        y, y1, _ = self.contact_state
+        out = []
+        for k in range(self.ny):
+            yk, rk, a, b, one, two, u0, u = (
+                e[k : k + 1] for e in (*start[:2], y, y1, *travel, self.u0[0], rate)
+            )
+            out.append([yk, rk, start[2], a, b, self.swing_T[0], *times, one, two, u0, u])
+        return out
+
     # ------------------------------------------------------------------ objective
     def _objective(self) -> tuple[Affine, Any, Array]:
         """- impulse [N s], plus a small price on accelerations and on sole wrenches.
@@ -519,15 +545,18 @@ class Transcription:
         return away - impulse, quadratic + sp.diags_array(diagonal), linear
 
     # ------------------------------------------------------------------ solution
+    def spline(
+        self, x: Array, control: Callable[[int], Affine], breaks: Array, duration: Group
+    ) -> CubicSpline:
+        """The spline that solver variables (n,) stand for."""
+        points = np.array([control(j).evaluate(x) for j in range(len(breaks) + 2)])
+        return CubicSpline(control=points, breaks=breaks, duration=float(duration.read(x)[0, 0]))
+
     def decode(self, x: Array) -> Plan:
         """The plan that solver variables (n,) stand for."""
         p, c = self.problem, self.coordinates
 
-        def spline(source: Callable[[int], Affine], breaks: Array, duration: Group) -> CubicSpline:
-            control = np.array([source(j).evaluate(x) for j in range(len(breaks) + 2)])
-            return CubicSpline(control=control, breaks=breaks, duration=float(duration.read(x)[0, 0]))
-
-        swing = spline(self.swing_control, self.swing_breaks, self.swing_T)
+        swing = self.spline(x, self.swing_control, self.swing_breaks, self.swing_T)
         follow, follow_w = self.follow.decode(x)
         brake, brake_w = self.brake.decode(x) if self.brake is not None else (None, None)
         outputs = self.program.outputs(x)

@@ -18,6 +18,20 @@ from impactopt.solution import Solution
 from impactopt.statics import static_wrenches
 from impactopt.validation import Simulation
 
+# a problem file, for tests whose solver is made up
+PROBLEM_FILE = """\
+[problem]
+name = "stand still"
+robot = "talos"
+striker = "right_hand"
+point_m = [0.6, -0.25, 1.1]
+normal = [1.0, 0.0, 0.0]
+[target]
+mass_kg = 5.0
+[contact]
+stiffness_N_m = 1e4
+damping_N_s_m = 300.0
+"""
 MASS, IMPULSE = 5.0, 10.0
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_solution import IMPULSE, FakeSolution, MissingSolution, still_problem, still_solution
+from fake_solution import IMPULSE, PROBLEM_FILE, FakeSolution, MissingSolution, still_problem, still_solution
 from typer.testing import CliRunner
 
 from impactopt.bench import replay, robustness, truth
@@ -23,19 +23,6 @@ from impactopt.program import Status
 from impactopt.solution import Solution
 from impactopt.validation import Simulation
 
-GOOD = """\
-[problem]
-name = "stand still"
-robot = "talos"
-striker = "right_hand"
-point_m = [0.6, -0.25, 1.1]
-normal = [1.0, 0.0, 0.0]
-[target]
-mass_kg = 5.0
-[contact]
-stiffness_N_m = 1e4
-damping_N_s_m = 300.0
-"""
 HEADS = {"seconds", "versions", "machine"}
 
 runner = CliRunner()
@@ -64,7 +51,7 @@ def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem, tmp_path: P
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     monkeypatch.setattr(truth, "VARIANTS", {})
     (tmp_path / "problems").mkdir()
-    (tmp_path / "problems" / "punch.toml").write_text(GOOD, encoding="utf-8")
+    (tmp_path / "problems" / "punch.toml").write_text(PROBLEM_FILE, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     return planner
 
@@ -88,7 +75,7 @@ def test_robustness_says_how_many_stand_and_keeps_every_draw() -> None:
 
 def test_the_robust_problem_is_measured_where_there_is_one(tmp_path: Path) -> None:
     assert robustness.run(quiet, draws=1, workers=1).numbers["problem"] == "problems/punch.toml"
-    (tmp_path / "problems" / "punch_robust.toml").write_text(GOOD, encoding="utf-8")
+    (tmp_path / "problems" / "punch_robust.toml").write_text(PROBLEM_FILE, encoding="utf-8")
     assert robustness.run(quiet, draws=1, workers=1).numbers["problem"] == "problems/punch_robust.toml"
 
 
@@ -159,7 +146,7 @@ def test_the_smallest_step_must_work(planner: Planner) -> None:
 
 # ---------------------------------------------------------------- truth
 def test_truth_has_a_row_for_every_problem_file(tmp_path: Path) -> None:
-    (tmp_path / "problems" / "another.toml").write_text(GOOD, encoding="utf-8")
+    (tmp_path / "problems" / "another.toml").write_text(PROBLEM_FILE, encoding="utf-8")
     rows = truth.run(quiet).numbers["rows"]
     assert [row["problem"] for row in rows] == ["another.toml", "punch.toml"]
     for row in rows:

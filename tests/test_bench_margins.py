@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_solution import IMPULSE, simulation_of, still_problem, still_solution
+from fake_solution import IMPULSE, PROBLEM_FILE, simulation_of, still_problem, still_solution
 from typer.testing import CliRunner
 
 from impactopt.bench import margins
@@ -27,19 +27,6 @@ from impactopt.solution import Solution
 from impactopt.terms import Balance, ContactWrenchCone, TorqueLimit
 from impactopt.validation import Conditions, Simulation
 
-GOOD = """\
-[problem]
-name = "stand still"
-robot = "talos"
-striker = "right_hand"
-point_m = [0.6, -0.25, 1.1]
-normal = [1.0, 0.0, 0.0]
-[target]
-mass_kg = 5.0
-[contact]
-stiffness_N_m = 1e4
-damping_N_s_m = 300.0
-"""
 VALUES = [(option, value) for option in OPTIONS for value in option.values]
 EXPECTED_SLIP = np.array([1e-3, 0.5, 3e-3, 2e-3])  # [m] of four draws; the second falls
 
@@ -111,7 +98,7 @@ def world(
         monkeypatch.setattr(margins, name, getattr(world, name))
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     (tmp_path / "problems").mkdir()
-    (tmp_path / "problems" / "punch.toml").write_text(GOOD, encoding="utf-8")
+    (tmp_path / "problems" / "punch.toml").write_text(PROBLEM_FILE, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     return world
 

@@ -1,0 +1,90 @@
+"""What every model of a collision takes and gives, from the point mass to full dynamics."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..contact import ContactLaw, Target
+from ..errors import InputError, check_array
+from ..robot import Robot
+from ..stance import Stance, usual_stance
+from .result import Collision
+
+__all__ = ["CollisionModel"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CollisionModel(ABC):
+    """A robot hits a target: what both do from contact to separation.
+
+    The servo holds on to a reference that coasts at the joint velocity at contact; the collision ends at
+    separation, for good.
+
+    Attributes
+    ----------
+    robot : with servo gains kp, kd and torque limits.
+    striker : name of the robot's striking point.
+    normal : (3,) unit vector along the blow, world axes; the target moves along it.
+    law, target : contact law, and what is hit.
+    stance : what holds the robot; None: all soles, or the fixed base.
+    horizon : [s] the contact should end before this.
+
+    Raises
+    ------
+    InputError : an unknown striker; a normal that is not a unit vector; a stance the robot cannot take; a
+        horizon that is not positive.
+    """
+
+    robot: Robot
+    striker: str
+    normal: ArrayLike
+    law: ContactLaw
+    target: Target
+    stance: Stance | None = None
+    horizon: float = 0.2
+
+    def __post_init__(self) -> None:
+        self.robot.striker(self.striker)
+        self.held_by.constraint_frames(self.robot)
+        normal = check_array("normal", self.normal, (3,))
+        if abs(np.linalg.norm(normal) - 1.0) > 1e-6:
+            raise InputError(
+                f"normal: not a unit vector (length {np.linalg.norm(normal):.6g}); divide it by its length"
+            )
+        object.__setattr__(self, "normal", normal)
+        if not check_array("horizon [s]", self.horizon, ()) > 0:
+            raise InputError(f"horizon [s]: {self.horizon:g}; give a number > 0")
+
+    @property
+    def held_by(self) -> Stance:
+        """The stance, or the robot's usual one."""
+        return usual_stance(self.robot) if self.stance is None else self.stance
+
+    @abstractmethod
+    def collide(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None = None,
+        *,
+        require_separation: bool = True,
+        **overrides: ArrayLike,
+    ) -> Collision:
+        """One collision, in numbers.
+
+        Parameters
+        ----------
+        q, v : (nq), (nv) at contact, Pinocchio's; v should leave what is held at rest.
+        torque : (n) [N m] feed-forward; a model that has none in it does not use it.
+        require_separation : refuse a contact that has not ended at the horizon.
+        overrides : numbers other than the defaults, by name (see `SDC.settings`).
+
+        Raises
+        ------
+        InputError : wrong shapes or NaN; a torque that the model needs and does not get; unknown settings; a
+            contact that does not end.
+        """

@@ -19,6 +19,7 @@ _EXPORTS = {
     "ContactWrenchCone": "terms",
     "FixedBase": "stance",
     "FreeMass": "contact.targets",
+    "FullDynamics": "reference",
     "ImpactProblem": "problem",
     "Incidence": "terms",
     "InputError": "errors",

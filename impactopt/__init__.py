@@ -49,6 +49,7 @@ _EXPORTS = {
     "load_record": "output",
     "load_robot": "presets",
     "solve": "planner",
+    "standin": "presets",
     "talos": "presets",
 }
 

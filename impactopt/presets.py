@@ -1,8 +1,11 @@
-"""Robots ready to use, on the URDFs of the package example-robot-data (`pip install 'impactopt[robots]'`)."""
+"""Robots ready to use: the stand-in for HRP-2, and those on the URDFs of the package example-robot-data.
+
+The stand-in needs no files; the others need `pip install 'impactopt[robots]'`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -10,10 +13,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impactopt._robot_build import joint_names, lock_joints
+from impactopt._standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, standin_model
 from impactopt.errors import InputError, did_you_mean
 from impactopt.robot import Robot, Sole, Striker
 
-__all__ = ["g1", "load_robot", "robot_names", "talos"]
+__all__ = ["g1", "load_robot", "robot_names", "standin", "talos"]
 
 
 def talos(**overrides: Any) -> Robot:
@@ -130,11 +135,76 @@ def g1(**overrides: Any) -> Robot:
     )
 
 
-_PRESETS: dict[str, Callable[..., Robot]] = {"talos": talos, "g1": g1}
+_HALF_SITTING = {  # of the left side; the right one is its mirror image
+    "hip_pitch": -0.35,
+    "knee": 0.7,
+    "ankle_pitch": -0.35,
+    "shoulder_pitch": 0.3,
+    "shoulder_roll": 0.15,
+    "elbow": -1.6,
+}
+
+
+def standin(
+    *, floating: bool = True, locked: Iterable[str] | Mapping[str, float] = (), **overrides: Any
+) -> Robot:
+    """A stand-in for the paper's robot, HRP-2: 58 kg, 28 joints and a free-flyer. It needs no files.
+
+    HRP-2's own description is not public. Torque and velocity limits, gear ratios, rotor inertias and soles
+    are HRP-2's from a public source (named in `_standin.py`), and so are 58 kg and 1.54 m. Lengths, the
+    masses of the links, inertias (of solid boxes) and position limits are *ours*: what is planned on the
+    stand-in is of HRP-2's class, not HRP-2's.
+
+    * Joints of a side: hip yaw, roll, pitch, knee, ankle pitch, roll; shoulder pitch, roll, yaw, elbow, wrist
+      yaw, pitch. Chest and head: yaw, pitch each. The grippers' are left out, as in the paper.
+    * Armature: rotor inertia x gear ratio^2, 0.011 to 1.01 kg m2.
+    * Servo: as OpenHRP3's sample controller: Kp 8000 N m/rad in legs and chest, 3000 in the arms, Kd 100 N m
+      s/rad in all of them; the neck, which is not in it, has the defaults of `Robot.from_model`.
+    * Soles: 0.230 x 0.131 m, 0.105 m below the ankle.
+    * Strikers `right_hand`, `left_hand`: front of the closed gripper, on the forearm's axis.
+    * Posture `half_sitting`: knees bent by 0.7 rad, soles flat, elbows bent, hands in front.
+
+    `floating` and `locked` are as of `Robot.from_urdf`; `overrides` go to `Robot.from_model`.
+    """
+    model = lock_joints(standin_model(floating=floating), locked)
+    joints = joint_names(model)
+    driven = [joint for joint in joints if not joint.startswith("head")]
+    arms = [joint for joint in driven if any(part in joint for part in ("shoulder", "elbow", "wrist"))]
+    posture = {
+        f"{side}_{joint}": sign * angle if joint.endswith("roll") else angle
+        for side, sign in (("left", 1.0), ("right", -1.0))
+        for joint, angle in _HALF_SITTING.items()
+    }
+    options: dict[str, Any] = {
+        "name": "standin",
+        "kp": {joint: 3000.0 if joint in arms else 8000.0 for joint in driven},
+        "kd": dict.fromkeys(driven, 100.0),
+        "soles": tuple(
+            Sole(
+                name=side,
+                frame=f"{side}_sole",
+                polygon=corners,
+                parent=f"{side}_ankle_roll",
+                placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, SOLE_HEIGHT])),
+            )
+            for side, corners in (("left", SOLE_CORNERS), ("right", (SOLE_CORNERS * [1, -1])[::-1]))
+        ),
+        "strikers": tuple(
+            Striker(
+                name=f"{side}_hand", frame=f"{side}_wrist_pitch", point=np.array([0.0, 0.0, -GRIPPER_LENGTH])
+            )
+            for side in ("right", "left")
+        ),
+        "postures": {"half_sitting": {joint: x for joint, x in posture.items() if joint in joints}},
+    }
+    return Robot.from_model(model, **{**options, **overrides})
+
+
+_PRESETS: dict[str, Callable[..., Robot]] = {"standin": standin, "talos": talos, "g1": g1}
 
 
 def load_robot(name: str, **overrides: Any) -> Robot:
-    """The preset of that name; `overrides` go to `Robot.from_urdf`."""
+    """The preset of that name; `overrides` go to `Robot.from_urdf` (`standin`: to `standin`)."""
     if name not in _PRESETS:
         raise InputError(
             f"no robot {name!r}{did_you_mean(name, _PRESETS)}; presets are {', '.join(_PRESETS)}"
@@ -152,6 +222,7 @@ def _robots() -> Path:
         package = distribution("example-robot-data")
     except PackageNotFoundError as error:
         raise InputError(
-            "presets need the package example-robot-data; run: pip install 'impactopt[robots]'"
+            "this robot needs the package example-robot-data; run: pip install 'impactopt[robots]'; "
+            "robot 'standin' needs nothing"
         ) from error
     return Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))

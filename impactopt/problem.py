@@ -148,6 +148,11 @@ class ImpactProblem:
                 f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
                 "(base_mass, base_inertia), which is for collision models"
             )
+        if self.stance.hand_frames(self.robot):
+            raise InputError(
+                f"a plan stands on soles only: give {type(self.stance).__name__} without hands, which are "
+                "for collision models"
+            )
         kinds = [type(t) for t in self.terms]
         for kind in kinds:
             if kinds.count(kind) > 1:

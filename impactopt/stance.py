@@ -30,9 +30,17 @@ class Stance(ABC):
         """Names of the soles that are held."""
         return tuple(sole.name for sole in self.soles(robot))
 
-    def constraint_frames(self, robot: Robot) -> tuple[str, ...]:
-        """Frames of the model that are held in all six directions."""
+    def sole_frames(self, robot: Robot) -> tuple[str, ...]:
+        """Frames of the soles that are held."""
         return tuple(sole.frame for sole in self.soles(robot))
+
+    def hand_frames(self, robot: Robot) -> tuple[str, ...]:
+        """Frames of the hands that are held; InputError for one that the robot has not."""
+        return ()
+
+    def constraint_frames(self, robot: Robot) -> tuple[str, ...]:
+        """Frames of the model that are held in all six directions: soles first, then hands."""
+        return self.sole_frames(robot) + self.hand_frames(robot)
 
     @property
     def compliance(self) -> NDArray[np.float64]:
@@ -43,12 +51,14 @@ class Stance(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class _OnSoles(Stance):
-    """Soles held exactly, or by a virtual base.
+    """Soles, and hands that support the robot, held exactly, or by a virtual base.
 
     Attributes
     ----------
-    base_mass, base_inertia : M_g [kg] and I_g [kg m2] added to each held sole (paper, eqs. 1, 2); None:
-        exact.
+    base_mass, base_inertia : M_g [kg] and I_g [kg m2] added to each held sole and hand (paper, eqs. 1, 2);
+        None: exact.
+    hands : names of strikers with which the robot holds on to the world, in all six directions (paper,
+        section II-A).
 
     Raises
     ------
@@ -57,8 +67,12 @@ class _OnSoles(Stance):
 
     base_mass: float | None = None
     base_inertia: float | None = None
+    hands: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.hands, (tuple, list)) or len(set(self.hands)) != len(self.hands):
+            raise InputError(f"hands: {self.hands!r}; give a tuple of strikers' names, each once")
+        object.__setattr__(self, "hands", tuple(self.hands))
         if (self.base_mass is None) != (self.base_inertia is None):
             raise InputError(
                 "virtual base: give both base_mass [kg] and base_inertia [kg m2], or neither (exact)"
@@ -68,6 +82,9 @@ class _OnSoles(Stance):
                 raise InputError(
                     f"virtual base: {name}: {value:g}; give a number > 0, or None for exactly held soles"
                 )
+
+    def hand_frames(self, robot: Robot) -> tuple[str, ...]:
+        return tuple(robot.striker(name).model_frame for name in self.hands)
 
     @property
     def compliance(self) -> NDArray[np.float64]:

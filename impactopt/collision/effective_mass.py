@@ -37,7 +37,7 @@ def effective_mass(robot: Robot, *, striker: str, normal: ArrayLike, stance: Sta
 
     def build() -> list[Any]:
         frozen = FrozenDynamics(robot, held_by, frame, bias=False, jdot=False)
-        m = frozen.function("frozen", ("m",))(frozen.q, np.zeros(robot.nv), n)
+        m = frozen.function("frozen", ("m",))(frozen.q, np.zeros(robot.nv), n, 0.0)
         return [ca.Function("effective_mass", [frozen.q], [1.0 / m], ["q"], ["mass"])]
 
     recipe = (model_hash(robot.model), frame, repr(held_by), held_by.constraint_frames(robot), tuple(n))

@@ -16,13 +16,13 @@ __all__ = ["first_event", "level_jet", "refine"]
 _BEYOND = 1e-5
 
 
-def level_jet(jet: Jet, level: Any, length: float) -> list[Any]:
+def level_jet(jet: Jet, level: Any, length: Any) -> list[Any]:
     """A jet that is zero where |value| is at `level`, on the side where the value is, or else is going."""
     side = ca.sign(ca.if_else(ca.fabs(jet[0]) > level, jet[0], value_at(jet, length)))
     return [side * jet[0] - level, *[side * x for x in jet[1:]]]
 
 
-def first_event(jets: Sequence[Jet], length: float) -> tuple[Any, Any]:
+def first_event(jets: Sequence[Jet], length: Any) -> tuple[Any, Any]:
     """(time [s] of the first sign change of any jet within `length`, 1 at this jet and 0 at the others).
 
     Sign changes are those between the polynomials' ends; one that is undone within the step goes unseen,
@@ -43,7 +43,7 @@ def first_event(jets: Sequence[Jet], length: float) -> tuple[Any, Any]:
     return first, ca.vertcat(*[which == i for i in range(len(jets))])
 
 
-def refine(jets: Sequence[Jet], length: float, first: Any, at: Any) -> Any:
+def refine(jets: Sequence[Jet], length: Any, first: Any, at: Any) -> Any:
     """Time [s] to just beyond the event that `first_event` has found, at most `length`.
 
     It is the result of Newton's last iteration, and so has the event time's true derivative even where

@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
+from ..contact import Target
 from ..rigid_body import RigidBody
+from .course import Course
 from .frozen import FrozenDynamics
-from .loop import run
-from .model import JointSpaceModel
+from .model import JointSpaceModel, shape_of
 from .outputs import HISTORIES, Outputs, frozen_for
 from .runge_kutta import rk4_step
 from .taylor import taylor_step
 
 if TYPE_CHECKING:
-    from .sdc import SDC
+    from .symbolic import SymbolicModel
 
 __all__ = [
     "METHODS",
@@ -25,47 +26,65 @@ __all__ = [
     "gradient_graph",
     "joint_space_model",
     "number_of_steps",
+    "target_yield",
 ]
 
 METHODS = {"events": taylor_step, "rk4": rk4_step}
 
 
-def joint_space_model(sdc: SDC, outputs: tuple[str, ...] = ()) -> JointSpaceModel:
-    """The collision in joint space, with what the outputs need in its state."""
+def joint_space_model(
+    collision: SymbolicModel, outputs: tuple[str, ...] = (), *, freezes: int = 0
+) -> JointSpaceModel:
+    """What the time loop integrates for these outputs."""
     return JointSpaceModel(
-        n=sdc.robot.n,
-        terms=sdc.terms,
-        law=sdc.law,
-        target=sdc.target,
-        settings=sdc.settings,
-        transition=sdc.joint_friction.transition,
+        n=collision.n_servos,
+        terms=collision.terms,
+        law=collision.law,
+        target=collision.target,
+        settings=collision.settings,
+        transition=collision.joint_friction.transition,
         peak="peak_force" in outputs,
-        second_integrals="displacement" in outputs,
+        second_integrals="configuration" in outputs or freezes > 0,
+        refrozen=freezes > 0,
     )
 
 
-def frozen_dynamics(sdc: SDC) -> FrozenDynamics:
+def frozen_dynamics(collision: SymbolicModel) -> FrozenDynamics:
     """Steps 1b and 2b."""
-    frame = sdc.robot.striker(sdc.striker).model_frame
-    return FrozenDynamics(sdc.robot, sdc.held_by, frame, bias=sdc.terms.bias, jdot=sdc.terms.jdot)
+    frame = collision.robot.striker(collision.striker).model_frame
+    terms = collision.terms
+    return FrozenDynamics(collision.robot, collision.held_by, frame, bias=terms.bias, jdot=terms.jdot)
 
 
-def number_of_steps(sdc: SDC) -> int:
-    """Steps that reach the horizon; where they end on events, with two events a joint on the way."""
-    steps = ceil(sdc.horizon / sdc.step - 1e-9)
-    return steps + (2 * sdc.robot.n + 4 if sdc.method == "events" else 0)
+def number_of_steps(collision: SymbolicModel, fraction: float = 1.0) -> int:
+    """Steps that reach this fraction of the horizon; where they end on events, with two events a joint on the
+    way."""
+    steps = ceil(fraction * collision.horizon / collision.step_length - 1e-9)
+    return steps + (2 * collision.n_servos + 4 if collision.stepping == "events" else 0)
 
 
-def collision_graph(sdc: SDC, outputs: tuple[str, ...], *, every: int = 1) -> Any:
+def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
+    """[1/kg] acceleration of the target's surface per contact force, at rest: one over a free mass."""
+    z, f = ca.SX.sym("z", target.n_states), ca.SX.sym("f")
+    symbols = {name: ca.SX.sym(name) for name in numbers}
+    states = [z[i] for i in range(target.n_states)]
+    rates = ca.vertcat(ca.SX(0, 1), *target.derivative(states, f, symbols))
+    acceleration = ca.mtimes(ca.jacobian(ca.SX(target.velocity(states, symbols)), z), rates)
+    slope = ca.densify(ca.jacobian(acceleration, f))
+    function = ca.Function("target_yield", [z, f, *symbols.values()], [slope])
+    return function(ca.DM.zeros(target.n_states), 0.0, *numbers.values())
+
+
+def collision_graph(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> Any:
     """ca.Function (q, v[, feedforward], *settings) -> outputs, differentiable, not compiled."""
-    inputs, out = _expressions(sdc, outputs, every)
+    inputs, out = _expressions(collision, outputs, every)
     return ca.Function("collision", list(inputs.values()), out, list(inputs), list(outputs))
 
 
-def gradient_graph(sdc: SDC, output: str) -> Any:
+def gradient_graph(collision: SymbolicModel, output: str) -> Any:
     """ca.Function (q, v[, feedforward], *settings) -> (output, d/dq (nv), d/dv (nv)), both in v's basis."""
-    inputs, (value,) = _expressions(sdc, (output,), 1)
-    rb = RigidBody(sdc.robot.model)
+    inputs, (value,) = _expressions(collision, (output,), 1)
+    rb = RigidBody(collision.robot.model)
     tangent = ca.Function("tangent", [rb.q], [rb.tangent_map()])
     # one sweep for both
     ((by_q, by_v),) = ca.reverse([value], [inputs["q"], inputs["v"]], [[ca.MX(1.0)]])
@@ -74,23 +93,28 @@ def gradient_graph(sdc: SDC, output: str) -> Any:
     return ca.Function("collision_gradient", list(inputs.values()), [value, by_q, by_v], list(inputs), names)
 
 
-def _expressions(sdc: SDC, outputs: tuple[str, ...], every: int) -> tuple[dict[str, Any], list[Any]]:
+def _expressions(
+    collision: SymbolicModel, outputs: tuple[str, ...], every: int
+) -> tuple[dict[str, Any], list[Any]]:
     """Inputs by name, and the outputs, MX."""
-    model, frozen = joint_space_model(sdc, outputs), frozen_dynamics(sdc)
+    model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
+    frozen = frozen_dynamics(collision)
     inputs = {"q": frozen.q, "v": frozen.v}
-    if sdc.terms.feedforward:
-        inputs["feedforward"] = ca.MX.sym("feedforward", sdc.robot.n)
-    inputs |= {key: ca.MX.sym(key, max(1, value.size)) for key, value in sdc.settings.items()}
+    if collision.terms.feedforward:
+        inputs["feedforward"] = ca.MX.sym("feedforward", collision.robot.n)
+    inputs |= {key: ca.MX.sym(key, *shape_of(value)) for key, value in collision.settings.items()}
     inputs["normal"] = frozen.normal
-    wanted = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs))))
-    values = frozen.function("frozen", wanted).call([frozen.q, frozen.v, frozen.normal])
-    data = dict(zip(wanted, values, strict=True)) | inputs
-    step = METHODS[sdc.method](model, sdc.step)
-    record = any(output in HISTORIES for output in outputs)
-    constants = [data[key] for key in model.data]
-    final, states = run(model, step, number_of_steps(sdc), constants, record=record)
-    if record and every > 1:
-        last = states.size2() - 1
-        states = states[:, [*range(0, last, every), last]]
-    made = Outputs(model, data, final, states, len(frozen.soles), frozen.velocity_change, frozen.v)
-    return inputs, [getattr(made, output) for output in outputs]
+    course = Course(
+        model,
+        frozen,
+        step=METHODS[collision.stepping](model, collision.step_length),
+        steps=lambda fraction: number_of_steps(collision, fraction),
+        horizon=collision.horizon,
+        freezes=collision.n_freezes,
+        wanted=frozen_for(outputs),
+        record=every if any(output in HISTORIES for output in outputs) else 0,
+    )
+    gives_way = target_yield(model.target, model.target_numbers(inputs))
+    stretches = course.run(inputs, gives_way)
+    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"])
+    return inputs, [ca.densify(getattr(made, output)) for output in outputs]

@@ -16,24 +16,22 @@ _BLOCK = 16
 
 
 def run(
-    model: JointSpaceModel, step: Any, steps: int, data: Sequence[Any], *, record: bool
+    model: JointSpaceModel, step: Any, start: Any, steps: int, data: Sequence[Any], *, record: bool
 ) -> tuple[Any, Any]:
-    """(final state, states at all steps) from the state at contact, MX.
+    """(final state, states at all steps) from the state `start`, MX.
 
     At least `steps` steps are made, rounded up to whole blocks; the states at all steps, (n_states, steps +
-    1), are in the graph only where `record` asks for them. After separation states repeat the last one.
+    1), are in the graph only where `record` asks for them. After the end states repeat the last one.
     """
     block = _block(model, step, record)
     still = _still(model, record)
     advance = ca.Function.if_else("advance", block, still)
-    in_contact, small = (
-        _in_contact(model),
-        [x for x, name in zip(data, model.data, strict=True) if name != "A"],
-    )
-    y = ca.MX(model.start())
+    running = _running(model)
+    small = [x for x, name in zip(data, model.data, strict=True) if name != "A"]
+    y = ca.MX(start)
     history = [y]
     for _ in range(-(-steps // _BLOCK)):
-        out = advance.call([in_contact(y, *small), y, *data])
+        out = advance.call([running(y, *small), y, *data])
         y = out[0]
         history += out[1:]
     return y, ca.horzcat(*history) if record else None
@@ -54,6 +52,6 @@ def _still(model: JointSpaceModel, record: bool) -> Any:
     return ca.Function("still", [y, *data], out)
 
 
-def _in_contact(model: JointSpaceModel) -> Any:
+def _running(model: JointSpaceModel) -> Any:
     y, data = ca.SX.sym("y", model.n_states), model.small_symbols()
-    return ca.Function("in_contact", [y, *data.values()], [model.phase(y, data)[1]])
+    return ca.Function("running", [y, *data.values()], [model.running(y, data)])

@@ -14,15 +14,15 @@ from ..contact import ContactLaw, Target
 from .settings import Settings
 from .terms import Terms
 
-__all__ = ["JointSpaceModel"]
+__all__ = ["JointSpaceModel", "shape_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointSpaceModel:
     """What happens between hand and target with the robot's frozen dynamics.
 
-    Its state y holds time integrals only, so that what is linear in them (momentum, work of constraints) is
-    kept exactly by any Runge-Kutta or Taylor method:
+    Its state y holds time integrals since the freeze, so that what is linear in them (momentum, work of
+    constraints) is kept exactly by any Runge-Kutta or Taylor method:
 
         time [s]; penetration [m]; impulse [N s] = integral of f; target's state; and, where they are asked
         for or needed, peak force [N], torque (n) [N m s] = integral of tau - F, deviation (n) [rad] =
@@ -30,11 +30,13 @@ class JointSpaceModel:
 
     Attributes
     ----------
-    n : number of joints.
+    n : number of joints; 0 for a point mass.
     terms, law, target, settings : as in `SDC`.
     transition : [rad/s], of the joint friction.
     peak : keep the largest force in the state.
     second_integrals : keep torque2 and impulse2 in the state.
+    refrozen : whether there are several freezes. Then `velocity_before` (n), the change of the joint velocity
+        from contact to the freeze, and `until` [s], when the freeze ends, are among the data.
     """
 
     n: int
@@ -45,6 +47,7 @@ class JointSpaceModel:
     transition: float
     peak: bool = False
     second_integrals: bool = False
+    refrozen: bool = False
 
     # ------------------------------------------------------------ layout of state and data
     @cached_property
@@ -71,11 +74,10 @@ class JointSpaceModel:
     @property
     def frozen(self) -> tuple[str, ...]:
         """Attributes of FrozenDynamics that the model needs."""
-        names = ["A", "s", "m", "hand_speed"]
+        names = ["A", "s"] if self.n else []
+        names += ["m", "hand_speed"]
         if self.terms.bias or self.terms.jdot:
             names += ["d", "e"]
-        if self.terms.friction:
-            names.append("joint_velocity")
         return tuple(names)
 
     @cached_property
@@ -84,9 +86,13 @@ class JointSpaceModel:
         n = self.n
         shapes = {"A": (n * (n + 1) // 2, 1), "m": (1, 1), "hand_speed": (1, 1), "e": (1, 1)}
         out = {name: shapes.get(name, (n, 1)) for name in self.frozen}
+        if self.refrozen:
+            out |= {"velocity_before": (n, 1), "until": (1, 1)}
+        if self.terms.friction:
+            out["joint_velocity"] = (n, 1)
         if self.terms.feedforward:
             out["feedforward"] = (n, 1)
-        return out | {name: (max(1, v.size), 1) for name, v in self.settings.items() if name != "normal"}
+        return out | {name: shape_of(v) for name, v in self.settings.items() if name != "normal"}
 
     def symbols(self, kind: Any = ca.SX) -> dict[str, Any]:
         """A symbol for each of the data."""
@@ -117,11 +123,14 @@ class JointSpaceModel:
 
     # ------------------------------------------------------------ one instant, or several: one a column of y
     def velocity_change(self, y: Any, data: dict[str, Any]) -> Any:
-        """Joint velocities less those at contact (n) [rad/s]: integral of eq. (9). Linear in y."""
-        return self.velocity_from(self.part(y, "torque"), self.part(y, "impulse"), self.part(y, "time"), data)
+        """Joint velocities less those at contact (n) [rad/s]: integral of eq. (9)."""
+        u = self.velocity_from(self.part(y, "torque"), self.part(y, "impulse"), self.part(y, "time"), data)
+        return u + _spread(data["velocity_before"], u) if self.refrozen else u
 
     def velocity_from(self, torque: Any, impulse: Any, time: Any, data: dict[str, Any]) -> Any:
-        """`velocity_change` from the state's parts that it depends on."""
+        """Joint velocities less those at the freeze, from the state's parts that they depend on. Linear."""
+        if not self.n:
+            return ca.mtimes(ca.DM(0, 1), impulse)
         u = self._product(data["A"], torque) - ca.mtimes(data["s"], impulse)
         return u + ca.mtimes(data["d"], time) if "d" in data else u
 
@@ -140,8 +149,10 @@ class JointSpaceModel:
         return ca.Function("product", [lower, x], [ca.mtimes(A, x)])
 
     def hand_speed_change(self, y: Any, data: dict[str, Any]) -> Any:
-        """n.v_hand less what it was at contact [m/s]: integral of eqs. (15), (16). Linear in y."""
-        w = ca.mtimes(data["s"].T, self.part(y, "torque")) - data["m"] * self.part(y, "impulse")
+        """n.v_hand less what it was at the freeze [m/s]: integral of eqs. (15), (16). Linear in y."""
+        w = -data["m"] * self.part(y, "impulse")
+        if self.n:
+            w = ca.mtimes(data["s"].T, self.part(y, "torque")) + w
         return w + data["e"] * self.part(y, "time") if "e" in data else w
 
     def target_state(self, y: Any) -> list[Any]:
@@ -160,10 +171,21 @@ class JointSpaceModel:
         compressing = rate > 0
         return compressing, ca.logic_or(compressing, force > 0)
 
+    def running(self, y: Any, data: dict[str, Any]) -> Any:
+        """Whether there is still something to integrate, 0 or 1: in contact, and before the freeze ends."""
+        contact = self.phase(y, data)[1]
+        return ca.logic_and(contact, self.part(y, "time") < data["until"]) if self.refrozen else contact
+
+    def longest(self, y: Any, data: dict[str, Any], length: float) -> Any:
+        """[s] a step of at most `length` may take, so that it ends with the freeze."""
+        return ca.fmin(length, data["until"] - self.part(y, "time")) if self.refrozen else length
+
     def servo(self, y: Any, u: Any, data: dict[str, Any]) -> Any:
         """The servo's feedback torque (n) [N m] at velocity change u (eqs. 10, 11). Linear in y and u."""
-        tau = -_spread(data["kd"], u) * u
-        return tau + _spread(data["kp"], u) * self.part(y, "deviation") if self.terms.stiffness else tau
+        if not self.n:
+            return u
+        tau = -_gain(data["kd"], u)
+        return tau + _gain(data["kp"], self.part(y, "deviation")) if self.terms.stiffness else tau
 
     def with_feedforward(self, tau: Any, data: dict[str, Any]) -> Any:
         return tau + _spread(data["feedforward"], tau) if self.terms.feedforward else tau
@@ -180,6 +202,16 @@ class JointSpaceModel:
         rate = _spread(data["joint_velocity"], u) + u
         sign = ca.fmax(ca.fmin(rate / self.transition, 1.0), -1.0)
         return _spread(data["viscous"], u) * rate + _spread(data["coulomb"], u) * sign
+
+
+def shape_of(value: NDArray[np.float64]) -> tuple[int, int]:
+    """Shape of a setting as a matrix."""
+    return (value.shape[0], value.shape[1]) if value.ndim == 2 else (max(1, value.size), 1)
+
+
+def _gain(gain: Any, x: Any) -> Any:
+    """Gain times x, the gain a matrix or one number a joint."""
+    return _spread(gain, x) * x if gain.size2() == 1 else ca.mtimes(gain, x)
 
 
 def _spread(column: Any, like: Any) -> Any:

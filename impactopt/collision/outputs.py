@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 
 from ..errors import InputError, did_you_mean
+from .course import Stretch
 from .model import JointSpaceModel
 
-__all__ = ["HISTORIES", "OF_SOLES", "OUTPUTS", "SCALARS", "Outputs", "check_outputs", "frozen_for"]
+__all__ = [
+    "HISTORIES",
+    "OF_SERVO",
+    "OF_SOLES",
+    "OUTPUTS",
+    "SCALARS",
+    "Outputs",
+    "check_outputs",
+    "frozen_for",
+]
 
 # name: what it is
 OUTPUTS = {
@@ -21,7 +30,8 @@ OUTPUTS = {
     "energy": "[J] given to the target",
     "separated": "1 where the contact ended within the horizon, else 0",
     "velocity": "(nv) after the collision, Pinocchio's v",
-    "displacement": "(nv) integral of v over the collision: q after it is pin.integrate(q, displacement)",
+    "configuration": "(nq) after the collision, Pinocchio's q",
+    "target_result": "the target's `results` at separation",
     "time": "(k) [s] since contact",
     "force": "(k) [N] on the target along the normal",
     "penetration": "(k) [m] of the contact law",
@@ -31,12 +41,15 @@ OUTPUTS = {
     "torque": "(n, k) [N m] of the servo",
     "demand": "(n, k) [N m] of the servo before saturation",
     "sole_wrench": "(6 a held sole, k) [N, N m] of the ground on each sole, world axes, at the sole's frame",
+    "hand_wrench": "(6 a held hand, k) [N, N m] of the world on each, world axes, at its striking point",
     "ground_wrench": "(6, k) [N, N m] of the ground on the robot, world axes, about the world's origin",
     "zmp": "(2, k) [m] x and y of the zero-moment point on the ground z = 0",
 }
 SCALARS = ("impulse", "peak_force", "duration", "energy", "separated")
 HISTORIES = tuple(OUTPUTS)[tuple(OUTPUTS).index("time") :]
 OF_SOLES = ("sole_wrench", "ground_wrench", "zmp")
+# what a point mass knows nothing of
+OF_SERVO = ("joint_velocity", "torque", "demand", "hand_wrench", *OF_SOLES)
 
 
 def check_outputs(names: tuple[str, ...]) -> None:
@@ -50,10 +63,13 @@ def check_outputs(names: tuple[str, ...]) -> None:
 
 def frozen_for(names: tuple[str, ...]) -> tuple[str, ...]:
     """Attributes of FrozenDynamics that these outputs need besides what the model does."""
-    wrench = {*OF_SOLES, "velocity", "displacement"} & {*names}
+    motion = {"velocity", "configuration"} & {*names}
+    wrench = {*OF_SOLES, "hand_wrench"} & {*names}
     whole = {"ground_wrench", "zmp"} & {*names}
-    return (("L_tau", "L_f", "L_0") if wrench else ()) + (
-        ("sole_positions", "unmodelled_wrench") if whole else ()
+    return (
+        (("L_tau", "L_f", "L_0") if motion or wrench else ())
+        + (("drift_velocity",) if motion else ())
+        + (("sole_positions", "unmodelled_wrench") if whole else ())
     )
 
 
@@ -63,78 +79,89 @@ class Outputs:
     Parameters
     ----------
     model : the collision in joint space.
-    data : its data by name, and the outputs of FrozenDynamics that `frozen_for` asks for.
-    final, states : last state (n_states), and states at all wanted instants (n_states, k) or None.
-    soles : number of held soles.
-    velocity_change : function (torque, force, sole wrenches, time) -> change of v or position.
+    stretches : what each freeze has led to.
+    soles, held : number of held soles, and of all that is held, the soles first.
     v : velocity at contact (nv).
     """
 
     def __init__(
-        self,
-        model: JointSpaceModel,
-        data: dict[str, Any],
-        final: Any,
-        states: Any,
-        soles: int,
-        velocity_change: Callable[..., Any],
-        v: Any,
+        self, model: JointSpaceModel, stretches: list[Stretch], soles: int, held: int, v: Any
     ) -> None:
-        self._model, self._data, self._final, self._states = model, data, final, states
-        self._n_soles, self._velocity_change, self._v = soles, velocity_change, v
+        self._model, self._stretches, self._last = model, stretches, stretches[-1]
+        self._instants = [Instants(model, stretch, soles, held, v) for stretch in stretches]
 
-    # ------------------------------------------------------------ over the collision
+    def __getattr__(self, name: str) -> Any:
+        if name not in HISTORIES:
+            raise AttributeError(name)
+        rows = ca.horzcat(*[getattr(instants, name) for instants in self._instants])
+        return rows.T if rows.size1() == 1 else rows
+
+    def _sum(self, part: str) -> Any:
+        return sum(self._model.part(stretch.final, part) for stretch in self._stretches)
+
     @cached_property
     def impulse(self) -> Any:
-        return self._model.part(self._final, "impulse")
+        return self._sum("impulse")
 
     @cached_property
     def peak_force(self) -> Any:
-        return self._model.part(self._final, "peak")
+        return self._model.part(self._last.final, "peak")
 
     @cached_property
     def duration(self) -> Any:
-        return self._model.part(self._final, "time")
+        return self._sum("time")
+
+    def _target(self, y: Any) -> tuple[list[Any], dict[str, Any]]:
+        return self._model.target_state(y), self._model.target_numbers(self._last.data)
 
     @cached_property
     def energy(self) -> Any:
-        numbers = self._model.target_numbers(self._data)
-        energies = [
-            self._model.target.energy(self._model.target_state(y), numbers)
-            for y in (self._final, ca.DM(self._model.start()))
-        ]
-        return energies[0] - energies[1]
+        ends = (self._last.final, ca.DM(self._model.start()))
+        energies = [self._model.target.energy(*self._target(y)) for y in ends]
+        return ca.MX(energies[0] - energies[1])
+
+    @cached_property
+    def target_result(self) -> Any:
+        return ca.vertcat(*self._model.target.result(*self._target(self._last.final)))
 
     @cached_property
     def separated(self) -> Any:
-        return 1 - self._model.phase(self._final, self._data)[1]
+        """No longer in contact at the end of any freeze."""
+        contact = ca.MX(1.0)
+        for stretch in self._stretches:
+            contact *= self._model.phase(stretch.final, stretch.data)[1]
+        return 1 - contact
 
     @cached_property
     def velocity(self) -> Any:
-        return self._v + self._change("torque", "impulse", self.duration)
+        return self._last.v_after()
 
     @cached_property
-    def displacement(self) -> Any:
-        return self._v * self.duration + self._change("torque2", "impulse2", self.duration**2 / 2)
+    def configuration(self) -> Any:
+        return self._last.q_after()
 
-    def _change(self, torque: str, impulse: str, time: Any) -> Any:
-        tau, f = self._model.part(self._final, torque), self._model.part(self._final, impulse)
-        return self._velocity_change(tau, f, self._wrench(tau, f, time), time)
 
-    # ------------------------------------------------------------ at the steps
+class Instants:
+    """Histories within one stretch, one instant a column."""
+
+    def __init__(self, model: JointSpaceModel, stretch: Stretch, soles: int, held: int, v: Any) -> None:
+        self._model, self._data, self._states = model, stretch.data, stretch.states
+        self._since = stretch.since
+        self._n_soles, self._n_held, self._v = soles, held, v
+
     def _row(self, name: str) -> Any:
         return self._model.part(self._states, name)
 
     @cached_property
     def time(self) -> Any:
-        return self._row("time").T
+        return self._since + self._row("time")
 
     @cached_property
     def penetration(self) -> Any:
-        return self._row("penetration").T
+        return self._row("penetration")
 
     @cached_property
-    def _force(self) -> Any:
+    def force(self) -> Any:
         model = self._model
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
         numbers = {name: ca.SX.sym(name) for name in model.law.parameters}
@@ -145,17 +172,14 @@ class Outputs:
         return law.map(columns)(self._row("penetration"), rates, *values)
 
     @cached_property
-    def force(self) -> Any:
-        return self._force.T
-
-    @cached_property
     def hand_speed(self) -> Any:
-        return (self._model.hand_speed_change(self._states, self._data) + self._data["hand_speed"]).T
+        return self._model.hand_speed_change(self._states, self._data) + self._data["hand_speed"]
 
     @cached_property
     def target_speed(self) -> Any:
         model = self._model
-        return model.target.velocity(model.target_state(self._states), model.target_numbers(self._data)).T
+        speed = model.target.velocity(model.target_state(self._states), model.target_numbers(self._data))
+        return speed + ca.MX.zeros(1, self._states.size2())
 
     @cached_property
     def _joint_change(self) -> Any:
@@ -177,16 +201,24 @@ class Outputs:
 
     # ------------------------------------------------------------ ground
     def _wrench(self, torque: Any, force: Any, time: Any) -> Any:
-        """Sole wrenches for torques (n, k), forces (1, k) and drift's weight (1, k); or their integrals."""
+        """Wrenches of all that is held for torques (n, k), forces (1, k) and the drift's weight (1, k)."""
         data = self._data
         return ca.mtimes(data["L_tau"], torque) - ca.mtimes(data["L_f"], force) + ca.mtimes(data["L_0"], time)
 
     @cached_property
-    def sole_wrench(self) -> Any:
+    def _held_wrench(self) -> Any:
         torque = self.torque
         if self._model.terms.friction:
             torque = torque - self._model.friction(self._joint_change, self._data)
-        return self._wrench(torque, self._force, ca.DM.ones(1, torque.size2()))
+        return self._wrench(torque, self.force, ca.DM.ones(1, torque.size2()))
+
+    @cached_property
+    def sole_wrench(self) -> Any:
+        return self._held_wrench[: 6 * self._n_soles, :]
+
+    @cached_property
+    def hand_wrench(self) -> Any:
+        return self._held_wrench[6 * self._n_soles :, :]
 
     @cached_property
     def ground_wrench(self) -> Any:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .outputs import HISTORIES, SCALARS
+from ..contact import Target
+from .outputs import HISTORIES, OUTPUTS, SCALARS
 
 __all__ = ["Collision"]
 
@@ -28,16 +29,19 @@ class Collision:
     energy : [J] given to the target.
     separated : whether the contact ended within the horizon.
     velocity : (nv) Pinocchio's v after the collision.
-    displacement : (nv) integral of v over the collision; the configuration after it is `pin.integrate(q,
-        displacement)`.
+    configuration : (nq) Pinocchio's q after the collision.
+    target_result : what the target says of itself at separation, by the names in its `results`.
     time : (k) [s] since contact.
     force : (k) [N] on the target along the normal.
     penetration : (k) [m] of the contact law.
     hand_speed, target_speed : (k) [m/s] along the normal.
     joint_velocity : (k, n) [rad/s].
-    torque, demand : (k, n) [N m] of the servo, and what it would be without saturation.
+    torque, demand : (k, n) [N m] of the servo, and what it would be without saturation. These, the joint
+        velocities and all wrenches are None of a point mass, which knows nothing of them.
     sole_wrench : (k, soles, 6) [N, N m] of the ground on each held sole, world axes, at the sole's frame;
         in the stance's order of soles. None on a fixed base.
+    hand_wrench : (k, hands, 6) [N, N m] of the world on each held hand, world axes, at its striking point;
+        in the stance's order of hands. None where none is held.
     ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None
         on a fixed base.
     zmp : (k, 2) [m] x and y of the zero-moment point on the ground z = 0; None on a fixed base.
@@ -49,33 +53,40 @@ class Collision:
     energy: float
     separated: bool
     velocity: Array
-    displacement: Array
+    configuration: Array
+    target_result: dict[str, float]
     time: Array
     force: Array
     penetration: Array
     hand_speed: Array
     target_speed: Array
-    joint_velocity: Array
-    torque: Array
-    demand: Array
+    joint_velocity: Array | None
+    torque: Array | None
+    demand: Array | None
     sole_wrench: Array | None
+    hand_wrench: Array | None
     ground_wrench: Array | None
     zmp: Array | None
 
     @classmethod
-    def from_outputs(cls, found: dict[str, Array]) -> Collision:
-        """From the arrays of a collision function, without what repeats itself after separation."""
+    def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
+        """From the arrays of a collision function, without instants that repeat the one before."""
         time = found["time"].ravel()
-        k = int(np.searchsorted(time, time[-1])) + 1
+        kept = np.concatenate([[True], np.diff(time) > 0])
         out: dict[str, Any] = {}
         for name, value in found.items():
             if name in HISTORIES:
-                out[name] = value.ravel()[:k] if value.shape[1] == 1 else np.ascontiguousarray(value[:, :k].T)
+                columns = value.T if value.shape == (time.size, 1) else value
+                rows = np.ascontiguousarray(columns[:, kept].T)
+                out[name] = rows.ravel() if OUTPUTS[name].startswith("(k)") else rows
             else:
                 out[name] = float(value.item()) if name in SCALARS else value.ravel()
         out["separated"] = bool(round(out["separated"]))
+        given = out.pop("target_result", np.zeros(0))
+        out["target_result"] = dict(zip(target.results, map(float, given), strict=True))
         for name in HISTORIES:
             out.setdefault(name, None)
-        if out["sole_wrench"] is not None:
-            out["sole_wrench"] = out["sole_wrench"].reshape(k, -1, 6)
+        for name in ("sole_wrench", "hand_wrench"):
+            if out[name] is not None:
+                out[name] = out[name].reshape(int(kept.sum()), -1, 6)
         return cls(**out)

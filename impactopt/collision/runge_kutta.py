@@ -18,14 +18,15 @@ def rk4_step(model: JointSpaceModel, length: float) -> Any:
     """ca.Function step(y, *data) -> y `length` [s] later; y itself after separation."""
     y, data, u = ca.SX.sym("y", model.n_states), model.small_symbols(), ca.SX.sym("u", model.n)
     rate = ca.Function("rate", [y, *data.values(), u], [rate_of_change(model, y, u, data)])
-    in_contact = ca.Function("in_contact", [y, *data.values()], [model.phase(y, data)[1]])
+    time = model.longest(y, data, length) * model.running(y, data)
+    step_length = ca.Function("step_length", [y, *data.values()], [time])
     Y, D = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
     small = [D[name] for name in data]
 
     def slope(state: Any) -> Any:
         return rate(state, *small, model.velocity_change(state, D))
 
-    h = length * in_contact(Y, *small)
+    h = step_length(Y, *small)
     k1 = slope(Y)
     k2 = slope(Y + h / 2 * k1)
     k3 = slope(Y + h / 2 * k2)

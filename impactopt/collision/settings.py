@@ -13,7 +13,7 @@ from ..errors import InputError, check_array, did_you_mean
 from ..robot import Robot
 from .terms import JointFriction, Terms
 
-__all__ = ["Settings"]
+__all__ = ["Settings", "servo_settings"]
 
 Array = NDArray[np.float64]
 
@@ -28,30 +28,19 @@ _NO_LIMIT = 1e12  # [N m]
 class Settings(Mapping[str, Array]):
     """Defaults of a collision's numbers by input name, in the order of the inputs; only those its terms need.
 
-    normal (3); contact_<number of the law>; target_<number of the target>; kd (n); kp (n) with servo
-    stiffness; torque_limit (n) with saturation; viscous, coulomb (n) with friction.
+    normal (3); contact_<number of the law>; target_<number of the target>; and with a servo
+    (`servo_settings`) kd; kp with servo stiffness; torque_limit (n) with saturation; viscous, coulomb (n)
+    with friction. kp and kd are (n), or (n, n) where the model was given matrices.
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        law: ContactLaw,
-        target: Target,
-        normal: ArrayLike,
-        terms: Terms,
-        friction: JointFriction,
+        self, law: ContactLaw, target: Target, normal: ArrayLike, servo: Mapping[str, ArrayLike]
     ) -> None:
         self._law, self._target = law, target
         values: dict[str, Any] = {"normal": normal}
         values |= {f"contact_{name}": number for name, number in law.parameters.items()}
         values |= {f"target_{name}": number for name, number in target.parameters.items()}
-        values["kd"] = robot.kd
-        if terms.stiffness:
-            values["kp"] = robot.kp
-        if terms.saturation:
-            values["torque_limit"] = robot.torque_limit
-        if terms.friction:
-            values["viscous"], values["coulomb"] = friction.arrays(robot.n)
+        values |= servo
         self._values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         self._values = {name: self._check(name, value) for name, value in self._values.items()}
 
@@ -75,7 +64,7 @@ class Settings(Mapping[str, Array]):
 
     def _check(self, name: str, value: ArrayLike) -> Array:
         shape = (3,) if name == "normal" else self._values[name].shape
-        if shape and name != "normal" and np.ndim(value) == 0:
+        if len(shape) == 1 and name != "normal" and np.ndim(value) == 0:
             value = np.full(shape, value)
         array = check_array(name, value, shape, finite=name != "torque_limit")
         if name == "torque_limit":
@@ -84,6 +73,12 @@ class Settings(Mapping[str, Array]):
             raise InputError(
                 f"normal: not a unit vector (length {np.linalg.norm(array):.6g}); divide it by its length"
             )
+        if name in ("kp", "kd") and array.ndim == 2:
+            # it may not feed energy
+            least = float(np.linalg.eigvalsh((array + array.T) / 2).min())
+            if least < -1e-9 * np.abs(array).max():
+                raise InputError(f"{name}: not positive semidefinite, it has the eigenvalue {least:.3g}")
+            return array
         sign = _SIGN.get(name, "")
         if (sign and (array < 0).any()) or (sign == "> 0" and (array == 0).any()):
             raise InputError(f"{name}: has {array.min():g}; all must be {sign}")
@@ -101,3 +96,31 @@ class Settings(Mapping[str, Array]):
 
     def __len__(self) -> int:
         return len(self._values)
+
+
+def servo_settings(
+    robot: Robot,
+    terms: Terms,
+    friction: JointFriction,
+    kp: ArrayLike | None = None,
+    kd: ArrayLike | None = None,
+) -> dict[str, ArrayLike]:
+    """The joints' numbers that these terms need; gains are the robot's unless given: one number for all
+    joints, (n), or (n, n)."""
+    values: dict[str, ArrayLike] = {"kd": _gain("kd", kd, robot.kd)}
+    if terms.stiffness:
+        values["kp"] = _gain("kp", kp, robot.kp)
+    if terms.saturation:
+        values["torque_limit"] = robot.torque_limit
+    if terms.friction:
+        values["viscous"], values["coulomb"] = friction.arrays(robot.n)
+    return values
+
+
+def _gain(name: str, given: ArrayLike | None, own: Array) -> Array:
+    if given is None:
+        return own
+    value, n = np.asarray(given, dtype=float), own.size
+    if value.ndim == 0:
+        value = np.full(n, float(value))
+    return check_array(name, value, (n,) * value.ndim)

@@ -1,10 +1,11 @@
 """Steps 3b to 7b of the paper as Taylor steps that end on events.
 
 Between events (end of compression, separation, a joint entering or leaving saturation or its friction's
-transition band) the equations are smooth, and linear but for the contact law. So a step takes the phase at
-its start, computes the state's first time derivatives, looks along Taylor's polynomials for the first event,
-and ends there or after its full length. Each order costs one product with the robot's inverse inertia, as a
-stage of a Runge-Kutta method does; for linear equations of order four it is the classical one.
+transition band, a switch of the target) the equations are smooth, and linear but for law and target. So a
+step takes the phase at its start, computes the state's first time derivatives, looks along Taylor's
+polynomials for the first event, and ends there or after its full length. Each order costs one product with
+the robot's inverse inertia, as a stage of a Runge-Kutta method does; for linear equations of order four it is
+the classical one.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ def taylor_step(model: JointSpaceModel, length: float) -> Any:
     """ca.Function step(y, *data) -> y at the next event, or `length` [s] later; y itself after separation."""
     y, data = ca.SX.sym("y", model.n_states), model.small_symbols()
     motion = _Motion(model, y, data)
-    events = motion.events(length)
+    longest = model.longest(y, data, length)
+    events = motion.events(longest)
     time, at = ca.SX.sym("time"), ca.SX.sym("at", len(events))
-    h = motion.contact * refine(events, length, time, at)
+    h = model.running(y, data) * refine(events, longest, time, at)
     y_next = model.join({name: value_at(jet, h) for name, jet in motion.jets.items()})
 
     # A tau stays one product in the code, between functions for all that is done joint by joint; and the
     # search for events, whose result `refine` makes differentiable, is kept out of derivatives
     known = [y, *data.values()]
     search = ca.Function(
-        "search", [*known, *motion.symbols], [*first_event(events, length)], {"is_diff_out": [False, False]}
+        "search", [*known, *motion.symbols], [*first_event(events, longest)], {"is_diff_out": [False, False]}
     )
     finish = ca.Function("finish", [*known, *motion.symbols, time, at], [y_next])
     Y, D = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
@@ -45,7 +47,8 @@ def taylor_step(model: JointSpaceModel, length: float) -> Any:
     made: list[Any] = []
     for k in range(ORDER):
         stage = ca.Function(f"stage_{k}", [*known, *motion.symbols[: 3 * k + 1]], motion.stages[k])
-        made.append(model.velocity_from(torque, impulse, time_passed, D))
+        u = model.velocity_from(torque, impulse, time_passed, D)
+        made.append(u + D["velocity_before"] if model.refrozen and k == 0 else u)
         torque, impulse = stage(*given, *made)
         made += [torque, impulse]
         time_passed = float(k == 0)
@@ -68,7 +71,7 @@ class _Motion:
 
     def __init__(self, model: JointSpaceModel, y: Any, data: dict[str, Any]) -> None:
         self.model, self.data = model, data
-        self.compressing, self.contact = model.phase(y, data)
+        self.compressing, _ = model.phase(y, data)
         self.jets: dict[str, list[Any]] = {name: [model.part(y, name)] for name in model.layout}
         self.jets["time"].append(1.0)
         self.target: list[list[Any]] = [[self.jets["target"][0][i]] for i in range(model.target.n_states)]
@@ -152,7 +155,7 @@ class _Motion:
         self.joint_rates.append(u)
         return tau - (data["viscous"] + (1 - self.sliding) * data["coulomb"] / model.transition) * u
 
-    def events(self, length: float) -> list[Jet]:
+    def events(self, length: Any) -> list[Jet]:
         """Jets that cross zero at the end of the present phase."""
         model = self.model
         # the force ends restitution; while compressing it stands aside, at a constant
@@ -163,4 +166,17 @@ class _Motion:
                 jets.append(level_jet([x[i] for x in self.demands], self.data["torque_limit"][i], length))
             if model.terms.friction:
                 jets.append(level_jet([x[i] for x in self.joint_rates], model.transition, length))
-        return jets
+        return [*jets, *self._target_switches()]
+
+    def _target_switches(self) -> list[Jet]:
+        """Jets of the target's switches, each of the piece that the step starts in."""
+        target, numbers = self.model.target, self.model.target_numbers(self.data)
+        known = [self.forces, *self.target]
+        pieces = range(len(target.switches([jet[0] for jet in self.target], self.forces[0], numbers)))
+        return [
+            [
+                derivative(lambda f, *z, i=i: target.switches(z, f, numbers)[i], known, k)
+                for k in range(ORDER + 1)
+            ]
+            for i in pieces
+        ]

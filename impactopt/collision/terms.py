@@ -41,6 +41,11 @@ class Terms:
             stiffness=False, feedforward=False, saturation=True, friction=friction, bias=False, jdot=False
         )
 
+    @classmethod
+    def none(cls) -> Terms:
+        """Nothing but the servo's damping."""
+        return cls(stiffness=False, feedforward=False, saturation=False, bias=False, jdot=False)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointFriction:

@@ -159,6 +159,13 @@ class RigidBody:
         """
         return self._coordinates.tangent_map()
 
+    def integrate(self, d: Any) -> Any:
+        """q, SX (nq), after moving with the constant velocity d (nv) for one second, as pin.integrate.
+
+        For base="quaternion" only.
+        """
+        return self._coordinates.integrate(as_sx("d", d))
+
     def from_pin(self, q: ArrayLike) -> NDArray[np.float64]:
         """These coordinates, (nq), of Pinocchio's q, (model.nq)."""
         return self._coordinates.from_pin(q)

@@ -126,6 +126,33 @@ class Coordinates:
                 entries[k, joint.v] = 1.0
         return pack_entries((self.nq, self.tree.nv), entries)
 
+    def integrate(self, d: Any) -> Any:
+        """q after moving with the constant velocity d, SX (nv), for one second, as pin.integrate; for
+        "quaternion"."""
+        if self.base != "quaternion":
+            raise InputError("integrate: needs Pinocchio's q; build with base='quaternion'")
+        q = ca.SX(self.q)
+        if self.tree.floating:
+            shift, quaternion = _exponential(d[:3], d[3:6])
+            x, y, z, w = self._quaternion
+            entries = {(r, c): self._rotation[r][c] for r in range(3) for c in range(3)}
+            rotation = pack_entries((3, 3), entries)
+            vector, scalar = ca.vertcat(x.x, y.x, z.x), w.x
+            q[:3] += ca.mtimes(rotation, shift)
+            q[3:6] = scalar * quaternion[:3] + quaternion[3] * vector + ca.cross(vector, quaternion[:3])
+            q[6] = scalar * quaternion[3] - ca.dot(vector, quaternion[:3])
+        for joint in self.tree.joints[1:]:
+            if joint.kind is Kind.FREE:
+                continue
+            if joint.continuous:
+                c, s = self.q[joint.q], self.q[joint.q + 1]
+                turn = d[joint.v]
+                q[joint.q] = c * ca.cos(turn) - s * ca.sin(turn)
+                q[joint.q + 1] = s * ca.cos(turn) + c * ca.sin(turn)
+            else:
+                q[joint.q] += d[joint.v]
+        return q
+
     def _one_number_a_velocity(self, method: str) -> None:
         if self.nq != self.tree.nv:
             raise InputError(
@@ -188,3 +215,17 @@ def _quaternion_matrix(x: Scalar, y: Scalar, z: Scalar, w: Scalar) -> Matrix:
         [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
         [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
     ]
+
+
+def _exponential(linear: Any, angular: Any) -> tuple[Any, Any]:
+    """(translation (3), quaternion (4)) of the twist's exponential; series where the angle is small."""
+    square = ca.dot(angular, angular)
+    small = square < 1e-6
+    angle = ca.sqrt(ca.if_else(small, 1.0, square))
+    half = ca.if_else(small, 0.5 - square / 48.0, ca.sin(angle / 2) / angle)
+    first = ca.if_else(small, 0.5 - square / 24.0, (1 - ca.cos(angle)) / angle**2)
+    second = ca.if_else(small, 1.0 / 6.0 - square / 120.0, (angle - ca.sin(angle)) / angle**3)
+    turned = ca.cross(angular, linear)
+    shift = linear + first * turned + second * ca.cross(angular, turned)
+    cosine = ca.if_else(small, 1.0 - square / 8.0 + square**2 / 384.0, ca.cos(angle / 2))
+    return shift, ca.vertcat(half * angular, cosine)

@@ -1,0 +1,173 @@
+"""The course of a collision: one freeze from contact to separation, or several, one after the other.
+
+With N freezes on the way, the contact's duration T is estimated by the freeze at contact, and the course is
+cut into N + 1 stretches at T (i / (N + 1))^(3/2), shorter ones first, as the velocity changes most right
+after contact. The first stretch goes by the freeze at contact; every other one by a freeze at its *middle*,
+which the freeze before it predicts. The prediction's error is of second order in the stretch's length, and so
+is that of a coefficient frozen in the middle: the course converges to full dynamics with 1/N^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .frozen import FrozenDynamics
+from .loop import run
+from .model import JointSpaceModel
+
+__all__ = ["Course", "Stretch"]
+
+_GRADING = 1.5
+# [1/kg] of a target that takes no impulse: drifts are frozen at the velocity given, see frozen.py
+_GIVES_WAY = 1e30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """What one freeze has led to, MX.
+
+    Attributes
+    ----------
+    data : of the model, and the outputs of FrozenDynamics that were wanted.
+    since : [s] from contact to the freeze's begin.
+    final : the state at its end.
+    states : (n_states, k) at all wanted instants, or None.
+    v_after, q_after : velocity and configuration at its end; functions, as not all are asked for.
+    """
+
+    data: dict[str, Any]
+    since: Any
+    start: Any
+    final: Any
+    states: Any
+    v_after: Callable[[], Any]
+    q_after: Callable[[], Any]
+
+
+class Course:
+    """Runs the time loop from contact to separation.
+
+    Parameters
+    ----------
+    model, frozen : the collision in joint space, and what is frozen.
+    step : one step of the time loop.
+    steps : number of steps for a fraction of the horizon.
+    horizon : [s] at which everything ends.
+    freezes : on the way, besides the one at contact.
+    wanted : outputs of FrozenDynamics that are wanted besides what the model needs.
+    record : keep every so many of the states, and the last; 0: none.
+    """
+
+    def __init__(
+        self,
+        model: JointSpaceModel,
+        frozen: FrozenDynamics,
+        *,
+        step: Any,
+        steps: Callable[[float], int],
+        horizon: float,
+        freezes: int,
+        wanted: tuple[str, ...],
+        record: int,
+    ) -> None:
+        self.model, self.frozen, self.record = model, frozen, record
+        self.step, self.steps, self.horizon, self.freezes = step, steps, horizon, freezes
+        whole = ("L_tau", "L_f", "L_0", "drift_velocity") if freezes else ()
+        self._names = tuple(dict.fromkeys((*model.frozen, *wanted, *whole)))
+        self._freeze = frozen.function("frozen", self._names)
+
+    def run(self, inputs: dict[str, Any], target_yield: Any) -> list[Stretch]:
+        """The stretches, in order; `inputs` are q, v, feedforward and settings by name."""
+        q, v = inputs["q"], inputs["v"]
+        data = inputs | self._frozen(q, v, inputs["normal"], target_yield)
+        if not self.freezes:
+            return [self._stretch(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0)]
+        n = self.model.n
+        data |= {"velocity_before": ca.MX.zeros(n), "until": ca.MX(self.horizon)}
+        begin = ca.MX(self.model.start())
+        duration = self._time(self._loop(data, begin, 1.0, record=False)[0])
+        fractions = (np.arange(self.freezes + 2) / (self.freezes + 1)) ** _GRADING
+        stretches: list[Stretch] = []
+        frozen_at, start = q, begin
+        for i, (a, b) in enumerate(pairwise(fractions)):
+            last = i == self.freezes
+            since = duration * a
+            length = self.horizon - since if last else duration * (b - a)
+            if i:
+                # what was frozen before goes on to the middle of this stretch, if there is still contact
+                before = stretches[-1]
+                contact = self.model.phase(before.final, before.data)[1]
+                ahead = before.data | {"until": self._time(before.final) + duration * (b - a) / 2}
+                middle = self._loop(ahead, before.final, float(b - a) / 2, record=False)[0]
+                q_middle, v_middle = self._moved(before.data, frozen_at, q, v, middle)
+                q, v = before.q_after(), before.v_after()
+                frozen_at = q_middle
+                data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], _GIVES_WAY)
+                data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
+                data["velocity_before"] = (v - inputs["v"])[-n:]
+                length = ca.if_else(contact, length, -1.0)
+                start = self._handed_on(before.final)
+            data = data | {"until": length}
+            share = 1.0 if last else float(b - a)
+            stretches.append(self._stretch(data, frozen_at, q, v, start, share, since))
+        return stretches
+
+    def _frozen(self, q: Any, v: Any, normal: Any, target_yield: Any) -> dict[str, Any]:
+        return dict(zip(self._names, self._freeze.call([q, v, normal, target_yield]), strict=True))
+
+    def _stretch(
+        self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, start: Any, fraction: float, since: Any
+    ) -> Stretch:
+        data = data | {"joint_velocity": data["v"][-self.frozen.robot.n :]}
+        final, states = self._loop(data, start, fraction, record=self.record > 0)
+        if states is not None and self.record > 1:
+            last = states.size2() - 1
+            states = states[:, [*range(0, last, self.record), last]]
+        return Stretch(
+            data=data,
+            since=since,
+            start=start,
+            final=final,
+            states=states,
+            v_after=lambda: v + self._change(data, frozen_at, final),
+            q_after=lambda: self._moved(data, frozen_at, q, v, final)[0],
+        )
+
+    def _loop(self, data: dict[str, Any], start: Any, fraction: float, *, record: bool) -> tuple[Any, Any]:
+        data = data | {"joint_velocity": data["v"][-self.frozen.robot.n :]}
+        constants = [data[key] for key in self.model.data]
+        return run(self.model, self.step, start, self.steps(fraction), constants, record=record)
+
+    def _time(self, y: Any) -> Any:
+        return self.model.part(y, "time")
+
+    def _handed_on(self, y: Any) -> Any:
+        """The state at the begin of a stretch, from that at the end of the one before."""
+        kept = ("penetration", "target", "peak", "deviation")
+        parts = {name: self.model.part(y, name) for name in self.model.layout}
+        return self.model.join({k: x if k in kept else ca.MX.zeros(*x.shape) for k, x in parts.items()})
+
+    # ------------------------------------------------------------ whole motion
+    def _moved(self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, y: Any) -> tuple[Any, Any]:
+        """(configuration, velocity) at state y, from those at the begin of the stretch."""
+        time = self._time(y)
+        way = v * time + self._change(data, frozen_at, y, second=True)
+        return self.frozen.integrate(q, way), v + self._change(data, frozen_at, y)
+
+    def _change(self, data: dict[str, Any], frozen_at: Any, y: Any, *, second: bool = False) -> Any:
+        """Change of v since the begin, or its integral over time."""
+        model = self.model
+        names = ("torque2", "impulse2") if second else ("torque", "impulse")
+        torque, impulse = (model.part(y, name) for name in names)
+        time = self._time(y) ** 2 / 2 if second else self._time(y)
+        if not model.n:
+            torque = ca.MX.zeros(self.frozen.robot.n)
+        wrench = ca.mtimes(data["L_tau"], torque) - data["L_f"] * impulse + data["L_0"] * time
+        at = (frozen_at, data["drift_velocity"], data["normal"])
+        return self.frozen.velocity_change(*at, torque, impulse, wrench, time)

@@ -1,0 +1,268 @@
+"""Collision models as CasADi functions: compiled with just the outputs asked for, or graphs to build with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..codegen import cached, model_hash
+from ..errors import InputError, check_array, did_you_mean
+from .graph import (
+    METHODS,
+    collision_graph,
+    frozen_dynamics,
+    gradient_graph,
+    joint_space_model,
+    number_of_steps,
+)
+from .interface import CollisionModel
+from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_outputs
+from .result import Collision
+from .settings import Settings
+from .stability import longest_stable_step, slope_function
+from .terms import JointFriction, Terms
+
+__all__ = ["SymbolicModel"]
+
+# [s] by method: Taylor steps are held by events and by the servo's fastest mode, not by accuracy; the other
+# is the paper's
+_STEPS = {"events": 2.5e-4, "rk4": 1e-4}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SymbolicModel(CollisionModel):
+    """A model of a collision that can be differentiated.
+
+    Attributes
+    ----------
+    terms : effects that are taken into account.
+    method : "events", Taylor steps of order six that end on events (impulse within 1e-6 relative of the exact
+        solution, most often within 1e-9); or "rk4", the paper's fixed Runge-Kutta steps, for laws that have
+        no such derivatives. None: the first that law and target allow.
+    step : [s] length of a step, below `stable_step(q)`; None: 2.5e-4 for "events", the paper's 1e-4 for
+        "rk4".
+    report : told what is going on while functions are compiled, one line a call.
+
+    Raises
+    ------
+    InputError : as `CollisionModel`; an unknown method, or one that law or target do not allow; a step that
+        is not positive.
+    """
+
+    terms: Terms = field(default_factory=Terms)
+    method: str | None = None
+    step: float | None = None
+    report: Callable[[str], None] | None = None
+    _functions: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.method is not None and self.method not in METHODS:
+            raise InputError(
+                f"method {self.method!r}{did_you_mean(self.method, METHODS)}; there are {', '.join(METHODS)}"
+            )
+        for thing in (self.law, self.target):
+            if self.method == "events" and not thing.analytic:
+                raise InputError(
+                    f"method 'events': {type(thing).__name__} lacks the derivatives that Taylor steps need; "
+                    "use 'rk4'"
+                )
+        if not check_array("step [s]", self.step_length, ()) > 0:
+            raise InputError(f"step [s]: {self.step_length:g}; give a number > 0")
+        if self.step_length > self.horizon:
+            raise InputError(f"step [s]: {self.step_length:g} is longer than the horizon, {self.horizon:g} s")
+        # checks the numbers now, and not when they are first used
+        _ = self.settings
+
+    # ------------------------------------------------------------ what is modelled
+    @property
+    def joint_friction(self) -> JointFriction:
+        """The joints' friction, or none."""
+        return JointFriction()
+
+    @property
+    def n_servos(self) -> int:
+        """Joints whose servos act: all, or none of a point mass."""
+        return self.robot.n
+
+    @property
+    def n_freezes(self) -> int:
+        """Freezes on the way, besides the one at contact."""
+        return 0
+
+    @property
+    def stepping(self) -> str:
+        """The method, or what law and target allow."""
+        return self.method or ("events" if self.law.analytic and self.target.analytic else "rk4")
+
+    @property
+    def step_length(self) -> float:
+        """The step [s], or the method's own."""
+        return _STEPS[self.stepping] if self.step is None else self.step
+
+    @cached_property
+    def settings(self) -> Settings:
+        """Numbers that are inputs of the functions, with their defaults."""
+        return Settings(self.law, self.target, self.normal, self._servo_settings())
+
+    def _servo_settings(self) -> dict[str, ArrayLike]:
+        return {}
+
+    @cached_property
+    def available(self) -> tuple[str, ...]:
+        """Names of the outputs that this model has, out of `impactopt.collision.OUTPUTS`."""
+        missing = set() if self.n_servos else {*OF_SERVO}
+        if not self.held_by.soles(self.robot):
+            missing |= {*OF_SOLES}
+        if not self.held_by.hand_frames(self.robot):
+            missing.add("hand_wrench")
+        if not self.target.results:
+            missing.add("target_result")
+        return tuple(name for name in OUTPUTS if name not in missing)
+
+    # ------------------------------------------------------------ functions
+    def graph(self, outputs: tuple[str, ...] = ("impulse",), *, every: int = 1) -> Any:
+        """The collision as a differentiable ca.Function that is not compiled, to build larger graphs with.
+
+        Inputs as of `function` with all settings; see there.
+        """
+        self._check_outputs(outputs, every)
+        return collision_graph(self, tuple(outputs), every=every)
+
+    def function(
+        self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = (), every: int = 1
+    ) -> Any:
+        """The collision as a compiled ca.Function of what it needs, to the outputs asked for.
+
+        Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with terms.feedforward; then the settings
+        that `parameters` name (any of `settings`), the others being fixed. It does not contain what no
+        output needs, and has no derivatives.
+
+        Parameters
+        ----------
+        outputs : names out of `impactopt.collision.OUTPUTS`, which says what they are; histories have a
+            column an instant, and repeat the last one after separation.
+        parameters : settings that are inputs.
+        every : keep every so many steps, and the last, of the histories.
+        """
+        self._check_outputs(outputs, every)
+        whole = self._compiled("collision", (*outputs, every), lambda: self.graph(outputs, every=every))
+        return self._with_parameters(whole, parameters)
+
+    def gradient_function(self, output: str = "impulse", *, parameters: tuple[str, ...] = ()) -> Any:
+        """A compiled ca.Function with the inputs of `function`, to a scalar output and its gradients.
+
+        Returns (value, d/dq (nv), d/dv (nv)): q's gradient is in the basis of v, as `pin.integrate` moves q.
+        """
+        self._check_outputs((output,), 1)
+        if output not in SCALARS:
+            raise InputError(f"gradient of {output!r}: only of a number: {', '.join(SCALARS)}")
+        whole = self._compiled("collision_gradient", (output,), lambda: gradient_graph(self, output))
+        return self._with_parameters(whole, parameters)
+
+    def _compiled(self, name: str, what: tuple[Any, ...], build: Callable[[], Any]) -> Any:
+        key = (name, *what)
+        if key not in self._functions:
+            functions = cached(name, (*self._recipe, *what), lambda: [build()], report=self.report)
+            self._functions[key] = functions[name]
+        return self._functions[key]
+
+    @cached_property
+    def _recipe(self) -> tuple[Any, ...]:
+        """All that shapes the functions; numbers that are inputs do not."""
+        held = (self.held_by.sole_frames(self.robot), self.held_by.hand_frames(self.robot))
+        held_by = (*held, tuple(self.held_by.compliance))
+        transition = self.joint_friction.transition if self.terms.friction else None
+        kinds = (self.law.formula(), self.target.formula(), self.terms, transition)
+        shapes = tuple((name, value.shape) for name, value in self.settings.items())
+        frame = self.robot.striker(self.striker).model_frame
+        course = (self.stepping, self.step_length, number_of_steps(self), self.horizon, self.n_freezes)
+        return (model_hash(self.robot.model), self.n_servos, frame, *held_by, *kinds, shapes, *course)
+
+    def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
+        for name in parameters:
+            self.settings.override({name: self.settings.get(name, 0.0)})
+        inputs = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
+        kept = {name: x for name, x in inputs.items() if name not in self.settings or name in parameters}
+        values = [kept.get(name, self.settings.get(name)) for name in inputs]
+        return ca.Function(
+            whole.name(), list(kept.values()), whole.call(values), list(kept), whole.name_out()
+        )
+
+    def _check_outputs(self, outputs: tuple[str, ...], every: int) -> None:
+        check_outputs(tuple(outputs))
+        if every < 1:
+            raise InputError(f"every: {every}; give a number of steps >= 1")
+        for name in outputs:
+            if name in self.available:
+                continue
+            if name in OF_SERVO and not self.n_servos:
+                why = "a point mass knows nothing of it"
+            elif name == "target_result":
+                why = f"a {type(self.target).__name__} has none"
+            elif name == "hand_wrench":
+                why = "no hand is held"
+            else:
+                why = "a robot on a fixed base has no soles"
+            raise InputError(f"output {name!r}: {why}; leave it out")
+
+    # ------------------------------------------------------------ numbers
+    def collide(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None = None,
+        *,
+        require_separation: bool = True,
+        **overrides: ArrayLike,
+    ) -> Collision:
+        q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
+        values = self.settings.override(overrides)
+        arguments: list[Any] = [q, v]
+        if self.terms.feedforward and torque is None:
+            raise InputError(
+                "torque: give the feed-forward torque (n) [N m], or switch terms.feedforward off"
+            )
+        if torque is not None:
+            given = check_array("torque [N m]", torque, (self.robot.n,))
+            if self.terms.feedforward:
+                arguments.append(given)
+        longest = self.stable_step(q, **overrides)
+        if self.step_length >= longest:
+            raise InputError(
+                f"step [s]: {self.step_length:g} is unstable here, where the fastest mode allows "
+                f"{longest:.2g}: give a step below that, or the joints less kd or more armature"
+            )
+        names = self.available
+        whole = self._compiled("collision", (*names, 1), lambda: self.graph(names))
+        found = whole.call([ca.DM(x) for x in (*arguments, *values.values())])
+        outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
+        result = Collision.from_outputs(outputs, self.target)
+        if require_separation and not result.separated:
+            raise InputError(
+                f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
+                "or pass require_separation=False for what happened so far"
+            )
+        return result
+
+    def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
+        """[s] that the step has to stay below at q: 2.6 over the fastest mode's rate, no joint saturated."""
+        q = self.robot.check_configuration(q)
+        values = self.settings.override(overrides)
+        frozen, slope = self._stability
+        found = frozen.call([q, np.zeros(self.robot.nv), values["normal"], ca.DM(0.0)])
+        data = dict(zip(frozen.name_out(), found, strict=True)) | values
+        if self.terms.bias or self.terms.jdot:
+            data |= {"d": np.zeros(self.robot.n), "e": 0.0}
+        return longest_stable_step(joint_space_model(self), slope, data)
+
+    @cached_property
+    def _stability(self) -> tuple[Any, Any]:
+        names = ("A", "s", "m") if self.n_servos else ("m",)
+        return frozen_dynamics(self).function("frozen", names), slope_function(joint_space_model(self))

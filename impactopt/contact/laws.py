@@ -7,18 +7,15 @@ n.
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
-import numpy as np
 
-from ..errors import InputError, check_array
+from ._expressions import Parameters, choose, numbers_of, positive, text_of
 
-Parameters = Mapping[str, Any]
+__all__ = ["ContactLaw", "KelvinVoigt", "SpringDamper"]
 
 
 class ContactLaw(ABC):
@@ -27,12 +24,22 @@ class ContactLaw(ABC):
     To write one, make a frozen dataclass whose fields are its numbers, and give `branch`. The branches have
     to agree where the rate is zero; contact ends when, in restitution, the branch's force has fallen to
     zero.
+
+    Attributes
+    ----------
+    analytic : whether the branches have derivatives of all orders at and around x = 0, as Taylor steps need
+        them; a law that has only the first, as x^1.5, says False and is integrated by Runge-Kutta steps.
     """
+
+    analytic: ClassVar[bool] = True
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The law's numbers by name; a collision model takes each as an input named `contact_<name>`."""
-        return _numbers(self)
+        """The law's numbers by name; a collision model takes each as an input named `contact_<name>`.
+
+        `type(law)(**numbers)` is the same law with other numbers.
+        """
+        return numbers_of(self)
 
     @abstractmethod
     def branch(
@@ -47,7 +54,8 @@ class ContactLaw(ABC):
         """Both branches as text in symbols of their own: what a compiled model of this law depends on."""
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
-        return str(self.branch(x, rate, True, names)), str(self.branch(x, rate, False, names))
+        compression, restitution = (text_of([self.branch(x, rate, c, names)]) for c in (True, False))
+        return compression, restitution
 
     def force(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
         """Force f [N] on the target: never adhesive (f >= 0), and zero while apart (penetration < 0).
@@ -56,9 +64,9 @@ class ContactLaw(ABC):
         """
         compression = self.branch(penetration, rate, True, parameters)
         restitution = self.branch(penetration, rate, False, parameters)
-        force = _choose(rate > 0, compression, restitution)
+        force = choose(rate > 0, compression, restitution)
         none = 0.0 * force
-        return _choose(penetration >= 0, _choose(force > 0, force, none), none)
+        return choose(penetration >= 0, choose(force > 0, force, none), none)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,21 +101,32 @@ class SpringDamper(ContactLaw):
         return spring + p["damping"] * rate if compressing else spring
 
 
-def positive(name: str, value: Any, *, zero: bool = False) -> float:
-    """`value` as a float; InputError unless it is one finite number > 0 (or >= 0 where `zero`)."""
-    number = float(check_array(name, value, ()))
-    if number < 0 or (number == 0 and not zero):
-        raise InputError(f"{name}: {number:g}; give a number {'>= 0' if zero else '> 0'}")
-    return number
+@dataclass(frozen=True, kw_only=True)
+class KelvinVoigt(ContactLaw):
+    """f = k x + d dx/dt in both phases, until the force has fallen to zero: it never pulls.
 
+    Two masses part with e = exp(-2 zeta acos(zeta) / sqrt(1 - zeta^2)) of their speed of approach, where
+    zeta = d / (2 sqrt(k mu)) < 1 and 1/mu = 1/m_1 + 1/m_2; they part while the spring is still compressed.
 
-def _numbers(instance: Any) -> dict[str, float]:
-    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+    Attributes
+    ----------
+    stiffness : k [N/m] > 0.
+    damping : d [N s/m] >= 0.
 
+    Raises
+    ------
+    InputError : a number out of its range.
+    """
 
-def _choose(condition: Any, yes: Any, no: Any) -> Any:
-    if isinstance(condition, (bool, np.bool_)):
-        return yes if condition else no
-    if isinstance(condition, np.ndarray):
-        return np.where(condition, yes, no)
-    return ca.if_else(condition, yes, no)
+    stiffness: float
+    damping: float
+
+    def __post_init__(self) -> None:
+        positive("KelvinVoigt: stiffness [N/m]", self.stiffness)
+        positive("KelvinVoigt: damping [N s/m]", self.damping, zero=True)
+
+    def branch(
+        self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
+    ) -> Any:
+        p = self.parameters if parameters is None else parameters
+        return p["stiffness"] * penetration + p["damping"] * rate

@@ -3,28 +3,41 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-from .laws import _numbers, positive
+import casadi as ca
 
-Parameters = Mapping[str, Any]
+from ._expressions import Parameters, numbers_of, positive, text_of
+
+__all__ = ["FreeMass", "RigidWall", "Target"]
 
 
 class Target(ABC):
     """Something that is hit, at rest when contact begins; motion is along the contact normal only.
 
-    To write one, make a frozen dataclass whose fields are its numbers, and give the methods below, which
-    have to be smooth; `state` is a column of `n_states` numbers or CasADi symbols, zero at rest.
+    To write one, make a frozen dataclass whose fields are its numbers, and give the methods below. They have
+    to be smooth but where one of `switches` changes its sign; `state` is a column of `n_states` numbers or
+    CasADi symbols, zero at rest.
+
+    Attributes
+    ----------
+    n_states : size of the state.
+    results : names of what `result` gives.
+    analytic : whether there are derivatives of all orders between switches, as Taylor steps need them.
     """
 
     n_states: int
+    results: ClassVar[tuple[str, ...]] = ()
+    analytic: ClassVar[bool] = True
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The target's numbers by name; a collision model takes each as an input named `target_<name>`."""
-        return _numbers(self)
+        """The target's numbers by name; a collision model takes each as an input named `target_<name>`.
+
+        `type(target)(**numbers)` is the same target with other numbers.
+        """
+        return numbers_of(self)
 
     @abstractmethod
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
@@ -36,12 +49,37 @@ class Target(ABC):
 
     @abstractmethod
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Energy [J] that the target holds."""
+        """Energy [J] that the target holds, or has used up in what it was hit for."""
+
+    def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
+        """Expressions whose changes of sign part the motion into smooth pieces; steps end on them."""
+        return []
+
+    def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
+        """What the blow has brought, from the state at separation; named by `results`."""
+        return []
+
+    def formula(self) -> tuple[str, ...]:
+        """The target as text in symbols of its own: what a compiled model of it depends on."""
+        numbers = {name: ca.SX.sym(name) for name in self.parameters}
+        state = [ca.SX.sym(f"state_{i}") for i in range(self.n_states)]
+        force = ca.SX.sym("force")
+        parts = {
+            "derivative": self.derivative(state, force, numbers),
+            "velocity": [self.velocity(state, numbers)],
+            "energy": [self.energy(state, numbers)],
+            "switches": self.switches(state, force, numbers),
+            "result": self.result(state, numbers),
+        }
+        made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
+        return (*made, f"results: {', '.join(self.results)}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FreeMass(Target):
     """A point mass that moves freely along the normal (paper, figs. 1 and 9); its state is its velocity.
+
+    Its result is `speed` [m/s], after the blow.
 
     Attributes
     ----------
@@ -55,6 +93,7 @@ class FreeMass(Target):
     mass: float
 
     n_states = 1
+    results: ClassVar[tuple[str, ...]] = ("speed",)
 
     def __post_init__(self) -> None:
         positive("FreeMass: mass [kg]", self.mass)
@@ -69,3 +108,22 @@ class FreeMass(Target):
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
         p = self.parameters if parameters is None else parameters
         return 0.5 * p["mass"] * state[0] ** 2
+
+    def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
+        return [state[0]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidWall(Target):
+    """A wall that never moves: it takes impulse, but no energy. It has no state and no numbers."""
+
+    n_states = 0
+
+    def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
+        return 0.0
+
+    def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
+        return []
+
+    def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
+        return 0.0

@@ -1,0 +1,56 @@
+"""What laws and targets are written with: the same for floats, NumPy arrays and CasADi expressions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..errors import InputError, check_array
+
+Parameters = Mapping[str, Any]
+
+# [m] below this a power is taken as zero: where its slopes, by base and by exponent, would be no numbers
+_TINY = 1e-30
+
+
+def choose(condition: Any, yes: Any, no: Any) -> Any:
+    """`yes` where the condition holds, else `no`."""
+    if isinstance(condition, (bool, np.bool_)):
+        return yes if condition else no
+    if isinstance(condition, np.ndarray):
+        return np.where(condition, yes, no)
+    return ca.if_else(condition, yes, no)
+
+
+def power(base: Any, exponent: Any) -> Any:
+    """max(base, 0)^exponent; for exponents >= 1 all first derivatives are finite everywhere."""
+    inside = base > _TINY
+    safe = choose(inside, base, _TINY)
+    return choose(inside, safe**exponent, 0.0 * safe)
+
+
+def numbers_of(instance: Any) -> dict[str, float]:
+    """The fields of a dataclass by name."""
+    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+
+
+def positive(name: str, value: Any, *, zero: bool = False) -> float:
+    """`value` as a float; InputError unless it is one finite number > 0 (or >= 0 where `zero`)."""
+    number = float(check_array(name, value, ()))
+    if number < 0 or (number == 0 and not zero):
+        raise InputError(f"{name}: {number:g}; give a number {'>= 0' if zero else '> 0'}")
+    return number
+
+
+def text_of(expressions: Sequence[Any]) -> str:
+    """Expressions as text that tells any two of them apart: with all digits of their constants."""
+    digits = ca.SX.get_precision()
+    ca.SX.set_precision(17)
+    try:
+        return ", ".join(str(ca.SX(expression)) for expression in expressions)
+    finally:
+        ca.SX.set_precision(digits)

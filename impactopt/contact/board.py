@@ -1,0 +1,77 @@
+"""A board that is broken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from ._expressions import Parameters, choose, positive
+from .targets import Target
+
+__all__ = ["Board"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board(Target):
+    """A board held at its edges: a modal mass on a spring, which breaks at a given force of the spring.
+
+    m dv/dt = f - k w - d v up to the deflection w = breaking_force / k, and m dv/dt = f beyond it: the pieces
+    are a free mass. As f >= 0, and v > 0 at the break, they only move on: broken is broken. The state is
+    (v, w). Its result is `broken`, 1 where the board broke before separation, else 0; whether one that is
+    left swinging breaks later is not looked at.
+
+    Source: lowest mode of a brittle beam, as in Walker, "Karate strikes", Am. J. Phys. 43 (1975) 845-849.
+
+    Attributes
+    ----------
+    mass : m [kg] > 0, modal, at the point that is hit.
+    stiffness : k [N/m] > 0.
+    breaking_force : [N] > 0, of the spring.
+    damping : d [N s/m] >= 0, of the bending.
+
+    Raises
+    ------
+    InputError : a number out of its range.
+    """
+
+    mass: float
+    stiffness: float
+    breaking_force: float
+    damping: float = 0.0
+
+    n_states = 2
+    results: ClassVar[tuple[str, ...]] = ("broken",)
+
+    def __post_init__(self) -> None:
+        positive("Board: mass [kg]", self.mass)
+        positive("Board: stiffness [N/m]", self.stiffness)
+        positive("Board: breaking_force [N]", self.breaking_force)
+        positive("Board: damping [N s/m]", self.damping, zero=True)
+
+    def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
+        return state[0]
+
+    def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
+        p = self.parameters if parameters is None else parameters
+        bending = p["stiffness"] * state[1] + p["damping"] * state[0]
+        held = choose(self._beyond(state, p) > 0, 0.0 * bending, bending)
+        return [(force - held) / p["mass"], state[0]]
+
+    def _beyond(self, state: Any, p: Parameters) -> Any:
+        return state[1] - p["breaking_force"] / p["stiffness"]
+
+    def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
+        """Deflection beyond that of the break."""
+        return [self._beyond(state, self.parameters if parameters is None else parameters)]
+
+    def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
+        """Kinetic energy, and that of bending: after the break, what it took to break."""
+        p = self.parameters if parameters is None else parameters
+        beyond, at_break = self._beyond(state, p), p["breaking_force"] / p["stiffness"]
+        bent = choose(beyond > 0, at_break + 0.0 * beyond, state[1])
+        return 0.5 * p["mass"] * state[0] ** 2 + 0.5 * p["stiffness"] * bent**2
+
+    def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
+        p = self.parameters if parameters is None else parameters
+        beyond = self._beyond(state, p)
+        return [choose(beyond > 0, 1.0 + 0.0 * beyond, 0.0 * beyond)]

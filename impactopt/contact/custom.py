@@ -1,0 +1,127 @@
+"""A contact law of one's own, without a class of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError
+from typing import Any, ClassVar
+
+import casadi as ca
+
+from ..errors import InputError, check_array
+from ._expressions import Parameters
+from .laws import ContactLaw
+
+__all__ = ["CustomLaw"]
+
+Branch = Callable[..., Any]
+
+
+class CustomLaw(ContactLaw):
+    """A contact law from functions of penetration [m], rate [m/s] and named numbers, to a force [N].
+
+    Each number becomes an input `contact_<name>` of a collision, with the value given here as its default.
+    The functions are called as ``function(penetration, rate, **numbers)``, with CasADi expressions too:
+    write ``casadi.fmax`` and ``casadi.if_else`` in the place of ``max`` and ``if``. They have to agree where
+    the rate is zero. A force below zero is cut, and so is one while apart.
+
+    >>> law = CustomLaw(
+    ...     compression=lambda x, rate, stiffness, hardening, damping: (
+    ...         stiffness * x + hardening * x**3 + damping * rate
+    ...     ),
+    ...     restitution=lambda x, rate, stiffness, hardening, damping: stiffness * x + hardening * x**3,
+    ...     analytic=True,
+    ...     stiffness=1e4,
+    ...     hardening=4e8,
+    ...     damping=200.0,
+    ... )
+    >>> law.force(0.001, 0.5)
+    110.4
+    >>> law.parameters
+    {'stiffness': 10000.0, 'hardening': 400000000.0, 'damping': 200.0}
+
+    Parameters
+    ----------
+    compression : force while the rate is > 0.
+    restitution : force after that; None: the same.
+    analytic : whether both have derivatives of all orders at and around x = 0; see `ContactLaw`.
+    numbers : finite; the functions' own arguments.
+
+    Raises
+    ------
+    InputError : no function; numbers that are not finite; a function that does not take just these numbers,
+        or gives anything but one expression.
+    """
+
+    # Each law made here is a class with these functions, so that type(law)(**numbers) is the same law with
+    # other numbers, as it is for any law.
+    _branches: ClassVar[tuple[Branch, Branch] | None] = None
+    _numbers: dict[str, float]
+
+    def __new__(
+        cls,
+        *,
+        compression: Branch | None = None,
+        restitution: Branch | None = None,
+        analytic: bool = False,
+        **numbers: float,
+    ) -> CustomLaw:
+        if cls._branches is not None:
+            return super().__new__(cls)
+        for name, function in (("compression", compression), ("restitution", restitution)):
+            if not callable(function) and not (name == "restitution" and function is None):
+                raise InputError(
+                    f"CustomLaw: {name}: {function!r}; give a function of penetration, rate and numbers"
+                )
+        branches = (compression, restitution or compression)
+        space = {"_branches": branches, "analytic": bool(analytic), "__module__": cls.__module__}
+        return super().__new__(type(cls.__name__, (cls,), space))
+
+    def __init__(
+        self,
+        *,
+        compression: Branch | None = None,
+        restitution: Branch | None = None,
+        analytic: bool = False,
+        **numbers: float,
+    ) -> None:
+        checked = {name: float(check_array(f"CustomLaw: {name}", x, ())) for name, x in numbers.items()}
+        object.__setattr__(self, "_numbers", checked)
+        x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {name: ca.SX.sym(name) for name in checked}
+        for name, compressing in (("compression", True), ("restitution", False)):
+            try:
+                size = ca.SX(self.branch(x, rate, compressing, symbols)).numel()
+            except Exception as error:
+                raise InputError(
+                    f"CustomLaw: {name}: cannot be called with CasADi expressions as "
+                    f"function({', '.join(['penetration', 'rate', *checked])}): {error}"
+                ) from error
+            if size != 1:
+                raise InputError(f"CustomLaw: {name}: gives {size} expressions; one force is wanted")
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        return dict(self._numbers)
+
+    def branch(
+        self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
+    ) -> Any:
+        assert self._branches is not None
+        numbers = self._numbers if parameters is None else parameters
+        return self._branches[0 if compressing else 1](penetration, rate, **numbers)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise FrozenInstanceError(f"cannot assign to field {name!r}")
+
+    def __repr__(self) -> str:
+        return f"CustomLaw({', '.join(f'{name}={value!r}' for name, value in self._numbers.items())})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # its class is made on the spot, and has no name to be found by
+        assert self._branches is not None
+        compression, restitution = self._branches
+        return _remake, (compression, restitution, self.analytic, self._numbers)
+
+
+def _remake(compression: Branch, restitution: Branch, analytic: bool, numbers: dict[str, float]) -> CustomLaw:
+    return CustomLaw(compression=compression, restitution=restitution, analytic=analytic, **numbers)

@@ -1,10 +1,10 @@
 """The course of a collision: one freeze from contact to separation, or several, one after the other.
 
-With N freezes on the way, the contact's duration T is estimated by the freeze at contact, and the course is
-cut into N + 1 stretches at T (i / (N + 1))^(3/2), shorter ones first, as the velocity changes most right
-after contact. The first stretch goes by the freeze at contact; every other one by a freeze at its *middle*,
-which the freeze before it predicts. The prediction's error is of second order in the stretch's length, and so
-is that of a coefficient frozen in the middle: the course converges to full dynamics with 1/N^2.
+With N freezes on the way, the freeze at contact only estimates the contact's duration T, and predicts. The
+course is cut into N stretches at T (i / N)^(3/2), shorter ones first, as the velocity changes most right
+after contact. Each goes by a freeze at its *middle*, which the freeze before it predicts. The prediction's
+error is of second order in the stretch's length, and so is that of a coefficient frozen in the middle: the
+course converges to full dynamics with 1/N^2.
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ class Stretch:
 
     data: dict[str, Any]
     since: Any
-    start: Any
     final: Any
     states: Any
     v_after: Callable[[], Any]
@@ -90,32 +89,31 @@ class Course:
             return [self._stretch(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0)]
         n = self.model.n
         data |= {"velocity_before": ca.MX.zeros(n), "until": ca.MX(self.horizon)}
-        begin = ca.MX(self.model.start())
-        duration = self._time(self._loop(data, begin, 1.0, record=False)[0])
-        fractions = (np.arange(self.freezes + 2) / (self.freezes + 1)) ** _GRADING
+        start = ca.MX(self.model.start())
+        duration = self._time(self._loop(data, start, 1.0, record=False)[0])
+        fractions = (np.arange(self.freezes + 1) / self.freezes) ** _GRADING
         stretches: list[Stretch] = []
-        frozen_at, start = q, begin
+        reached, frozen_at, contact = start, q, ca.MX(1.0)
         for i, (a, b) in enumerate(pairwise(fractions)):
-            last = i == self.freezes
-            since = duration * a
-            length = self.horizon - since if last else duration * (b - a)
-            if i:
-                # what was frozen before goes on to the middle of this stretch, if there is still contact
-                before = stretches[-1]
-                contact = self.model.phase(before.final, before.data)[1]
-                ahead = before.data | {"until": self._time(before.final) + duration * (b - a) / 2}
-                middle = self._loop(ahead, before.final, float(b - a) / 2, record=False)[0]
-                q_middle, v_middle = self._moved(before.data, frozen_at, q, v, middle)
-                q, v = before.q_after(), before.v_after()
-                frozen_at = q_middle
-                data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], _GIVES_WAY)
-                data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
-                data["velocity_before"] = (v - inputs["v"])[-n:]
-                length = ca.if_else(contact, length, -1.0)
-                start = self._handed_on(before.final)
-            data = data | {"until": length}
+            last = i == self.freezes - 1
+            # what was frozen before goes on to the middle of this stretch
+            ahead = data | {"until": self._time(reached) + duration * (b - a) / 2}
+            middle = self._loop(ahead, reached, float(b - a) / 2, record=False)[0]
+            q_middle, v_middle = self._moved(data, frozen_at, q, v, middle)
+            if stretches:
+                q, v = stretches[-1].q_after(), stretches[-1].v_after()
+            frozen_at = q_middle
+            data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], _GIVES_WAY)
+            data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
+            data["velocity_before"] = (v - inputs["v"])[-n:]
+            # no stretch begins after separation
+            length = self.horizon - duration * a if last else duration * (b - a)
+            data["until"] = ca.if_else(contact, length, -1.0)
             share = 1.0 if last else float(b - a)
-            stretches.append(self._stretch(data, frozen_at, q, v, start, share, since))
+            stretches.append(self._stretch(data, frozen_at, q, v, start, share, duration * a))
+            reached = stretches[-1].final
+            start = self._handed_on(reached)
+            contact *= self.model.phase(reached, data)[1]
         return stretches
 
     def _frozen(self, q: Any, v: Any, normal: Any, target_yield: Any) -> dict[str, Any]:
@@ -132,7 +130,6 @@ class Course:
         return Stretch(
             data=data,
             since=since,
-            start=start,
             final=final,
             states=states,
             v_after=lambda: v + self._change(data, frozen_at, final),

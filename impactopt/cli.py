@@ -139,10 +139,15 @@ def check(file: ProblemPath) -> None:
 def robots() -> None:
     """List the robots that problem files can name."""
     with plain_errors("interrupted"):
+        from impactopt.errors import InputError
         from impactopt.presets import load_robot, robot_names
 
         for name in robot_names():
-            robot = load_robot(name)
+            try:
+                robot = load_robot(name)
+            except InputError as error:
+                typer.echo(f"{name}: {error}")
+                continue
             mass = sum(float(body.mass) for body in robot.model.inertias)
             typer.echo(f"{name}: {robot.n} joints, {mass:.0f} kg")
             for kind, names in (

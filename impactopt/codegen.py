@@ -49,6 +49,10 @@ _NOT_IN_GRAPHS = frozenset(
     (
         "__init__",
         "__main__",
+        "_standin",
+        "baseline",
+        "bench",
+        "cases",
         "cli",
         "errors",
         "ipopt",
@@ -57,8 +61,18 @@ _NOT_IN_GRAPHS = frozenset(
         "plotting",
         "presets",
         "private_files",
+        "problem_file",
+        "program",
+        "reference",
+        "report",
+        "reproduce",
+        "screen",
+        "solution",
+        "sqp",
+        "sweep",
+        "validation",
     )
-) | {"baseline", "problem_file", "program", "report", "screen", "solution", "sqp", "sweep", "validation"}
+)
 # gcc -O1 allocates registers in more than linear time: 6, 18, 71 s for 16, 47, 118 thousand instructions.
 # Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
 _MAX_OPTIMIZED = 60_000

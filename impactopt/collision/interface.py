@@ -48,8 +48,9 @@ class CollisionModel(ABC):
     horizon: float = 0.2
 
     def __post_init__(self) -> None:
-        self.robot.striker(self.striker)
-        self.held_by.constraint_frames(self.robot)
+        frame = self.robot.striker(self.striker).model_frame
+        if frame in self.held_by.constraint_frames(self.robot):
+            raise InputError(f"striker {self.striker!r}: it is held by the stance; strike with another")
         normal = check_array("normal", self.normal, (3,))
         if abs(np.linalg.norm(normal) - 1.0) > 1e-6:
             raise InputError(

@@ -32,6 +32,7 @@ def longest_stable_step(model: JointSpaceModel, slope: Any, data: dict[str, Any]
     y, rates = model.start(), [1e-12]
     y[model.layout["penetration"]] = 1e-3
     for worst["hand_speed"] in (1.0, -1.0):  # compression, restitution
-        matrix = np.array(slope(y, *[worst[name] for name in model.data]))
-        rates.append(float(np.abs(np.linalg.eigvals(matrix)).max()))
+        for y[model.layout["target"]] in (0.0, 1e-3):  # a target that sticks hides how fast it can move
+            matrix = np.array(slope(y, *[worst[name] for name in model.data]))
+            rates.append(float(np.abs(np.linalg.eigvals(matrix)).max()))
     return _LIMIT / max(rates)

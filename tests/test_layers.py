@@ -26,7 +26,7 @@ LAYERS = (
     ("nlp",),
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),
-    ("reference",),
+    ("reference", "cases"),
     ("solution", "baseline", "planner", "robustness"),
     ("problem_file", "output", "replay", "sweep"),
     ("plotting", "report", "screen"),

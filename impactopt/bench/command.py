@@ -90,6 +90,12 @@ def margins(
     _run(["margins"], {"margins": options}, as_json, out, quiet)
 
 
+@app.command("virtual-base")
+def virtual_base(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+    """The paper's mass M_g under the soles against soles held exactly: its error, and rounding's."""
+    _run(["virtual-base"], {}, as_json, out, quiet)
+
+
 @app.command("all")
 def run_all(
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,

@@ -9,10 +9,11 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..codegen import cached, model_hash
 from ..errors import InputError, check_array, did_you_mean
+from .exact import ExactCollision
 from .graph import (
     METHODS,
     collision_graph,
@@ -32,7 +33,7 @@ __all__ = ["SymbolicModel"]
 
 # [s] by method: Taylor steps are held by events and by the servo's fastest mode, not by accuracy; the other
 # is the paper's
-_STEPS = {"events": 2.5e-4, "rk4": 1e-4}
+_STEPS = {"events": 2.5e-4, "rk4": 1e-4, "exact": 2.5e-4}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,9 +45,10 @@ class SymbolicModel(CollisionModel):
     terms : effects that are taken into account.
     method : "events", Taylor steps of order six that end on events (impulse within 1e-6 relative of the exact
         solution, most often within 1e-9); or "rk4", the paper's fixed Runge-Kutta steps, for laws that have
-        no such derivatives. None: the first that law and target allow.
+        no such derivatives. None: the first that law and target allow. Or "exact", up to rounding, where law
+        and target are linear between events, to measure the others by: for `collide` only.
     step : [s] length of a step, below `stable_step(q)`; None: 2.5e-4 for "events", the paper's 1e-4 for
-        "rk4".
+        "rk4". With "exact", where it need not be stable, it is the histories' spacing: None is 2.5e-4.
     report : told what is going on while functions are compiled, one line a call.
 
     Raises
@@ -63,9 +65,10 @@ class SymbolicModel(CollisionModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.method is not None and self.method not in METHODS:
+        methods = (*METHODS, "exact")
+        if self.method is not None and self.method not in methods:
             raise InputError(
-                f"method {self.method!r}{did_you_mean(self.method, METHODS)}; there are {', '.join(METHODS)}"
+                f"method {self.method!r}{did_you_mean(self.method, methods)}; there are {', '.join(methods)}"
             )
         for thing in (self.law, self.target):
             if self.method == "events" and not thing.analytic:
@@ -79,6 +82,10 @@ class SymbolicModel(CollisionModel):
             raise InputError(f"step [s]: {self.step_length:g} is longer than the horizon, {self.horizon:g} s")
         # checks the numbers now, and not when they are first used
         _ = self.settings
+        if self.method == "exact":
+            if self.n_freezes:
+                raise InputError("method 'exact': only without further freezes: freezes=0, or use 'events'")
+            _ = self._exact
 
     # ------------------------------------------------------------ what is modelled
     @property
@@ -197,6 +204,8 @@ class SymbolicModel(CollisionModel):
 
     def _check_outputs(self, outputs: tuple[str, ...], every: int) -> None:
         check_outputs(tuple(outputs))
+        if self.stepping == "exact":
+            raise InputError("method 'exact' gives numbers only, by `collide`; use 'events' for functions")
         if every < 1:
             raise InputError(f"every: {every}; give a number of steps >= 1")
         for name in outputs:
@@ -233,7 +242,19 @@ class SymbolicModel(CollisionModel):
             given = check_array("torque [N m]", torque, (self.robot.n,))
             if self.terms.feedforward:
                 arguments.append(given)
-        longest = self.stable_step(q, **overrides)
+        if self.stepping == "exact":
+            result = self._exact(q, v, arguments[2] if self.terms.feedforward else None, values)
+        else:
+            result = self._by_steps(arguments, values)
+        if require_separation and not result.separated:
+            raise InputError(
+                f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
+                "or pass require_separation=False for what happened so far"
+            )
+        return result
+
+    def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
+        longest = self.stable_step(arguments[0], **values)
         if self.step_length >= longest:
             raise InputError(
                 f"step [s]: {self.step_length:g} is unstable here, where the fastest mode allows "
@@ -243,13 +264,11 @@ class SymbolicModel(CollisionModel):
         whole = self._compiled("collision", (*names, 1), lambda: self.graph(names))
         found = whole.call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
-        result = Collision.from_outputs(outputs, self.target)
-        if require_separation and not result.separated:
-            raise InputError(
-                f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
-                "or pass require_separation=False for what happened so far"
-            )
-        return result
+        return Collision.from_outputs(outputs, self.target)
+
+    @cached_property
+    def _exact(self) -> ExactCollision:
+        return ExactCollision(self)
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
         """[s] that the step has to stay below at q: 2.6 over the fastest mode's rate, no joint saturated."""

@@ -1,0 +1,263 @@
+"""The frozen collision solved exactly, piece by piece, where law and target are linear between events.
+
+Between events (end of compression, separation, a joint entering or leaving saturation or its friction's
+transition band, a switch of the target) the frozen equations are linear with constant coefficients, so that
+z(t + h) = exp(M h) z(t). Within h, one over the fastest mode's rate, Taylor's polynomials of degree 20 are
+exact to rounding; their Bernstein coefficients enclose what is watched, so no event goes unseen, however
+soon it is undone. What is left are rounding errors: this is what other methods are measured against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from .bernstein import bernstein_matrix, first_negative, largest
+from .course import Stretch
+from .graph import frozen_dynamics, joint_space_model, target_yield
+from .linear_contact import force_coefficients, target_pieces
+from .outputs import Outputs, frozen_for
+from .pieces import Phase, Pieces
+from .result import Collision
+
+if TYPE_CHECKING:
+    from .symbolic import SymbolicModel
+
+__all__ = ["ExactCollision", "Path", "exact_collision", "exact_path"]
+
+Array = NDArray[np.float64]
+
+_DEGREE = 20
+_TO_BERNSTEIN = bernstein_matrix(_DEGREE)
+# of the terms that a watched form sums up: below this its value is rounding
+_ROUNDING = 64 * np.finfo(float).eps
+_MOST_PHASES = 10_000
+
+
+def exact_collision(
+    collision: SymbolicModel, q: Array, v: Array, torque: Array | None, values: dict[str, Array]
+) -> Collision:
+    """One collision, exact but for rounding.
+
+    Parameters
+    ----------
+    collision : the model; of its `method` nothing is used, and of its `step` the histories' spacing.
+    q, v : (nq), (nv) at contact, Pinocchio's.
+    torque : (n) [N m] feed-forward; None where terms.feedforward is off.
+    values : all of `collision.settings`.
+
+    Raises
+    ------
+    InputError : law or target that are not linear between events.
+    """
+    return ExactCollision(collision)(q, v, torque, values)
+
+
+class ExactCollision:
+    """`exact_collision` for one model, with what it takes to freeze it kept.
+
+    Raises
+    ------
+    InputError : law or target that are not linear between events.
+    """
+
+    def __init__(self, collision: SymbolicModel) -> None:
+        self.collision = collision
+        self.model = joint_space_model(collision, ("configuration",))
+        force_coefficients(collision.law, collision.law.parameters)
+        target_pieces(collision.target, collision.target.parameters)
+
+    @cached_property
+    def _frozen(self) -> Any:
+        return frozen_dynamics(self.collision)
+
+    @cached_property
+    def _freeze(self) -> Any:
+        names = (*self.model.frozen, *frozen_for(self.collision.available))
+        return self._frozen.function("frozen", tuple(dict.fromkeys(names)))
+
+    def __call__(self, q: Array, v: Array, torque: Array | None, values: dict[str, Array]) -> Collision:
+        model, collision = self.model, self.collision
+        gives_way = target_yield(model.target, model.target_numbers(values))
+        found = self._freeze.call([ca.DM(x) for x in (q, v, values["normal"], gives_way)])
+        data: dict[str, Any] = dict(zip(self._freeze.name_out(), found, strict=True))
+        data |= {"q": q, "v": v, "joint_velocity": v[-collision.robot.n :], **values}
+        if collision.terms.feedforward:
+            data["feedforward"] = torque
+        numbers = {name: _array(data[name]) for name in model.data}
+        path = exact_path(Pieces(model, numbers), collision.horizon, collision.step_length)
+        return self._result({name: ca.DM(x) for name, x in data.items()}, path)
+
+    def _result(self, data: dict[str, Any], path: Path) -> Collision:
+        """By the same formulas as other methods' results, but for what is known exactly here."""
+        frozen, collision = self._frozen, self.collision
+        states = ca.DM(path.states.T)
+        final = states[:, -1]
+
+        def change(*, second: bool) -> Any:
+            """Of v since contact, or its integral over time."""
+            names = ("torque2", "impulse2") if second else ("torque", "impulse")
+            joints, impulse = (self.model.part(final, name) for name in names)
+            time = self.model.part(final, "time")
+            weight = time**2 / 2 if second else time
+            joints = joints if self.model.n else ca.DM.zeros(collision.robot.n)
+            wrench = data["L_tau"] @ joints - data["L_f"] * impulse + data["L_0"] * weight
+            at = (data["q"], data["drift_velocity"], data["normal"])
+            return frozen.velocity_change(*at, joints, impulse, wrench, weight)
+
+        way = data["v"] * path.time[-1] + change(second=True)
+        stretch = Stretch(
+            data=data,
+            since=0.0,
+            final=final,
+            states=states,
+            v_after=lambda: data["v"] + change(second=False),
+            q_after=lambda: frozen.integrate(data["q"], way),
+        )
+        made = Outputs(self.model, [stretch], len(frozen.soles), len(frozen.held), data["v"])
+        known = {"peak_force": path.peak_force, "separated": float(path.separated)}
+        out = {name: np.array([[x]]) for name, x in known.items()}
+        for name in collision.available:
+            if name not in out:
+                out[name] = np.array(ca.evalf(ca.densify(ca.MX(getattr(made, name)))))
+        if path.separated:  # there the force is zero, and not what rounding has left of it
+            out["force"].ravel()[-1] = 0.0
+        return Collision.from_outputs(out, collision.target)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path:
+    """States from contact to separation.
+
+    Attributes
+    ----------
+    time : (k) [s], at phases' ends and on a uniform grid.
+    states : (k, n_states) of the joint-space model.
+    peak_force : [N] largest force at any time.
+    separated : whether the contact ended within the horizon.
+    phases : that were gone through, in order.
+    """
+
+    time: Array
+    states: Array
+    peak_force: float
+    separated: bool
+    phases: list[Phase]
+
+
+def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
+    """From contact to separation, or to the horizon [s]; states are kept every `spacing` [s].
+
+    Raises
+    ------
+    RuntimeError : phases that end as soon as they begin, one after the other.
+    """
+    z, phase = pieces.start()
+    phases, kept, peak = [phase], [z], 0.0
+    over = not phase.compressing and not pieces.force(phase) @ z > 0
+    step = min(1.0 / pieces.fastest(), horizon)
+    following: Phase | None = None if over else phase
+    time = pieces.model.layout["time"].start
+    while following is not None and z[time] < horizon:
+        phase, flow = following, _Flow(pieces, following, step)
+        ended = None
+        while ended is None and z[time] < horizon:
+            flow = flow.fitting(z)
+            terms = flow.terms(z)
+            ended = flow.first_exit(z, terms)
+            # [0, 1] of this step until the event, the horizon, or the step's end
+            left = (horizon - z[time]) / flow.step
+            s = min(1.0 if ended is None else ended[0], left)
+            peak = largest(_TO_BERNSTEIN @ (terms @ flow.force), s, peak)
+            begin, end = z[time], z[time] + s * flow.step
+            for grid in spacing * np.arange(np.floor(begin / spacing) + 1, np.ceil(end / spacing)):
+                kept.append(_value(terms, (grid - begin) / flow.step))
+            if ended is None and s < left:
+                z = flow.exponential @ z
+            else:
+                z = _value(terms, s)
+                if s >= left:
+                    z[time] = horizon
+                    ended = ended if ended is not None and ended[0] < left else (s, -1, False)
+        kept.append(z)
+        assert ended is not None
+        _, which, above = ended
+        if which < 0:
+            break
+        following = pieces.after(phase, flow.watch.of[which], above=above)
+        if following is not None:
+            phases.append(following)
+        if len(phases) > _MOST_PHASES:
+            raise RuntimeError(f"more than {_MOST_PHASES} phases by {z[time]:.3g} s")
+    states = np.array(kept)
+    return Path(
+        time=states[:, time],
+        states=states[:, :-1],
+        peak_force=peak,
+        separated=over or following is None,
+        phases=phases,
+    )
+
+
+class _Flow:
+    """Steps of one length [s] within one phase."""
+
+    def __init__(self, pieces: Pieces, phase: Phase, step: float) -> None:
+        self.pieces, self.phase, self.step = pieces, phase, step
+        self.scaled = pieces.matrix(phase) * step
+        self.exponential = expm(self.scaled)
+        self.watch, self.force = pieces.watch(phase), pieces.force(phase)
+
+    def fitting(self, z: Array) -> _Flow:
+        """This flow, or one of shorter steps: Taylor's polynomials have to end where the exponential does."""
+        ends = self.exponential @ z
+        sums = _value(self.terms(z), 1.0)
+        rows = self.watch.rows
+        size = np.abs(rows) @ (np.abs(ends) + np.abs(z))
+        if (np.abs(rows @ (sums - ends)) <= 1e-12 * size).all():
+            return self
+        return _Flow(self.pieces, self.phase, self.step / 2).fitting(z)
+
+    def terms(self, z: Array) -> Array:
+        """(degree + 1, N): z(s step) = sum of s^k times row k."""
+        out = np.empty((_DEGREE + 1, z.size))
+        out[0] = z
+        for k in range(_DEGREE):
+            out[k + 1] = self.scaled @ out[k] / (k + 1)
+        return out
+
+    def first_exit(self, z: Array, terms: Array) -> tuple[float, int, bool] | None:
+        """(place in the step, number of the form, whether above) of the first to leave its bounds.
+
+        Bounds are widened by rounding errors, so that a form that has just come in is not thrown out.
+        """
+        watch = self.watch
+        b = _TO_BERNSTEIN @ (terms @ watch.rows.T)
+        sizes = np.abs(watch.rows) @ np.abs(z)
+        first: tuple[float, int, bool] | None = None
+        for bound, sign in ((watch.lower, 1.0), (watch.upper, -1.0)):
+            there = np.isfinite(bound)
+            edge = np.where(there, bound, 0.0)
+            margin = sign * (b - edge) + _ROUNDING * (sizes + np.abs(edge))
+            for i in np.flatnonzero(there & (margin < 0).any(axis=0)):
+                place = first_negative(margin[:, i])
+                if place is not None and (first is None or place < first[0]):
+                    first = (place, int(i), sign < 0)
+        return first
+
+
+def _value(terms: Array, s: float) -> Array:
+    z: Array = s ** np.arange(_DEGREE + 1) @ terms
+    return z
+
+
+def _array(value: Any) -> Array:
+    """As the settings have it: matrices as they are, columns as vectors."""
+    found = np.array(value, dtype=float)
+    return found.ravel() if found.ndim < 2 or 1 in found.shape else found

@@ -59,11 +59,14 @@ _EXPORTS = {
     "draw_conditions": "robustness",
     "effective_mass": "collision",
     "g1": "presets",
+    "holding_torque": "reference.holding",
     "load_problem": "problem_file",
     "load_record": "output",
     "load_robot": "presets",
+    "posture_of_effective_mass": "cases",
     "solve": "planner",
     "standin": "presets",
+    "striking_velocity": "cases",
     "talos": "presets",
 }
 

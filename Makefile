@@ -8,12 +8,12 @@ EXTRAS := robots,validate,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench clean distclean
+.PHONY: help venv demo test lint types format bench reproduce clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1|\2/p' $(firstword $(MAKEFILE_LIST)) | awk -F'|' '{printf "%-12s %s\n", $$1, $$2}'
-	@echo "Options: ARGS='...' for test, demo and bench; PYTHON=... for the interpreter that makes .venv"
+	@echo "Options: ARGS='...' for test, demo, bench and reproduce; PYTHON=... for the interpreter that makes .venv"
 
 venv: $(STAMP) ## make .venv with this project and what it needs
 
@@ -58,6 +58,9 @@ format: $(STAMP) ## rewrite the sources in the project's style
 
 bench: $(STAMP) ## run every benchmark, some minutes; tables, JSON and pictures in results/bench
 	@$(BIN)/impactopt bench all --out results/bench $(ARGS)
+
+reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes; results/reproduce
+	@$(BIN)/impactopt reproduce all --out results/reproduce $(ARGS)
 
 clean: ## remove results and caches of the tools; .venv and compiled functions stay
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -16,6 +16,7 @@ import typer
 from impactopt._validate_command import validate
 from impactopt.bench.command import app as bench_app
 from impactopt.plain_errors import plain_errors
+from impactopt.reproduce.command import reproduce
 
 if TYPE_CHECKING:
     from impactopt.output import Record
@@ -121,6 +122,7 @@ def solve(
 
 
 app.command()(validate)
+app.command()(reproduce)
 
 
 @app.command()

@@ -5,13 +5,13 @@ Exit codes: 0 done, 2 bad input, or nothing to measure.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from impactopt.plain_errors import plain_errors
+from impactopt.bench.report import Report, Say
+from impactopt.bench.running import show_reports
 
 app = typer.Typer(
     name="bench",
@@ -127,28 +127,18 @@ def _run(
     together: bool = False,
 ) -> None:
     """Run benches by name, show each when it is done; ``options`` by bench."""
-    with plain_errors("interrupted before the bench was done") as console:
-        from rich.console import Console
 
+    def run(name: str, say: Say) -> Report:
         from impactopt.bench.registry import run_bench
-        from impactopt.bench.report import save_report
-        from impactopt.output import make_directory, plain
-        from impactopt.screen import Progress
 
-        directory = make_directory(out) if out is not None else None
-        found = {}
-        for name in names:
-            with Progress(console, quiet=quiet) as progress:
-                report = run_bench(name, progress.say, **options.get(name, {}))
-                written = save_report(report, directory) if directory is not None else []
-            found[name] = plain(report.numbers)
-            if as_json:
-                continue
-            screen = Console()
-            for table in report.tables:
-                screen.print(table)
-            if written:
-                files = ", ".join(path.name for path in written)
-                screen.print(f"{written[0].parent}: {files}", highlight=False, soft_wrap=True)
-        if as_json:
-            typer.echo(json.dumps(found if together else found[names[0]], indent=2))
+        return run_bench(name, say, **options.get(name, {}))
+
+    show_reports(
+        names,
+        run,
+        as_json=as_json,
+        out=out,
+        quiet=quiet,
+        together=together,
+        interrupted="interrupted before the bench was done",
+    )

@@ -1,0 +1,9 @@
+"""The paper's tables and figures beside ours, each by one command, `impactopt reproduce NAME`.
+
+* registry.py    tables and figures by name
+* command.py     the command line
+* paper.py       what the paper prints
+* costs.py       its formulas of computation cost; timing.py, trees.py: our own implementations, measured
+* motions.py     the nine motions through every rung of the ladder of collision models
+* table1.py, table2.py, table3.py, fig3.py, fig4.py, fig7.py    one a file, each with a function `run`
+"""

@@ -35,13 +35,13 @@ class Compiler:
         return "\0".join([ca.__version__, *self.command, self.version, *_FLAGS, platform.machine(), _cpu()])
 
     def run(self, source: Path, library: Path, level: str) -> None:
-        """Compile `source` into the shared `library` at an optimization level such as "-O1".
+        """Compile `source` into the shared `library` at an optimization level such as "-O1", or flags.
 
         Raises
         ------
         CompileError : with the compiler's first error.
         """
-        command = [*self.command, level, *_FLAGS, str(source), "-o", str(library), "-lm"]
+        command = [*self.command, *level.split(), *_FLAGS, str(source), "-o", str(library), "-lm"]
         result = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
         if result.returncode != 0:
             lines = result.stderr.strip().splitlines() or ["no message"]

@@ -23,6 +23,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ from impactopt.private_files import (
     write_atomically,
 )
 
-__all__ = ["cache_directory", "cached", "model_hash"]
+__all__ = ["NativeCode", "cache_directory", "cached", "model_hash"]
 
 Report = Callable[[str], None]
 
@@ -76,12 +77,33 @@ _NOT_IN_GRAPHS = frozenset(
 # gcc -O1 allocates registers in more than linear time: 6, 18, 71 s for 16, 47, 118 thousand instructions.
 # Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
 _MAX_OPTIMIZED = 60_000
+# Loops over vectors gain from all that keeps the order of sums; -ffast-math would not keep it, nor NaN.
+_NATIVE_LEVEL = "-O3 -fvisibility=hidden -ffp-contract=fast -fno-math-errno -fno-trapping-math"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NativeCode:
+    """A function whose C code is not CasADi's, but keeps to the interface that `ca.external` asks for.
+
+    Attributes
+    ----------
+    name : of the function.
+    code : C, one translation unit.
+    graph : builds the same function as a graph, for where there is no compiler.
+    """
+
+    name: str
+    code: str
+    graph: Callable[[], ca.Function]
+
+
+Buildable = Any  # ca.Function or NativeCode
 
 
 def cached(
     name: str,
     recipe: tuple[Any, ...],
-    build: Callable[[], Sequence[ca.Function]],
+    build: Callable[[], Sequence[Buildable]],
     *,
     report: Report | None = None,
 ) -> dict[str, ca.Function]:
@@ -95,7 +117,7 @@ def cached(
     name : of the group of functions, for file names and messages.
     recipe : everything but this package's sources that shapes the functions: numbers, text, arrays, enums,
         dataclasses, and tuples or mappings of them; for a model, its `model_hash`.
-    build : makes the functions; only called when the cache has no valid copy.
+    build : makes the functions, as graphs or as `NativeCode`; only called when the cache has no valid copy.
     report : told what is going on, one line a call, while functions are compiled.
 
     Returns
@@ -108,7 +130,7 @@ def cached(
     compiler = find_compiler()
     if compiler is None:
         _warn_no_compiler()
-        return _by_name(build())
+        return _graphs(_by_name(build()))
     try:
         directory = private_directory(cache_directory())
     except (UnsafePath, OSError) as error:
@@ -161,7 +183,7 @@ def _build_entry(
     directory: Path,
     entry: str,
     name: str,
-    build: Callable[[], Sequence[ca.Function]],
+    build: Callable[[], Sequence[Buildable]],
     compiler: Compiler,
     tell: Report,
 ) -> dict[str, ca.Function]:
@@ -177,7 +199,7 @@ def _build_entry(
                 # the longest first, so that the cores finish together; CasADi itself stays in this thread
                 for function in sorted(functions.values(), key=_longest_body, reverse=True):
                     job = pool.submit(_library, directory, Path(scratch), *_c_code(function), compiler)
-                    jobs[job] = function.name()
+                    jobs[job] = _name_of(function)
                 for done, job in enumerate(as_completed(jobs), start=1):
                     listing[jobs[job]] = job.result()
                     seconds = time.monotonic() - start
@@ -193,12 +215,14 @@ def _build_entry(
             NoCompilerWarning,
             stacklevel=4,
         )
-        return functions
+        return _graphs(functions)
     return {f: ca.external(f, str(directory / listing[f][0])) for f in functions}
 
 
-def _c_code(function: ca.Function) -> tuple[str, str, str]:
+def _c_code(function: Buildable) -> tuple[str, str, str]:
     """Name, C code and optimization level of a function."""
+    if isinstance(function, NativeCode):
+        return function.name, function.code, _NATIVE_LEVEL
     name = str(function.name())
     generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
     generator.add(function)
@@ -231,21 +255,33 @@ def _library(
     return library.name, digest
 
 
-def _longest_body(function: ca.Function) -> int:
+def _longest_body(function: Buildable) -> int:
     """Instructions in the longest of the C functions that `function` becomes."""
+    if isinstance(function, NativeCode):
+        return _MAX_OPTIMIZED
     parts = [function, *function.find_functions()]
     return max(
         (int(f.n_instructions()) for f in parts if f.class_name() in ("SXFunction", "MXFunction")), default=0
     )
 
 
-def _by_name(functions: Sequence[ca.Function]) -> dict[str, ca.Function]:
-    named: dict[str, ca.Function] = {}
+def _name_of(function: Buildable) -> str:
+    return function.name if isinstance(function, NativeCode) else str(function.name())
+
+
+def _by_name(functions: Sequence[Buildable]) -> dict[str, Buildable]:
+    named: dict[str, Buildable] = {}
     for function in functions:
-        if function.name() in named:
-            raise ValueError(f"two functions of one group are named {function.name()!r}")
-        named[function.name()] = function
+        name = _name_of(function)
+        if name in named:
+            raise ValueError(f"two functions of one group are named {name!r}")
+        named[name] = function
     return named
+
+
+def _graphs(functions: dict[str, Buildable]) -> dict[str, ca.Function]:
+    """The functions as CasADi can run them itself."""
+    return {name: f.graph() if isinstance(f, NativeCode) else f for name, f in functions.items()}
 
 
 @functools.cache
@@ -263,10 +299,10 @@ def _sources_key() -> str:
     """Hash of this package's sources that can shape a graph."""
     root = Path(__file__).parent
     digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
+    for path in sorted(path for kind in ("*.py", "*.c", "*.h") for path in root.rglob(kind)):
         parts = path.relative_to(root).with_suffix("").parts
         if parts[0] not in _NOT_IN_GRAPHS:
-            digest.update("/".join(parts).encode() + b"\0" + path.read_bytes() + b"\0")
+            digest.update("/".join((*parts[:-1], path.name)).encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
 

@@ -1,0 +1,169 @@
+/* The time loop, and the course of a collision over its freezes; see collision/loop.py and course.py. */
+
+typedef struct {
+  Frozen frozen;
+  Data data;
+  double q[NQ], v[NV], normal[3], feedforward[N1];
+} Work;
+
+/* steps in a block of the graph's loop, which looks once more at what stands still, but not between blocks */
+#define BLOCK 16
+
+/* from y to separation, or the freeze's end; the phase at the end */
+static Instant run(const Data *d, State *y, int steps, const Record *record) {
+  Instant now;
+  int made = 0;
+  for (;; made++) {
+    look(d, y, &now);
+    judge(d, y, &now);
+    if (record && made % EVERY == 0 && made < steps) write_column(d, y, &now, record, made / EVERY);
+    if (made == steps || !now.contact || !(y->time < d->until)) break;
+    advance(d, y, &now, fmin(LENGTH, d->until - y->time));
+  }
+  if (made % BLOCK) stand_still(d, y, &now);
+  if (!(now.rate == now.rate)) {
+    /* no number in, none out */
+    y->impulse = y->time = y->penetration = y->peak = NAN;
+    FOR(i, V) y->torque[i] = y->torque2[i] = (vec){0} + NAN;
+    FOR(i, NZ) y->target[i] = NAN;
+    y->impulse2 = NAN;
+    look(d, y, &now);
+    now.contact = 1;
+  }
+  if (record) {
+    const int column = made < steps ? (made + EVERY - 1) / EVERY : record->columns - 1;
+    write_column(d, y, &now, record, column);
+    repeat_column(record, column);
+  }
+  return now;
+}
+
+static void load(const double *from, double *to, int n) {
+  FOR(i, n) to[i] = from ? from[i] : 0.0;
+}
+
+static void load_data(const double **arg, Data *d) {
+  double ones[V * LANES];
+  FOR(i, V * LANES) ones[i] = 1.0;
+  pad(d->kept, V, ones, N, 0.0);
+#if N
+#if KD_MATRIX
+  FOR(j, N) pad(d->kd[j], V, arg[ARG_kd] ? arg[ARG_kd] + N * j : 0, N, 0.0);
+#else
+  pad(d->kd, V, arg[ARG_kd], N, 0.0);
+#endif
+#if STIFFNESS && KP_MATRIX
+  FOR(j, N) pad(d->kp[j], V, arg[ARG_kp] ? arg[ARG_kp] + N * j : 0, N, 0.0);
+#elif STIFFNESS
+  pad(d->kp, V, arg[ARG_kp], N, 0.0);
+#endif
+#else
+  memset(d->kd, 0, sizeof d->kd);
+#endif
+#if SATURATION
+  pad(d->limit, V, arg[ARG_torque_limit], N, 1.0);
+#endif
+#if FRICTION
+  pad(d->viscous, V, arg[ARG_viscous], N, 0.0);
+  pad(d->coulomb, V, arg[ARG_coulomb], N, 0.0);
+  pad(d->joint_velocity, V, arg[ARG_v] ? arg[ARG_v] + NV - N : 0, N, 0.0);
+#endif
+#if FEEDFORWARD
+  pad(d->feedforward, V, arg[ARG_feedforward], N, 0.0);
+#endif
+  FOR(i, N_LAW) load(arg[ARG_law + i], d->law + i, 1);
+  FOR(i, N_TARGET) load(arg[ARG_target + i], d->target + i, 1);
+}
+
+static const double *filled(const double *given, double *room, int n) {
+  if (given) return given;
+  load(0, room, n);
+  return room;
+}
+
+#if FREEZES
+/* configuration and velocity at state y, from those at the begin of the stretch */
+static void moved(const Frozen *F, const double *q, const double *v, const State *y, double *q_then,
+                  double *v_then) {
+  double way[NV], change[NV], from[NQ];
+  memcpy(from, q, sizeof from);
+  velocity_change(F, y->torque2, y->impulse2, y->time * y->time / 2, way);
+  velocity_change(F, y->torque, y->impulse, y->time, change);
+  FOR(i, NV) way[i] = v[i] * y->time + way[i];
+  const double *in[] = {from, way};
+  double *out[] = {q_then};
+  integrate(in, out, 0, 0, 0);
+  FOR(i, NV) v_then[i] = v[i] + change[i];
+}
+#endif
+
+/* what the collision has led to */
+typedef struct {
+  State final;
+  double impulse, duration, in_contact;
+  double q[NQ], v[NV]; /* at the begin of the last stretch */
+} Course;
+
+static void collide(const double **arg, double **res, Work *w, Course *c) {
+  Frozen *F = &w->frozen;
+  Data *d = &w->data;
+  const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
+  const double *normal = filled(arg[ARG_normal], w->normal, 3);
+  Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
+  const Record *record = HISTORIES ? &recorded : 0;
+  load_data(arg, d);
+  freeze(q, v, normal, call(target_yield, d->target, 0, 0), F);
+  d->frozen = F;
+  d->hand_speed = F->hand_speed;
+  memset(&c->final, 0, sizeof c->final);
+  memcpy(c->q, q, sizeof c->q);
+  memcpy(c->v, v, sizeof c->v);
+  d->until = HORIZON;
+#if !FREEZES
+  c->in_contact = run(d, &c->final, STEPS[0], record).contact;
+  c->impulse = c->final.impulse;
+  c->duration = c->final.time;
+#else
+  State start = {0}, reached = {0}, middle;
+  double q_middle[NQ], v_middle[NV], q_then[NQ], v_then[NV];
+  FOR(i, V) d->before[i] = (vec){0};
+  run(d, &reached, STEPS_AT_ALL, 0);
+  const double duration = reached.time;
+  memset(&reached, 0, sizeof reached);
+  c->impulse = c->duration = 0.0;
+  c->in_contact = 1.0;
+  FOR(i, FREEZES) {
+    const double share = ENDS[i + 1] - ENDS[i];
+    const int last = i == FREEZES - 1;
+    middle = reached;
+    d->until = reached.time + duration * share / 2;
+    run(d, &middle, STEPS_TO_MIDDLE[i], 0);
+    moved(F, c->q, c->v, &middle, q_middle, v_middle);
+    if (i) {
+      moved(F, c->q, c->v, &reached, q_then, v_then);
+      memcpy(c->q, q_then, sizeof c->q);
+      memcpy(c->v, v_then, sizeof c->v);
+    }
+    freeze(q_middle, v_middle, normal, 1e30, F);
+    const double *in[] = {c->q, c->v, normal};
+    double *out[] = {&d->hand_speed};
+    hand_speed_at(in, out, 0, 0, 0);
+    double before[NV];
+    FOR(k, NV) before[k] = c->v[k] - v[k];
+    pad(d->before, V, before + NV - N, N, 0.0);
+    d->until = c->in_contact ? (last ? HORIZON - duration * ENDS[i] : duration * share) : -1.0;
+    recorded.since = duration * ENDS[i];
+    recorded.columns = N_COLUMNS[i];
+    reached = start;
+    c->in_contact *= run(d, &reached, STEPS[i], record).contact;
+    recorded.column += N_COLUMNS[i];
+    c->impulse += reached.impulse;
+    c->duration += reached.time;
+    c->final = reached;
+    start = reached;
+    start.time = start.impulse = start.impulse2 = 0.0;
+    memset(start.torque, 0, sizeof start.torque);
+    memset(start.torque2, 0, sizeof start.torque2);
+  }
+#endif
+}

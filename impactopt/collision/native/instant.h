@@ -1,0 +1,126 @@
+/* State of the collision in joint space, and the forces in it at one instant; see collision/model.py. */
+
+typedef struct {
+  vec torque[V], deviation[V], torque2[V];
+  double time, penetration, impulse, peak, impulse2;
+  double target[NZ1];
+} State;
+
+/* what is constant during a stretch of the collision */
+typedef struct {
+  const Frozen *frozen;
+  double hand_speed, until;
+  vec kept[V];          /* 1 at the joints, else 0 */
+  vec joint_velocity[V], before[V], feedforward[V], limit[V], viscous[V], coulomb[V];
+#if KD_MATRIX
+  vec kd[N1][V];
+#else
+  vec kd[V];
+#endif
+#if KP_MATRIX
+  vec kp[N1][V];
+#else
+  vec kp[V];
+#endif
+  double law[AT_LEAST_1(N_LAW)], target[AT_LEAST_1(N_TARGET)];
+} Data;
+
+typedef struct {
+  vec u[V], demand[V], torque[V], net[V]; /* net: less friction */
+  double speed, target_speed, rate;
+  int compressing, contact;
+} Instant;
+
+INLINE double call(int (*f)(const double **, double **, long long *, double *, int), const double *a,
+                   const double *b, const double *c) {
+  double out = 0.0;
+  const double *in[] = {a, b, c};
+  double *to[] = {&out};
+  f(in, to, 0, 0, 0);
+  return out;
+}
+
+/* u and the hand's speed, from integrals of torque and force, and time; or from derivatives of them */
+INLINE double velocity(const Data *d, const vec *torque, double impulse, double time, vec *u) {
+  const Frozen *F = d->frozen;
+  const double *x = (const double *)torque;
+  vec a[V], b[V];
+#if BIAS || JDOT
+  FOR(i, V) a[i] = F->drift[i] * time;
+#else
+  FOR(i, V) a[i] = (vec){0};
+#endif
+  FOR(i, V) b[i] = (vec){0};
+  int j = 0;
+#pragma GCC unroll 16
+  for (; j + 1 < N; j += 2) {
+    FOR(i, V) a[i] += F->Q[j][i] * x[j];
+    FOR(i, V) b[i] += F->Q[j + 1][i] * x[j + 1];
+  }
+  if (N % 2) FOR(i, V) a[i] += F->Q[N - 1][i] * x[N - 1];
+  FOR(i, V) u[i] = (a[i] + b[i]) - F->Q[N][i] * impulse;
+  const double speed = u[N / LANES][N % LANES];
+  u[V - 1] *= d->kept[V - 1];
+  return speed;
+}
+
+INLINE void times_matrix(const vec (*m)[V], const vec *x, vec *out) {
+  FOR(i, V) out[i] = (vec){0};
+  FOR(j, N) FOR(i, V) out[i] += m[j][i] * ((const double *)x)[j];
+}
+
+/* the servo's torque from joint velocity and deviation, both less those at contact */
+INLINE void servo(const Data *d, const vec *u, const vec *deviation, vec *out) {
+#if KD_MATRIX
+  times_matrix(d->kd, u, out);
+  FOR(i, V) out[i] = -out[i];
+#else
+  FOR(i, V) out[i] = -(d->kd[i] * u[i]);
+#endif
+#if STIFFNESS
+#if KP_MATRIX
+  vec held[V];
+  times_matrix(d->kp, deviation, held);
+  FOR(i, V) out[i] += held[i];
+#else
+  FOR(i, V) out[i] += d->kp[i] * deviation[i];
+#endif
+#endif
+}
+
+INLINE vec clipped(vec x, vec limit) { return choose(x > limit, limit, choose(x < -limit, -limit, x)); }
+INLINE vec magnitude(vec x) { return (vec)((bits)x & ~SIGN_BIT); }
+
+/* velocities, rate of penetration and servo at a state */
+INLINE void look(const Data *d, const State *y, Instant *now) {
+  now->speed = velocity(d, y->torque, y->impulse, y->time, now->u) + d->hand_speed;
+  now->target_speed = call(target_velocity, y->target, d->target, 0);
+  now->rate = now->speed - now->target_speed;
+#if FREEZES
+  FOR(i, V) now->u[i] += d->before[i];
+#endif
+  servo(d, now->u, y->deviation, now->demand);
+#if FEEDFORWARD
+  FOR(i, V) now->demand[i] += d->feedforward[i];
+#endif
+#if SATURATION
+  FOR(i, V) now->torque[i] = clipped(now->demand[i], d->limit[i]);
+#else
+  FOR(i, V) now->torque[i] = now->demand[i];
+#endif
+#if FRICTION
+  FOR(i, V) {
+    const vec one = d->kept[0] * 0.0 + 1.0, rate = d->joint_velocity[i] + now->u[i];
+    const vec sign = clipped(rate / TRANSITION, one);
+    now->net[i] = now->torque[i] - (d->viscous[i] * rate + d->coulomb[i] * sign);
+  }
+#else
+  FOR(i, V) now->net[i] = now->torque[i];
+#endif
+}
+
+/* phase: contact is over when, in restitution, no force is left */
+INLINE void judge(const Data *d, const State *y, Instant *now) {
+  now->compressing = now->rate > 0.0;
+  now->contact = now->compressing || call(restitution_force, &y->penetration, &now->rate, d->law) > 0.0;
+}

@@ -1,0 +1,86 @@
+/* Histories, a column an instant, straight into the outputs; see collision/outputs.py. */
+
+typedef struct {
+  double **out;
+  const double *v; /* at contact */
+  double since;
+  int column, columns; /* of the present stretch: the first, and how many */
+} Record;
+
+#define COLUMN_OF(name, rows) (out[OUT_##name] + (long)(rows) * column)
+
+static void write_column(const Data *d, const State *y, const Instant *now, const Record *record, int column) {
+  double **out = record->out;
+  column += record->column;
+#ifdef OUT_time
+  if (out[OUT_time]) *COLUMN_OF(time, 1) = record->since + y->time;
+#endif
+#ifdef OUT_penetration
+  if (out[OUT_penetration]) *COLUMN_OF(penetration, 1) = y->penetration;
+#endif
+#ifdef OUT_hand_speed
+  if (out[OUT_hand_speed]) *COLUMN_OF(hand_speed, 1) = now->speed;
+#endif
+#ifdef OUT_target_speed
+  if (out[OUT_target_speed]) *COLUMN_OF(target_speed, 1) = now->target_speed;
+#endif
+#ifdef OUT_joint_velocity
+  if (out[OUT_joint_velocity])
+    FOR(i, N) COLUMN_OF(joint_velocity, N)[i] = record->v[NV - N + i] + ((const double *)now->u)[i];
+#endif
+#ifdef OUT_torque
+  if (out[OUT_torque]) memcpy(COLUMN_OF(torque, N), now->torque, N * sizeof(double));
+#endif
+#ifdef OUT_demand
+  if (out[OUT_demand]) memcpy(COLUMN_OF(demand, N), now->demand, N * sizeof(double));
+#endif
+#if defined(OUT_force) || HELD_HISTORY
+  const double force = call(contact_force, &y->penetration, &now->rate, d->law);
+#endif
+#ifdef OUT_force
+  if (out[OUT_force]) *COLUMN_OF(force, 1) = force;
+#endif
+#if HELD_HISTORY
+  vec held[VC];
+  wrench_of(d->frozen, (const double *)now->net, force, 1.0, held);
+  const double *w = (const double *)held;
+#ifdef OUT_sole_wrench
+  if (out[OUT_sole_wrench]) memcpy(COLUMN_OF(sole_wrench, 6 * SOLES), w, 6 * SOLES * sizeof(double));
+#endif
+#ifdef OUT_hand_wrench
+  if (out[OUT_hand_wrench])
+    memcpy(COLUMN_OF(hand_wrench, C - 6 * SOLES), w + 6 * SOLES, (C - 6 * SOLES) * sizeof(double));
+#endif
+#if defined(OUT_ground_wrench) || defined(OUT_zmp)
+  double total[6];
+  memcpy(total, d->frozen->unmodelled, sizeof total);
+  FOR(s, SOLES) {
+    const double *f = w + 6 * s, *p = d->frozen->soles + 3 * s;
+    FOR(i, 6) total[i] += f[i];
+    total[3] += p[1] * f[2] - p[2] * f[1];
+    total[4] += p[2] * f[0] - p[0] * f[2];
+    total[5] += p[0] * f[1] - p[1] * f[0];
+  }
+#endif
+#ifdef OUT_ground_wrench
+  if (out[OUT_ground_wrench]) memcpy(COLUMN_OF(ground_wrench, 6), total, sizeof total);
+#endif
+#ifdef OUT_zmp
+  if (out[OUT_zmp]) {
+    COLUMN_OF(zmp, 2)[0] = -total[4] / total[2];
+    COLUMN_OF(zmp, 2)[1] = total[3] / total[2];
+  }
+#endif
+#endif
+}
+
+/* the columns after `column` repeat it */
+static void repeat_column(const Record *record, int column) {
+  const int begin = record->column + column, end = record->column + record->columns;
+  FOR(i, N_OUT) {
+    const int rows = ROWS[i];
+    if (!rows || !record->out[i]) continue;
+    const double *from = record->out[i] + (long)rows * begin;
+    for (int k = begin + 1; k < end; k++) memcpy(record->out[i] + (long)rows * k, from, rows * sizeof(double));
+  }
+}

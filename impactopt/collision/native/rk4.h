@@ -1,0 +1,61 @@
+/* Fixed steps of the classical Runge-Kutta method; see collision/runge_kutta.py. */
+
+typedef struct {
+  vec torque[V], deviation[V], torque2[V];
+  double penetration, impulse, impulse2, target[NZ1];
+} Slope;
+
+INLINE void slope_at(const Data *d, const State *y, const Instant *now, Slope *s) {
+  s->penetration = now->rate;
+  s->impulse = call(contact_force, &y->penetration, &now->rate, d->law);
+  const double *in[] = {y->target, &s->impulse, d->target};
+  double *out[] = {s->target};
+  target_rates(in, out, 0, 0, 0);
+  FOR(i, V) {
+    s->torque[i] = now->net[i];
+    if (STIFFNESS) s->deviation[i] = -now->u[i];
+    if (SECOND_INTEGRALS) s->torque2[i] = y->torque[i];
+  }
+  s->impulse2 = y->impulse;
+}
+
+/* y := x + h s */
+INLINE void shifted(const State *x, const Slope *s, double h, State *y) {
+  FOR(i, V) {
+    y->torque[i] = x->torque[i] + h * s->torque[i];
+    if (STIFFNESS) y->deviation[i] = x->deviation[i] + h * s->deviation[i];
+    if (SECOND_INTEGRALS) y->torque2[i] = x->torque2[i] + h * s->torque2[i];
+  }
+  y->time = x->time + h;
+  y->penetration = x->penetration + h * s->penetration;
+  y->impulse = x->impulse + h * s->impulse;
+  y->impulse2 = x->impulse2 + h * s->impulse2;
+  FOR(i, NZ) y->target[i] = x->target[i] + h * s->target[i];
+}
+
+#define MEAN(part) ((k1.part + 2.0 * k2.part + 2.0 * k3.part + k4.part) / 6.0)
+
+INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
+  Slope k1, k2, k3, k4;
+  State x;
+  Instant then;
+  slope_at(d, y, now, &k1);
+  shifted(y, &k1, h / 2, &x), look(d, &x, &then), slope_at(d, &x, &then, &k2);
+  shifted(y, &k2, h / 2, &x), look(d, &x, &then), slope_at(d, &x, &then, &k3);
+  shifted(y, &k3, h, &x), look(d, &x, &then), slope_at(d, &x, &then, &k4);
+  FOR(i, V) {
+    k1.torque[i] = MEAN(torque[i]);
+    if (STIFFNESS) k1.deviation[i] = MEAN(deviation[i]);
+    if (SECOND_INTEGRALS) k1.torque2[i] = MEAN(torque2[i]);
+  }
+#if PEAK
+  y->peak = y->peak < k1.impulse ? k1.impulse : y->peak;
+#endif
+  k1.penetration = MEAN(penetration);
+  k1.impulse = MEAN(impulse);
+  k1.impulse2 = MEAN(impulse2);
+  FOR(i, NZ) k1.target[i] = MEAN(target[i]);
+  shifted(y, &k1, h, y);
+}
+
+INLINE void stand_still(const Data *d, State *y, const Instant *now) {}

@@ -31,7 +31,7 @@ from impactopt.reproduce import (
     table3,
     timing,
 )
-from impactopt.reproduce.trees import random_robot
+from impactopt.reproduce.trees import random_robot, tip_speed
 
 HEADS = {"seconds", "versions", "machine"}
 TABLE_2 = {
@@ -116,8 +116,7 @@ def test_what_is_timed_of_the_sdc_is_the_sdc() -> None:
     sdc = SDC.paper(robot, striker="tip", normal=[1.0, 0.0, 0.0])
     rng = np.random.default_rng(5)
     q, v = rng.uniform(-1, 1, 8), rng.normal(size=8)
-    _, J = hand(robot, q)
-    v = np.copysign(1.0, J @ v) * v
+    v *= np.sign(tip_speed(robot, q, v))
     freeze, steps = timing._sdc_functions(sdc)
     frozen = freeze.call(
         [np.tile(np.reshape(x, (-1, 1)), (1, timing.MANY)) for x in (q, v, [1, 0, 0], [0.2])]
@@ -128,13 +127,6 @@ def test_what_is_timed_of_the_sdc_is_the_sdc() -> None:
     time = min(timing.STEPS * sdc.step_length, whole.duration)
     assert end[0] == pytest.approx(time)
     assert end[1] == pytest.approx(np.interp(time, whole.time, whole.penetration), rel=1e-9)
-
-
-def hand(robot: Any, q: np.ndarray) -> tuple[Any, np.ndarray]:
-    data = robot.model.createData()
-    pin.computeJointJacobians(robot.model, data, q)
-    frame = robot.model.getFrameId("striker:tip")
-    return data, pin.getFrameJacobian(robot.model, data, frame, pin.LOCAL_WORLD_ALIGNED)[0]
 
 
 def test_ratios_come_from_times() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from impactopt.bench.report import Report, Say, cell, make_table
 from impactopt.reproduce.costs import cost_aba, cost_full, cost_sdc, even_tree, iterations
 from impactopt.reproduce.timing import measure
-from impactopt.reproduce.trees import random_robot
+from impactopt.reproduce.trees import random_robot, tip_speed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,6 +52,7 @@ def run(say: Say, *, measured: Sequence[int] = MEASURED) -> Report:
         say(f"measuring a tree of {n} joints (compiles the first time)")
         robot, rng = random_robot(n), np.random.default_rng(1)
         q, v = rng.uniform(-1, 1, size=n), rng.normal(size=n)
+        v *= np.sign(tip_speed(robot, q, v))  # towards the target
         times[n] = measure(robot, q, v, "tip", full=n <= MOST_DENSE)
     rows: list[dict[str, Any]] = []
     for n in sorted({*SIZES, *measured}):

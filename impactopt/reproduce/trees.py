@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.robot import Robot, Striker
 
-__all__ = ["random_robot"]
+__all__ = ["random_robot", "tip_speed"]
 
 LIMBS = 4  # l of the paper's fig. 4
 
@@ -47,3 +48,12 @@ def random_robot(n: int, *, seed: int = 0) -> Robot:
         position_limit=dict.fromkeys(names, (-3.0, 3.0)),
         strikers=[Striker(name="tip", frame=names[-1], point=np.array([0.1, 0.0, 0.0]))],
     )
+
+
+def tip_speed(robot: Robot, q: NDArray[np.float64], v: NDArray[np.float64]) -> float:
+    """Speed of `tip` along the world's x [m/s] at q (nq), v (nv)."""
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, q, v)
+    frame = model.getFrameId(robot.striker("tip").model_frame)
+    pin.updateFramePlacement(model, data, frame)
+    return float(pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED).linear[0])

@@ -46,6 +46,7 @@ def joint_space_model(
         peak="peak_force" in outputs,
         second_integrals="configuration" in outputs or freezes > 0,
         refrozen=freezes > 0,
+        horizon=collision.horizon,
     )
 
 

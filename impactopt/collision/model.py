@@ -37,6 +37,7 @@ class JointSpaceModel:
     second_integrals : keep torque2 and impulse2 in the state.
     refrozen : whether there are several freezes. Then `velocity_before` (n), the change of the joint velocity
         from contact to the freeze, and `until` [s], when the freeze ends, are among the data.
+    horizon : [s] at which everything ends; several freezes have it in `until`.
     """
 
     n: int
@@ -48,6 +49,7 @@ class JointSpaceModel:
     peak: bool = False
     second_integrals: bool = False
     refrozen: bool = False
+    horizon: float = np.inf
 
     # ------------------------------------------------------------ layout of state and data
     @cached_property
@@ -172,13 +174,15 @@ class JointSpaceModel:
         return compressing, ca.logic_or(compressing, force > 0)
 
     def running(self, y: Any, data: dict[str, Any]) -> Any:
-        """Whether there is still something to integrate, 0 or 1: in contact, and before the freeze ends."""
-        contact = self.phase(y, data)[1]
-        return ca.logic_and(contact, self.part(y, "time") < data["until"]) if self.refrozen else contact
+        """Whether there is still something to integrate, 0 or 1: in contact, and before the end."""
+        return ca.logic_and(self.phase(y, data)[1], self.part(y, "time") < self._end(data))
 
     def longest(self, y: Any, data: dict[str, Any], length: float) -> Any:
-        """[s] a step of at most `length` may take, so that it ends with the freeze."""
-        return ca.fmin(length, data["until"] - self.part(y, "time")) if self.refrozen else length
+        """[s] a step of at most `length` may take, so that it ends with the freeze, or at the horizon."""
+        return ca.fmin(length, self._end(data) - self.part(y, "time"))
+
+    def _end(self, data: dict[str, Any]) -> Any:
+        return data["until"] if self.refrozen else self.horizon
 
     def servo(self, y: Any, u: Any, data: dict[str, Any]) -> Any:
         """The servo's feedback torque (n) [N m] at velocity change u (eqs. 10, 11). Linear in y and u."""

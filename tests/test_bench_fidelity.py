@@ -1,4 +1,4 @@
-"""The benches of models: errors of the ladder against full dynamics, of virtual bases against held soles."""
+"""The benches of models: the ladder against full dynamics, virtual bases against held soles."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from impactopt.bench import virtual_base
+from impactopt.bench import fidelity, virtual_base
+from impactopt.bench.fidelity import Task
+from impactopt.bench.ladder import GAINS, HORIZON, MASS_RATIOS, TARGETS, Rung, situations
+from impactopt.bench.report import Report
 from impactopt.bench.virtual_base import Hand
+from impactopt.cases import PAPER_SPEEDS
 from impactopt.cli import app
 from impactopt.collision import effective_mass
+from impactopt.errors import InputError
+from impactopt.plotting.fidelity import fidelity_picture
 from impactopt.plotting.virtual_base import virtual_base_picture
 from impactopt.presets import standin
 from impactopt.robot import Robot
@@ -99,3 +105,154 @@ def test_the_command_virtual_base(monkeypatch: pytest.MonkeyPatch, tmp_path: Any
     found = json.loads(result.stdout)
     assert {"robot", "M_g", "error_model", "error_literal", "reason"} <= set(found["rows"][0])
     assert {path.name for path in (tmp_path / "kept").iterdir()} == {"virtual-base.json", "virtual_base.png"}
+
+
+# ---------------------------------------------------------------- fidelity
+SHORT = (Rung(model="virtual-mass"), Rung(model="sdc", freezes=0), Rung(model="sdc", freezes=2))
+
+
+@pytest.fixture(scope="module")
+def short() -> Report:
+    return fidelity.run(silent, ladder=SHORT, workers=1, quick=True)
+
+
+def made_up(errors: dict[int | None, list[float | None]]) -> list[dict[str, Any]]:
+    """Collisions of one robot with these impulse errors, by freezes."""
+    count = len(next(iter(errors.values())))
+    out = []
+    for k in range(count):
+        models = [
+            {
+                "model": "sdc",
+                "freezes": n,
+                "impulse_error_pct": given[k],
+                "zmp_error_mm": given[k],
+                "torque_error_pct": given[k],
+                "torque_joint": f"joint {k}",
+            }
+            for n, given in errors.items()
+        ]
+        common = {"robot": "r", "case": f"case {k}", "mujoco_vs_pinocchio_pct": None, "separated": k != 1}
+        out.append({**common, "models": models})
+    return out
+
+
+@pytest.mark.parametrize("name", ["standin", pytest.param("g1", id="g1")])
+def test_the_collisions_are_what_the_bench_says(name: str) -> None:
+    cases = situations(name)
+    assert len({case.name for case in cases}) == len(MASS_RATIOS) * len(PAPER_SPEEDS) * len(GAINS) == 27
+    masses = {round(case.effective_mass / TARGETS[name], 6) for case in cases}
+    assert masses == set(MASS_RATIOS)
+    ratios = {float(np.max(case.overrides["kp"] / case.robot.kp)) for case in cases}
+    assert ratios == set(GAINS)
+    for case in cases:
+        np.testing.assert_allclose(
+            case.overrides["kd"] / case.robot.kd, case.overrides["kp"] / case.robot.kp, rtol=1e-12
+        )
+        assert np.all(np.abs(case.torque) < case.robot.torque_limit)
+
+
+def test_mujoco_gets_each_pair_of_posture_speed_and_gains_once() -> None:
+    chosen = [task.index for task in fidelity.tasks_of("standin", SHORT, quick=False) if task.mujoco]
+    places = np.array(np.unravel_index(chosen, (3, 3, 3)))
+    assert len(chosen) == 9
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert len({(i, j) for i, j in places[[a, b]].T.tolist()}) == 9
+
+
+def test_freezing_again_makes_it_better_and_a_point_mass_is_far_off(short: Report) -> None:
+    rows = {(row["model"], row["freezes"]): row for row in short.numbers["rows"]}
+    virtual, once, again = (rows[rung.model, rung.freezes] for rung in SHORT)
+    assert virtual["worst_impulse_error_pct"] > 10.0
+    assert virtual["worst_zmp_error_mm"] is None and virtual["worst_torque_error_at"] is None
+    assert once["worst_impulse_error_pct"] < 2.0
+    for key in ("worst_impulse_error_pct", "median_impulse_error_pct", "worst_torque_error_pct"):
+        assert again[key] < 0.5 * once[key]
+    assert once["worst_torque_joint"] in standin().joint_names
+    assert all(row["failed"] == 0 and row["pushes"] == [] for row in rows.values())
+
+
+def test_mujoco_agrees_with_the_reference(short: Report) -> None:
+    assert short.numbers["mujoco_collisions"] == 1
+    assert short.numbers["mujoco_vs_pinocchio_pct"] < 0.01
+    for collision in short.numbers["collisions"]:
+        assert collision["separated"] and 0.01 < collision["duration_s"] < HORIZON
+
+
+def test_the_order_is_minus_the_slope_of_the_logarithms() -> None:
+    rungs = [Rung(model="sdc", freezes=n) for n in (0, 1, 2, 4, 8)]
+    errors: dict[int | None, list[float | None]] = {
+        n: [-9.0 / n**2, 1.0 / n**3, 0.5 / n**3] if n else [9.0] * 3 for n in (0, 1, 2, 4, 8)
+    }
+    found = fidelity.orders(made_up(errors), rungs)
+    assert found["order_in_freezes"] == pytest.approx(2.0)
+    assert found["order_in_freezes_median"] == pytest.approx(3.0)
+    assert found["orders"]["r"]["order_in_freezes"] == pytest.approx(2.0)
+    assert fidelity.orders(made_up({0: [1.0]}), rungs[:1])["order_in_freezes"] is None
+
+
+def test_a_row_has_the_worst_and_where_and_drops_nothing() -> None:
+    collisions = made_up({4: [0.1, -0.7, None, 0.3]})
+    row = fidelity.row_of("r", Rung(model="sdc", freezes=4), collisions)
+    assert row["worst_impulse_error_pct"] == 0.7 and row["worst_impulse_error_at"] == "case 1"
+    assert row["worst_torque_joint"] == "joint 1"
+    assert row["median_impulse_error_pct"] == 0.3
+    assert (row["collisions"], row["failed"], row["pushes"]) == (4, 1, ["case 1"])
+
+
+def test_a_model_that_refuses_a_collision_is_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Refusing:
+        def collide(self, *_given: Any, **_options: Any) -> Any:
+            raise InputError("no")
+
+        converged = collide
+
+    whole = fidelity._model
+    monkeypatch.setattr(
+        fidelity,
+        "_model",
+        lambda robot, rung: whole(robot, rung) if rung.model == "reference" else Refusing(),
+    )
+    task = Task(robot="standin", index=0, ladder=SHORT[1:2], mujoco=True)
+    found = fidelity.measured(None, task)
+    assert found["reason"] == "mujoco: no" and found["mujoco_vs_pinocchio_pct"] is None
+    assert found["models"][0]["reason"] == "no" and found["models"][0]["impulse_error_pct"] is None
+    monkeypatch.setattr(fidelity, "_model", lambda _robot, _rung: Refusing())
+    assert fidelity.measured(None, task)["reason"] == "reference: no"
+
+
+def test_a_process_that_dies_is_a_failure_of_its_collision() -> None:
+    found = {"robot": "r", **fidelity._crashed(-11)}
+    assert fidelity.row_of("r", SHORT[0], [found])["failed"] == 1
+    assert fidelity.second_opinion([found]) == {"mujoco_vs_pinocchio_pct": None, "mujoco_collisions": 0}
+
+
+def test_a_picture_of_the_rows(short: Report) -> None:
+    figure = fidelity_picture(short.numbers["rows"])
+    assert len(figure.axes) == 1 and figure.axes[0].get_title(loc="left") == "standin"
+
+
+def test_the_command_fidelity(monkeypatch: pytest.MonkeyPatch, short: Report, tmp_path: Any) -> None:
+    asked: dict[str, Any] = {}
+
+    def run(_say: Any, **options: Any) -> Report:
+        asked.update(options)
+        return short
+
+    monkeypatch.setattr(fidelity, "run", run)
+    out = str(tmp_path / "kept")
+    result = runner.invoke(app, ["bench", "fidelity", "--quick", "--workers", "1", "--json", "--out", out])
+    assert result.exit_code == 0, result.output
+    assert asked == {"quick": True, "workers": 1}
+    found = json.loads(result.stdout)
+    keys = {
+        "worst_impulse_error_pct",
+        "median_impulse_error_pct",
+        "worst_zmp_error_mm",
+        "worst_torque_error_pct",
+    }
+    assert {"robot", "model", "freezes"} | keys <= set(found["rows"][0])
+    assert {"order_in_freezes", "mujoco_vs_pinocchio_pct"} <= set(found)
+    assert {path.name for path in (tmp_path / "kept").iterdir()} == {"fidelity.json", "fidelity.png"}
+    screen = runner.invoke(app, ["bench", "fidelity", "--quick", "--workers", "1"])
+    assert screen.exit_code == 0 and "MuJoCo against the reference" in screen.stdout

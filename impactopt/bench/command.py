@@ -90,6 +90,20 @@ def margins(
     _run(["margins"], {"margins": options}, as_json, out, quiet)
 
 
+@app.command()
+def fidelity(
+    workers: Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")] = 2,
+    few: Annotated[
+        bool, typer.Option("--quick", help="Three collisions of the stand-in, up to four freezes.")
+    ] = False,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """How far each collision model is from full dynamics: 27 collisions on each of three robots."""
+    _run(["fidelity"], {"fidelity": {"workers": workers, "quick": few}}, as_json, out, quiet)
+
+
 @app.command("virtual-base")
 def virtual_base(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
     """The paper's mass M_g under the soles against soles held exactly: its error, and rounding's."""
@@ -113,6 +127,7 @@ def run_all(
         "robustness": {"draws": draws, **drawn},
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
+        "fidelity": {"workers": workers, "quick": True},
     }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)
 

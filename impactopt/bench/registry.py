@@ -19,6 +19,7 @@ BENCHES = {
     "replay": "replay",
     "baselines": "baselines",
     "margins": "margins",
+    "fidelity": "fidelity",
     "virtual-base": "virtual_base",
 }
 

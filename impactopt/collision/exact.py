@@ -159,48 +159,38 @@ def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
     RuntimeError : phases that end as soon as they begin, one after the other.
     """
     z, phase = pieces.start()
-    phases, kept, peak = [phase], [z], 0.0
-    over = not phase.compressing and not pieces.force(phase) @ z > 0
-    step = min(1.0 / pieces.fastest(), horizon)
-    following: Phase | None = None if over else phase
-    time = pieces.model.layout["time"].start
+    phases, kept, peak = [], [z], 0.0
+    time, step = pieces.model.layout["time"].start, min(1.0 / pieces.fastest(), horizon)
+    touching = phase.compressing or pieces.force(phase) @ z > 0
+    following: Phase | None = phase if touching else None
     while following is not None and z[time] < horizon:
-        phase, flow = following, _Flow(pieces, following, step)
-        ended = None
-        while ended is None and z[time] < horizon:
-            flow = flow.fitting(z)
-            terms = flow.terms(z)
-            ended = flow.first_exit(z, terms)
-            # [0, 1] of this step until the event, the horizon, or the step's end
-            left = (horizon - z[time]) / flow.step
-            s = min(1.0 if ended is None else ended[0], left)
-            peak = largest(_TO_BERNSTEIN @ (terms @ flow.force), s, peak)
-            begin, end = z[time], z[time] + s * flow.step
-            for grid in spacing * np.arange(np.floor(begin / spacing) + 1, np.ceil(end / spacing)):
-                kept.append(_value(terms, (grid - begin) / flow.step))
-            if ended is None and s < left:
-                z = flow.exponential @ z
-            else:
-                z = _value(terms, s)
-                if s >= left:
-                    z[time] = horizon
-                    ended = ended if ended is not None and ended[0] < left else (s, -1, False)
-        kept.append(z)
-        assert ended is not None
-        _, which, above = ended
-        if which < 0:
-            break
-        following = pieces.after(phase, flow.watch.of[which], above=above)
-        if following is not None:
-            phases.append(following)
+        phase, found = following, None
+        phases.append(phase)
         if len(phases) > _MOST_PHASES:
             raise RuntimeError(f"more than {_MOST_PHASES} phases by {z[time]:.3g} s")
+        flow = _Flow(pieces, phase, step)
+        while found is None and z[time] < horizon:
+            flow, terms = flow.fitting(z)
+            begin, left = z[time], min(1.0, (horizon - z[time]) / flow.step)
+            found = flow.first_exit(z, terms, left)
+            s = left if found is None else found[0]
+            peak = largest(_TO_BERNSTEIN @ (terms @ flow.force), s, peak)
+            ends = (begin / spacing, (begin + s * flow.step) / spacing)
+            for grid in spacing * np.arange(np.floor(ends[0]) + 1, np.ceil(ends[1])):
+                kept.append(_value(terms, (grid - begin) / flow.step))
+            z = flow.exponential @ z if s == 1.0 else _value(terms, s)
+            if found is None and left < 1.0:
+                z[time] = horizon
+        kept.append(z)
+        if found is not None:
+            following = pieces.after(phase, flow.watch.of[found[1]], above=found[2])
+            z = z if following is None else pieces.entering(following, z)
     states = np.array(kept)
     return Path(
         time=states[:, time],
         states=states[:, :-1],
         peak_force=peak,
-        separated=over or following is None,
+        separated=following is None,
         phases=phases,
     )
 
@@ -214,14 +204,13 @@ class _Flow:
         self.exponential = expm(self.scaled)
         self.watch, self.force = pieces.watch(phase), pieces.force(phase)
 
-    def fitting(self, z: Array) -> _Flow:
-        """This flow, or one of shorter steps: Taylor's polynomials have to end where the exponential does."""
-        ends = self.exponential @ z
-        sums = _value(self.terms(z), 1.0)
-        rows = self.watch.rows
+    def fitting(self, z: Array) -> tuple[_Flow, Array]:
+        """This flow, or one of shorter steps, and its terms: they have to sum up to what the exponential
+        gives."""
+        terms, ends, rows = self.terms(z), self.exponential @ z, self.watch.rows
         size = np.abs(rows) @ (np.abs(ends) + np.abs(z))
-        if (np.abs(rows @ (sums - ends)) <= 1e-12 * size).all():
-            return self
+        if (np.abs(rows @ (_value(terms, 1.0) - ends)) <= 1e-12 * size).all():
+            return self, terms
         return _Flow(self.pieces, self.phase, self.step / 2).fitting(z)
 
     def terms(self, z: Array) -> Array:
@@ -232,14 +221,14 @@ class _Flow:
             out[k + 1] = self.scaled @ out[k] / (k + 1)
         return out
 
-    def first_exit(self, z: Array, terms: Array) -> tuple[float, int, bool] | None:
-        """(place in the step, number of the form, whether above) of the first to leave its bounds.
+    def first_exit(self, z: Array, terms: Array, end: float) -> tuple[float, int, bool] | None:
+        """(place in the step, up to `end`; number of the form; whether above) of the first out of bounds.
 
         Bounds are widened by rounding errors, so that a form that has just come in is not thrown out.
         """
         watch = self.watch
         b = _TO_BERNSTEIN @ (terms @ watch.rows.T)
-        sizes = np.abs(watch.rows) @ np.abs(z)
+        sizes = np.abs(watch.rows) @ (np.abs(z) + np.abs(self.scaled) @ np.abs(z))
         first: tuple[float, int, bool] | None = None
         for bound, sign in ((watch.lower, 1.0), (watch.upper, -1.0)):
             there = np.isfinite(bound)
@@ -247,7 +236,7 @@ class _Flow:
             margin = sign * (b - edge) + _ROUNDING * (sizes + np.abs(edge))
             for i in np.flatnonzero(there & (margin < 0).any(axis=0)):
                 place = first_negative(margin[:, i])
-                if place is not None and (first is None or place < first[0]):
+                if place is not None and place <= (end if first is None else first[0]):
                     first = (place, int(i), sign < 0)
         return first
 

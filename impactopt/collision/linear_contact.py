@@ -51,6 +51,7 @@ class TargetPiece:
     watched : (k + 2) what stays within `bounds` while the piece lasts; None where it lasts for good.
     bounds : of the form watched.
     following : number of the piece that comes next.
+    stopped : the target stands still: its first state, the speed, is zero.
     """
 
     derivative: Array
@@ -58,6 +59,7 @@ class TargetPiece:
     watched: Array | None = None
     bounds: tuple[float, float] = (-np.inf, np.inf)
     following: int = 0
+    stopped: bool = False
 
 
 def target_pieces(target: Target, p: Mapping[str, float]) -> tuple[TargetPiece, ...]:
@@ -71,10 +73,13 @@ def target_pieces(target: Target, p: Mapping[str, float]) -> tuple[TargetPiece, 
         R, growth, m = p["resistance"] + p["hardening"] * p["depth"], p["hardening"], p["mass"]
         driven = np.array([[0.0, -growth / m, 1 / m, -R / m], [1.0, 0.0, 0.0, 0.0]])
         v, beyond = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, -growth, 1.0, -R])
-        still = {"derivative": np.zeros((2, 4)), "velocity": np.zeros(4)}
+        none = np.zeros((2, 4))
+        below, above = (-np.inf, 0.0), (0.0, np.inf)
         return (
-            TargetPiece(**still, watched=beyond, bounds=(-np.inf, 0.0), following=1),
-            TargetPiece(derivative=driven, velocity=v, watched=v, bounds=(0.0, np.inf), following=0),
+            TargetPiece(
+                derivative=none, velocity=none[0], watched=beyond, bounds=below, following=1, stopped=True
+            ),
+            TargetPiece(derivative=driven, velocity=v, watched=v, bounds=above, following=0),
         )
     if isinstance(target, Board):
         k, d, m = p["stiffness"], p["damping"], p["mass"]

@@ -181,6 +181,14 @@ class Pieces:
         changed: dict[str, Any] = {name: sides}
         return replace(phase, **changed)
 
+    def entering(self, phase: Phase, z: Array) -> Array:
+        """z at the phase's begin: a target that has stopped has no speed left, not even by rounding."""
+        if not self.pieces[phase.piece].stopped:
+            return z
+        z = z.copy()
+        z[self.model.layout["target"].start] = 0.0
+        return z
+
     def _limit(self) -> Array:
         n, on = self.model.n, self.model.terms.saturation
         return self.data["torque_limit"] if on else np.full(n, np.inf)

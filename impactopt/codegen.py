@@ -41,7 +41,7 @@ from impactopt.private_files import (
     write_atomically,
 )
 
-__all__ = ["NativeCode", "cache_directory", "cached", "model_hash"]
+__all__ = ["NativeCode", "cache_directory", "cached", "library_path", "model_hash"]
 
 Report = Callable[[str], None]
 
@@ -146,6 +146,23 @@ def cached(
         if functions is not None:
             return functions
         return _build_entry(directory, entry, name, build, compiler, tell)
+
+
+def library_path(name: str, recipe: tuple[Any, ...], function: str) -> Path | None:
+    """The library of one function that `cached` gave for this name and recipe, for entries of it that CasADi
+    does not know; None where it runs in CasADi's virtual machine."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    try:
+        directory = private_directory(cache_directory())
+    except (UnsafePath, OSError):
+        directory = temporary_private_directory()
+    entry = f"{_slug(name)}-{_entry_key(name, recipe, compiler)}"
+    if _load_entry(directory, entry) is None:
+        return None
+    listing = json.loads((directory / f"{entry}.json").read_text(encoding="utf-8"))
+    return directory / str(listing["functions"][function][0])
 
 
 def cache_directory() -> Path:

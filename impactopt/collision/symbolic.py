@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..codegen import cached, model_hash
 from ..errors import InputError, check_array, did_you_mean
+from .batch import Batch
+from .describe import Description, describe
 from .exact import ExactCollision
 from .graph import (
     METHODS,
@@ -172,6 +174,53 @@ class SymbolicModel(CollisionModel):
             raise InputError(f"gradient of {output!r}: only of a number: {', '.join(SCALARS)}")
         whole = self._compiled("collision_gradient", (output,), lambda: gradient_graph(self, output))
         return self._with_parameters(whole, parameters)
+
+    def describe(
+        self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = ()
+    ) -> Description:
+        """What `function` contains for these outputs, with its instructions, and what was left out and why:
+        text by str(), numbers by `as_dict`."""
+        self._check_outputs(outputs, 1)
+        return describe(self, tuple(outputs), parameters)
+
+    def batch(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None = None,
+        *,
+        outputs: tuple[str, ...] = ("impulse", "duration"),
+        every: int = 1,
+        threads: int | None = None,
+        **settings: ArrayLike,
+    ) -> dict[str, NDArray[np.float64]]:
+        """Collisions by name of output, with no interpreter between them, on several cores.
+
+        Parameters
+        ----------
+        q, v : (N, nq), (N, nv) at contact.
+        torque : (N, n), or (n) for all [N m]; needed with terms.feedforward.
+        outputs : names out of `impactopt.collision.OUTPUTS`.
+        every : keep every so many steps, and the last, of the histories.
+        threads : cores to use; None: all.
+        settings : other values of any of `settings`, for all, or with a first axis of N, one each.
+
+        Returns
+        -------
+        Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
+        frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool, False
+        also where there came out no number. That the step is stable is checked in the first collision only.
+
+        Raises
+        ------
+        InputError : wrong shapes, NaN, or numbers out of their range; a step that is unstable.
+        """
+        self._check_outputs(outputs, every)
+        key = ("batch", *outputs, every)
+        if key not in self._functions:
+            self._functions[key] = Batch(self, tuple(outputs), every=every)
+        found: dict[str, NDArray[np.float64]] = self._functions[key](q, v, torque, settings, threads=threads)
+        return found
 
     def _compiled(self, name: str, what: tuple[Any, ...], build: Callable[[], Any]) -> Any:
         key = (name, *what)

@@ -1,0 +1,197 @@
+"""Many collisions in one call: a loop in C over arrays, on several cores.
+
+CasADi's own maps are serial in its wheels, and its calls keep the interpreter's lock. So the loop is an entry
+of its own in the library, called through ctypes, which lets go of the lock: threads are then cores.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..codegen import cached, library_path
+from ..errors import InputError, check_array
+from .native import native_collision
+from .outputs import HISTORIES, SCALARS
+from .settings import _NO_LIMIT
+
+if TYPE_CHECKING:
+    from .symbolic import SymbolicModel
+
+__all__ = ["Batch"]
+
+Array = NDArray[np.float64]
+# slices a thread: collisions differ in length, and a thread that is done takes the next slice
+_SLICES = 4
+_ALIGNED = 8  # doubles
+
+
+class Batch:
+    """The compiled function of a model and outputs, over arrays of collisions.
+
+    Parameters
+    ----------
+    model : of the collision.
+    outputs : names out of `impactopt.collision.OUTPUTS` that the model has.
+    every : keep every so many steps of the histories.
+    """
+
+    def __init__(self, model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> None:
+        # one of them says which contacts have not ended
+        self.model, self.outputs = model, tuple(dict.fromkeys((*outputs, "separated")))
+        recipe = (*model._recipe, *self.outputs, every)
+
+        def build() -> list[Any]:
+            code = native_collision(model, self.outputs, every=every)
+            loop = files(native_collision.__module__.rpartition(".")[0]).joinpath("batch.c")
+            return [replace(code, code=f"{code.code}\n{loop.read_text(encoding='utf-8')}")]
+
+        self._function = cached("collision_batch", recipe, build, report=model.report)["collision"]
+        library = library_path("collision_batch", recipe, "collision")
+        self._loop = None if library is None else ctypes.CDLL(str(library)).collision_batch
+
+    def __call__(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None,
+        settings: Mapping[str, ArrayLike],
+        *,
+        threads: int | None = None,
+    ) -> dict[str, Array]:
+        """As of `SymbolicModel.batch`."""
+        cores = os.cpu_count() or 1 if threads is None else threads
+        if not isinstance(cores, int) or cores < 1:
+            raise InputError(f"threads: {threads!r}; give a whole number >= 1")
+        given = _inputs(self.model, q, v, torque, settings)
+        self._check_step(given)
+        count, function = given["q"].shape[0], self._function
+        rows = [_by_columns(given[name]) for name in function.name_in()]
+        shapes = [function.size_out(k) for k in range(function.n_out())]
+        found = [np.zeros((count, shape[0] * shape[1])) for shape in shapes]
+        if self._loop is None:
+            _one_by_one(function, rows, found)
+        else:
+            _in_threads(self._loop, function.sz_w(), rows, found, cores)
+        names = function.name_out()
+        return {
+            name: self._shaped(name, x, shape) for name, x, shape in zip(names, found, shapes, strict=True)
+        }
+
+    def _check_step(self, given: Mapping[str, Array]) -> None:
+        first = {name: given[name][0] for name in self.model.settings}
+        first = {name: x.reshape(self.model.settings[name].shape) for name, x in first.items()}
+        longest, step = self.model.stable_step(given["q"][0], **first), self.model.step_length
+        if step >= longest:
+            raise InputError(
+                f"step [s]: {step:g} is unstable in the first collision, where the fastest mode allows "
+                f"{longest:.2g}: give the model a step below that, or the joints less kd or more armature"
+            )
+
+    def _shaped(self, name: str, flat: Array, shape: tuple[int, int]) -> Array:
+        """Collisions first, then instants; matrices of CasADi's lie by columns."""
+        count = flat.shape[0]
+        if name == "separated":
+            mask: Any = flat[:, 0] > 0.5
+            return np.asarray(mask)
+        if name in SCALARS:
+            return flat[:, 0]
+        if name not in HISTORIES or shape[1] == 1:
+            return flat
+        if name in ("sole_wrench", "hand_wrench"):
+            return flat.reshape(count, shape[1], -1, 6)
+        return flat.reshape(count, shape[1], shape[0])
+
+
+# ---------------------------------------------------------------- running
+def _in_threads(loop: Any, work: int, rows: list[Array], found: list[Array], threads: int) -> None:
+    doubles, count = ctypes.POINTER(ctypes.c_double), found[0].shape[0]
+    Pointers, Steps = doubles * len(rows), ctypes.c_longlong * len(rows)
+    arg = Pointers(*[x.ctypes.data_as(doubles) for x in rows])
+    arg_step = Steps(*[0 if x.shape[0] == 1 else x.shape[1] for x in rows])
+    res = (doubles * len(found))(*[x.ctypes.data_as(doubles) for x in found])
+    res_step = (ctypes.c_longlong * len(found))(*[x.shape[1] for x in found])
+    slices = min(count, 1 if threads == 1 else _SLICES * threads)
+    ends = [count * k // slices for k in range(slices + 1)]
+
+    def run(begin: int, end: int) -> None:
+        memory = np.empty(work + _ALIGNED)
+        place = memory.ctypes.data_as(doubles)
+        loop(ctypes.c_longlong(begin), ctypes.c_longlong(end), arg, arg_step, res, res_step, place)
+
+    if threads == 1:
+        run(0, count)
+        return
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        list(pool.map(run, ends[:-1], ends[1:]))
+
+
+def _one_by_one(function: Any, rows: list[Array], found: list[Array]) -> None:
+    """Where there is no compiler."""
+    shapes = [function.size_in(k) for k in range(function.n_in())]
+    for i in range(found[0].shape[0]):
+        mine = [x[0 if x.shape[0] == 1 else i] for x in rows]
+        values = [ca.DM(x.reshape(shape, order="F")) for x, shape in zip(mine, shapes, strict=True)]
+        for into, out in zip(found, function.call(values), strict=True):
+            into[i] = np.array(out).ravel(order="F")
+
+
+# ---------------------------------------------------------------- inputs
+def _by_columns(x: Array) -> Array:
+    """(cases, numbers), each case's as CasADi has them."""
+    return np.ascontiguousarray(np.swapaxes(x, 1, 2) if x.ndim == 3 else x).reshape(x.shape[0], -1)
+
+
+def _inputs(
+    model: SymbolicModel, q: ArrayLike, v: ArrayLike, torque: ArrayLike | None, settings: Mapping[str, Any]
+) -> dict[str, Array]:
+    """Each input, (N, ...) or (1, ...)."""
+    robot = model.robot
+    given = {"q": check_array("q", q, (None, robot.nq))}
+    count = given["q"].shape[0]
+    if not count:
+        raise InputError("q: no collision; give at least one, (N, nq)")
+    given["v"] = check_array("v", v, (count, robot.nv))
+    if robot.floating:
+        off = np.abs(np.linalg.norm(given["q"][:, 3:7], axis=1) - 1)
+        if off.max() > 1e-6:
+            robot.check_configuration(given["q"][off.argmax()], name=f"q of collision {off.argmax()}")
+    if model.terms.feedforward:
+        if torque is None:
+            raise InputError("torque: give the feed-forward torque (N, n) [N m], or (n) for all")
+        one = np.ndim(torque) == 1
+        given["feedforward"] = check_array("torque [N m]", torque, (robot.n,) if one else (count, robot.n))
+        given["feedforward"] = given["feedforward"].reshape(-1, robot.n)
+    return given | _settings(model, settings, count)
+
+
+def _settings(model: SymbolicModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
+    """Of each setting its value for all, or one a collision, in its range."""
+    alone = model.settings.override(
+        {
+            name: x
+            for name, x in settings.items()
+            if name not in model.settings or np.ndim(x) <= model.settings[name].ndim
+        }
+    )
+    out = {name: value[None] if value.ndim else value.reshape(1, 1) for name, value in alone.items()}
+    for name, given in settings.items():
+        usual = model.settings[name]
+        if np.ndim(given) > usual.ndim:
+            value = check_array(name, given, (count, *usual.shape), finite=name != "torque_limit")
+            # ranges are intervals: if least and largest are in it, all are
+            whole = name == "normal" or usual.ndim == 2
+            for one in value if whole else (value.min(axis=0), value.max(axis=0)):
+                model.settings.override({name: one})
+            capped = np.minimum(value, _NO_LIMIT) if name == "torque_limit" else value
+            out[name] = capped if usual.ndim else capped.reshape(count, 1)
+    return out

@@ -14,12 +14,13 @@ from scipy.integrate import trapezoid
 from small_robots import biped
 from typer.testing import CliRunner
 
+from impactopt.bench import costs
+from impactopt.bench.trees import random_robot, tip_speed
 from impactopt.cases import Case, paper_motions
 from impactopt.cli import app
 from impactopt.collision import SDC
 from impactopt.errors import InputError
 from impactopt.reproduce import (
-    costs,
     fig3,
     fig4,
     fig7,
@@ -31,7 +32,6 @@ from impactopt.reproduce import (
     table3,
     timing,
 )
-from impactopt.reproduce.trees import random_robot, tip_speed
 
 HEADS = {"seconds", "versions", "machine"}
 TABLE_2 = {

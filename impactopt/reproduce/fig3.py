@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impactopt.bench.costs import HRP2, TOTAL_TIME, cost_aba, cost_full, cost_sdc, iterations
 from impactopt.bench.report import Report, Say, cell, make_table
 from impactopt.cases import striking_velocity
 from impactopt.presets import standin
-from impactopt.reproduce.costs import HRP2, TOTAL_TIME, cost_aba, cost_full, cost_sdc, iterations
 from impactopt.reproduce.timing import Times, measure
 
 if TYPE_CHECKING:

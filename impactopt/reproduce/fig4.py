@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impactopt.bench.costs import cost_aba, cost_full, cost_sdc, even_tree, iterations
 from impactopt.bench.report import Report, Say, cell, make_table
-from impactopt.reproduce.costs import cost_aba, cost_full, cost_sdc, even_tree, iterations
+from impactopt.bench.trees import random_robot, tip_speed
 from impactopt.reproduce.timing import measure
-from impactopt.reproduce.trees import random_robot, tip_speed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

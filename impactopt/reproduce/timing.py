@@ -15,7 +15,6 @@ machine's moods meet them alike; each time is a median.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +24,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bench.clock import medians, runner
 from impactopt.codegen import cached, model_hash
 from impactopt.collision import SDC
 from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model
@@ -36,9 +36,7 @@ __all__ = ["Times", "measure"]
 Array = NDArray[np.float64]
 MANY = 20  # evaluations inside C a call; with more their outputs would fill the caches
 STEPS = 200  # of the time loop a call
-REPEATS = 51
 STAGES = 4  # of a Runge-Kutta step
-_LONG_ENOUGH = 1e-3  # [s] of one measurement; longer ones are cut up by what else runs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,15 +77,15 @@ def measure(robot: Robot, q: Array, v: Array, striker: str, *, full: bool = True
     given = dict(zip(freeze.name_out(), frozen, strict=True)) | dict(sdc.settings)
     tau = np.zeros(robot.n)
     runs: dict[str, Callable[[], Any]] = {
-        "freeze": _runner(freeze, [_many(x) for x in (q, v, numbers["normal"], numbers["target_yield"])]),
-        "stage": _runner(steps, [start, *(given[name] for name in steps.name_in()[1:])]),
+        "freeze": runner(freeze, [_many(x) for x in (q, v, numbers["normal"], numbers["target_yield"])]),
+        "stage": runner(steps, [start, *(given[name] for name in steps.name_in()[1:])]),
         **_pinocchio(robot.model, q, v),
     }
     shares = {"freeze": MANY, "stage": STEPS * STAGES, "aba": 1, "call": 1}
     if full:
-        runs["full"] = _runner(_full(robot, striker), [_many(x) for x in (q, v, tau, np.array(100.0))])
+        runs["full"] = runner(_full(robot, striker), [_many(x) for x in (q, v, tau, np.array(100.0))])
         shares["full"] = MANY
-    found = {name: seconds / shares[name] for name, seconds in _medians(runs).items()}
+    found = {name: seconds / shares[name] for name, seconds in medians(runs).items()}
     return Times(
         full=found.get("full"),
         freeze=found["freeze"],
@@ -182,23 +180,6 @@ def _many(x: Any) -> Array:
     return np.tile(np.reshape(x, (-1, 1)), (1, MANY))
 
 
-# ---------------------------------------------------------------- clock
-def _runner(function: Any, arguments: list[Any]) -> Callable[[], Any]:
-    """Calls a function through buffers: nothing is copied or allocated."""
-    buffer, evaluate = function.buffer()
-    kept: list[Any] = [np.asfortranarray(x, dtype=np.float64).ravel(order="F") for x in arguments]
-    kept += [np.zeros(max(function.nnz_out(i), 1)) for i in range(function.n_out())]
-    for i in range(function.n_in()):
-        buffer.set_arg(i, memoryview(kept[i]))
-    for i in range(function.n_out()):
-        buffer.set_res(i, memoryview(kept[function.n_in() + i]))
-
-    def run(_alive: Any = (buffer, kept)) -> None:
-        evaluate()
-
-    return run
-
-
 def _pinocchio(model: Any, q: Array, v: Array) -> dict[str, Callable[[], Any]]:
     data, tau = model.createData(), np.zeros(model.nv)
     pendulum = pin.Model()
@@ -209,21 +190,3 @@ def _pinocchio(model: Any, q: Array, v: Array) -> dict[str, Callable[[], Any]]:
         "aba": lambda: pin.aba(model, data, q, v, tau),
         "call": lambda: pin.aba(pendulum, own, zero, zero, zero),
     }
-
-
-def _medians(runs: dict[str, Callable[[], Any]]) -> dict[str, float]:
-    """[s] of one call each, warmed up, in turns."""
-    counts = {}
-    for name, run in runs.items():
-        run()
-        began = time.perf_counter()
-        run()
-        counts[name] = max(1, int(_LONG_ENOUGH / max(time.perf_counter() - began, 1e-7)))
-    samples: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(REPEATS):
-        for name, run in runs.items():
-            began = time.perf_counter()
-            for _ in range(counts[name]):
-                run()
-            samples[name].append((time.perf_counter() - began) / counts[name])
-    return {name: float(np.median(some)) for name, some in samples.items()}

@@ -14,24 +14,24 @@ __all__ = ["random_robot", "tip_speed"]
 LIMBS = 4  # l of the paper's fig. 4
 
 
-def random_robot(n: int, *, seed: int = 0) -> Robot:
-    """A fixed base with four limbs of n / 4 revolute joints, whose last tip is the striker `tip`.
+def random_robot(n: int, *, limbs: int = LIMBS, seed: int = 0) -> Robot:
+    """A fixed base with limbs of n / limbs revolute joints each, whose last tip is the striker `tip`.
 
     Masses, sizes and placements are drawn; postures and dynamics mean nothing.
 
     Raises
     ------
-    InputError : n is no positive multiple of four.
+    InputError : n is no positive multiple of the number of limbs.
     """
-    if n <= 0 or n % LIMBS:
-        raise InputError(f"n: {n}; give a positive multiple of {LIMBS}")
+    if n <= 0 or limbs <= 0 or n % limbs:
+        raise InputError(f"n: {n}; give a positive multiple of {limbs}")
     rng = np.random.default_rng(seed)
     model = pin.Model()
     model.name = f"tree of {n}"
     kinds = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
-    for limb in range(LIMBS):
+    for limb in range(limbs):
         parent = 0
-        for k in range(n // LIMBS):
+        for k in range(n // limbs):
             at = pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-0.2, 0.2, size=3))
             parent = model.addJoint(parent, kinds[k % 3](), at, f"limb {limb} joint {k}")
             model.addJointFrame(parent)

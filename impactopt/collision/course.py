@@ -1,8 +1,8 @@
 """The course of a collision: one freeze from contact to separation, or several, one after the other.
 
 With N freezes on the way, the freeze at contact only estimates the contact's duration T, and predicts. The
-course is cut into N stretches at T (i / N)^(3/2), shorter ones first, as the velocity changes most right
-after contact. Each goes by a freeze at its *middle*, which the freeze before it predicts. The prediction's
+course is cut into N stretches of T / N (shorter ones first would be no better). Each goes by a freeze at its
+*middle*, which the freeze before it predicts. The prediction's
 error is of second order in the stretch's length, and so is that of a coefficient frozen in the middle: the
 course converges to full dynamics with 1/N^2.
 """
@@ -23,7 +23,7 @@ from .model import JointSpaceModel
 
 __all__ = ["Course", "Stretch"]
 
-_GRADING = 1.5
+_GRADING = 1.0
 # [1/kg] of a target that takes no impulse: drifts are frozen at the velocity given, see frozen.py
 _GIVES_WAY = 1e30
 

@@ -19,8 +19,8 @@ from test_sdc import Kinematics, two_masses
 from impactopt._compiler import find_compiler
 from impactopt.codegen import cached
 from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
-from impactopt.collision.graph import collision_graph
-from impactopt.collision.native import native_collision
+from impactopt.collision.graph import collision_graph, gradient_graph
+from impactopt.collision.native import native_collision, native_gradient
 from impactopt.contact import (
     Board,
     CustomLaw,
@@ -187,6 +187,77 @@ def test_a_held_hand_in_c_is_the_graph():
     model = sdc("standin", stance=BothSoles(hands=("left_hand",)))
     outputs = ("hand_wrench", "zmp", "impulse")
     assert_same(model, situation("standin", model), outputs, every=5)
+
+
+# ------------------------------------------------------------ gradients
+def gradient(model: Any, output: str) -> Any:
+    recipe = (*model._recipe, output)
+    return cached("native_gradient", recipe, lambda: [native_gradient(model, output)])["collision_gradient"]
+
+
+GRADIENTS = {
+    "all terms": ("impulse", {"terms": Terms(friction=True), "friction": FRICTION}),
+    "nothing but damping": ("duration", {"terms": Terms.none()}),
+    "matrices of gains": ("impulse", {"kp": 10 * GAINS, "kd": GAINS, "terms": Terms(jdot=False)}),
+    "a nail": ("energy", {"target": Nail(mass=0.2, resistance=80.0, hardening=1e4)}),
+    "a wall, to the horizon": (
+        "peak_force",
+        {"target": RigidWall(), "law": KelvinVoigt(stiffness=1e4, damping=5.0), "horizon": 0.003},
+    ),
+    "Runge-Kutta": (
+        "energy",
+        {"method": "rk4", "step": 5e-4, "terms": Terms(friction=True, bias=False), "friction": FRICTION},
+    ),
+    "Runge-Kutta, no jets": ("peak_force", {"law": HuntCrossley(stiffness=1e6, dissipation=0.3)}),
+}
+
+
+def assert_same_gradient(model: Any, values: list[Any], output: str) -> dict[str, Any]:
+    made, graph = gradient(model, output), gradient_graph(model, output)
+    assert made.name_in() == graph.name_in() and made.name_out() == graph.name_out()
+    found, true = call(made, values), call(graph, values)
+    for name, value in true.items():
+        assert found[name].shape == value.shape, name
+        scale = max(float(np.abs(value).max()), 1e-6)
+        assert np.abs(found[name] - value).max() <= 1e-10 * scale, name
+    return found
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_an_arms_gradient_in_c_is_the_graphs(name):
+    output, options = GRADIENTS[name]
+    model = sdc("arm", **options)
+    found = assert_same_gradient(model, situation("arm", model), output)
+    assert max(np.abs(found[f"{output}_by_{x}"]).max() for x in "qv") > 1e-3
+
+
+def test_a_bipeds_gradient_in_c_is_the_graphs_and_that_of_differences():
+    model = sdc("biped")
+    robot, values = model.robot, situation("biped", model)
+    found = assert_same_gradient(model, values, "impulse")
+    function, (q, v, *others) = native(model, ("impulse",)), values
+    rng, h = np.random.default_rng(1), 1e-6
+    for _ in range(4):
+        way, change = rng.normal(size=(2, robot.nv))
+        ahead, behind = (
+            call(function, [pin.integrate(robot.model, q, t * way), v + t * change, *others])["impulse"]
+            for t in (h, -h)
+        )
+        slope = (found["impulse_by_q"].T @ way + found["impulse_by_v"].T @ change).item()
+        assert (ahead - behind).item() / (2 * h) == pytest.approx(slope, rel=1e-6)
+
+
+def test_a_point_masses_gradient_in_c_is_the_graphs():
+    model = sdc("arm", VirtualMass)
+    assert_same_gradient(model, situation("arm", model), "impulse")
+
+
+def test_a_gradient_says_where_it_has_no_numbers():
+    model = sdc("arm")
+    values = situation("arm", model)
+    values[1] = np.array([np.nan, 0.0, 0.0, 0.0])
+    found = call(gradient(model, "impulse"), values)
+    assert all(np.isnan(x).all() for x in found.values())
 
 
 # ------------------------------------------------------------ against closed forms

@@ -1,16 +1,23 @@
 /* The time loop, and the course of a collision over its freezes; see collision/loop.py and course.py. */
 
+/* states at the begin of all steps, for those who go back */
+typedef struct {
+  int made;
+  State states[GRADIENT ? STEPS_AT_ALL + 1 : 1];
+} Tape;
+
 typedef struct {
   Frozen frozen;
   Data data;
-  double q[NQ], v[NV], normal[3], feedforward[N1];
+  Tape tape;
+  double q[NQ], v[NV], normal[3];
 } Work;
 
 /* steps in a block of the graph's loop, which looks once more at what stands still, but not between blocks */
 #define BLOCK 16
 
 /* from y to separation, or the freeze's end; the phase at the end */
-static Instant run(const Data *d, State *y, int steps, const Record *record) {
+static Instant run(const Data *d, State *y, int steps, const Record *record, Tape *tape) {
   Instant now;
   int made = 0;
   for (;; made++) {
@@ -18,8 +25,10 @@ static Instant run(const Data *d, State *y, int steps, const Record *record) {
     judge(d, y, &now);
     if (record && made % EVERY == 0 && made < steps) write_column(d, y, &now, record, made / EVERY);
     if (made == steps || !now.contact || !(y->time < d->until)) break;
+    if (GRADIENT) tape->states[made] = *y;
     advance(d, y, &now, fmin(LENGTH, d->until - y->time));
   }
+  if (GRADIENT) tape->states[made] = *y, tape->made = made;
   if (made % BLOCK) stand_still(d, y, &now);
   if (!(now.rate == now.rate)) {
     /* no number in, none out */
@@ -120,14 +129,14 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   memcpy(c->v, v, sizeof c->v);
   d->until = HORIZON;
 #if !FREEZES
-  c->in_contact = run(d, &c->final, STEPS[0], record).contact;
+  c->in_contact = run(d, &c->final, STEPS[0], record, &w->tape).contact;
   c->impulse = c->final.impulse;
   c->duration = c->final.time;
 #else
   State start = {0}, reached = {0}, middle;
   double q_middle[NQ], v_middle[NV], q_then[NQ], v_then[NV];
   FOR(i, V) d->before[i] = (vec){0};
-  run(d, &reached, STEPS_AT_ALL, 0);
+  run(d, &reached, STEPS_AT_ALL, 0, &w->tape);
   const double duration = reached.time;
   memset(&reached, 0, sizeof reached);
   c->impulse = c->duration = 0.0;
@@ -137,7 +146,7 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
     const int last = i == FREEZES - 1;
     middle = reached;
     d->until = reached.time + duration * share / 2;
-    run(d, &middle, STEPS_TO_MIDDLE[i], 0);
+    run(d, &middle, STEPS_TO_MIDDLE[i], 0, &w->tape);
     moved(F, c->q, c->v, &middle, q_middle, v_middle);
     if (i) {
       moved(F, c->q, c->v, &reached, q_then, v_then);
@@ -155,7 +164,7 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
     recorded.since = duration * ENDS[i];
     recorded.columns = N_COLUMNS[i];
     reached = start;
-    c->in_contact *= run(d, &reached, STEPS[i], record).contact;
+    c->in_contact *= run(d, &reached, STEPS[i], record, &w->tape).contact;
     recorded.column += N_COLUMNS[i];
     c->impulse += reached.impulse;
     c->duration += reached.time;

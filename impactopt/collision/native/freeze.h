@@ -12,6 +12,7 @@ typedef struct {
   vec wrench[N + 1][VC]; /* columns of L_tau, L_f */
   vec L_0[VC];
   double R[C1][C1];     /* with the reciprocal of its diagonal */
+  double push[C1];      /* R^-1 (acceleration of what is held if it were free) */
   double bias_root[NV];
   double drift_velocity[NV];
   double hand_speed;
@@ -145,6 +146,7 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
   FOR(c, C) push[c] -= of_held[c];
 #endif
   SOLVE(F, push, double)
+  memcpy(F->push, push, sizeof push);
   FOR(c, C) FOR(i, V) F->drift[i] += push[c] * F->Z[c][i];
   for (int i = N + 1; i < V * LANES; i++) ((double *)F->drift)[i] = 0.0;
   ((double *)F->drift)[N] += of_hand;

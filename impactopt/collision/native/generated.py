@@ -14,7 +14,7 @@ from ..jets import derivative
 from ..model import JointSpaceModel
 from ..taylor import ORDER
 
-__all__ = ["Tree", "c_code", "scalar_functions", "tree_functions"]
+__all__ = ["Tree", "backwards", "c_code", "gamma_of", "scalar_functions", "tangent_back", "tree_functions"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +153,34 @@ def _jets(
 
 def _number(expression: Any) -> Any:
     return ca.densify(ca.SX(expression))
+
+
+# of each function, the inputs that it is differentiated by
+_BACK = {"order": (0, 2, 3, 4, 5), "switches": (0, 1), "contact_force": (0, 1), "target_rates": (0, 1)}
+_BACK |= {"target_velocity": (0,), "target_energy": (0,), "tree": (0, 1), "drift": (0, 1)}
+
+
+def backwards(functions: list[Any]) -> list[Any]:
+    """<name>_back (inputs, derivatives by the outputs) -> derivatives by some of the inputs, where used."""
+    made = []
+    for function in functions:
+        kind = function.name().split("_")[0] if function.name().startswith("order_") else function.name()
+        if kind in _BACK:
+            x = [ca.SX.sym(name, *function.size_in(name)) for name in function.name_in()]
+            y = function.call(x)
+            seeds = [ca.SX.sym("seed", *part.shape) for part in y]
+            by = [x[i] for i in _BACK[kind]]
+            (out,) = ca.reverse(y, by, [seeds])
+            out = [ca.densify(part) for part in out]
+            made.append(ca.Function(f"{function.name()}_back", [*x, *seeds], out))
+    return made
+
+
+def tangent_back(frozen: FrozenDynamics) -> Any:
+    """ca.Function tangent_back (q, derivatives by q (nq)) -> the same in v's basis (nv)."""
+    rb = frozen._tree.rb
+    by_q = ca.SX.sym("by_q", rb.q.size1())
+    return ca.Function("tangent_back", [rb.q, by_q], [ca.densify(ca.mtimes(rb.tangent_map().T, by_q))])
 
 
 def c_code(name: str, functions: list[Any]) -> str:

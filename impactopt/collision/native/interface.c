@@ -1,0 +1,29 @@
+/* CasADi's interface of external functions. All memory is the caller's work vector, so that threads do not meet. */
+
+#define EXPORT __attribute__((visibility("default")))
+typedef long long Int;
+
+EXPORT int NAME(const double **arg, double **res, Int *iw, double *w, int mem) {
+  evaluate(arg, res, (Work *)(((size_t)w + 63) & ~(size_t)63));
+  return 0;
+}
+EXPORT void OF_NAME(incref)(void) {}
+EXPORT void OF_NAME(decref)(void) {}
+EXPORT int OF_NAME(alloc_mem)(void) { return 0; }
+EXPORT int OF_NAME(init_mem)(int mem) { return 0; }
+EXPORT void OF_NAME(free_mem)(int mem) {}
+EXPORT int OF_NAME(checkout)(void) { return 0; }
+EXPORT void OF_NAME(release)(int mem) {}
+EXPORT Int OF_NAME(n_in)(void) { return N_IN; }
+EXPORT Int OF_NAME(n_out)(void) { return N_OUT; }
+EXPORT const char *OF_NAME(name_in)(Int i) { return i >= 0 && i < N_IN ? NAMES_IN[i] : 0; }
+EXPORT const char *OF_NAME(name_out)(Int i) { return i >= 0 && i < N_OUT ? NAMES_OUT[i] : 0; }
+EXPORT const Int *OF_NAME(sparsity_in)(Int i) { return i >= 0 && i < N_IN ? SHAPES_IN[i] : 0; }
+EXPORT const Int *OF_NAME(sparsity_out)(Int i) { return i >= 0 && i < N_OUT ? SHAPES_OUT[i] : 0; }
+EXPORT int OF_NAME(work)(Int *sz_arg, Int *sz_res, Int *sz_iw, Int *sz_w) {
+  if (sz_arg) *sz_arg = N_IN;
+  if (sz_res) *sz_res = N_OUT;
+  if (sz_iw) *sz_iw = 0;
+  if (sz_w) *sz_w = sizeof(Work) / sizeof(double) + 8;
+  return 0;
+}

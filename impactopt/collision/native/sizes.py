@@ -1,0 +1,172 @@
+"""What the kernel has to know of a model's sizes and switches, as C macros and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..course import _GRADING
+from ..events import _BEYOND
+from ..graph import joint_space_model, number_of_steps
+from ..loop import _BLOCK
+from ..model import shape_of
+from ..outputs import HISTORIES, OF_SOLES, frozen_for
+from ..taylor import ORDER
+from .generated import Tree, gamma_of
+
+if TYPE_CHECKING:
+    from ..symbolic import SymbolicModel
+
+__all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes"]
+
+
+def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:
+    """Shapes of the inputs by name."""
+    robot = collision.robot
+    shapes = {"q": (robot.nq, 1), "v": (robot.nv, 1)}
+    if collision.terms.feedforward:
+        shapes["feedforward"] = (robot.n, 1)
+    return shapes | {name: shape_of(value) for name, value in collision.settings.items()}
+
+
+def shapes_out(collision: SymbolicModel, outputs: tuple[str, ...], every: int) -> dict[str, tuple[int, int]]:
+    """Shapes of the outputs by name."""
+    robot, columns = collision.robot, sum(_columns(collision, every))
+    shapes = dict.fromkeys(outputs, (1, 1))
+    shapes |= {
+        "velocity": (robot.nv, 1),
+        "configuration": (robot.nq, 1),
+        "target_result": (len(collision.target.results), 1),
+    }
+    for name in HISTORIES:
+        rows = _rows(collision, name)
+        shapes[name] = (columns, 1) if rows == 1 else (rows, columns)
+    return {name: shapes[name] for name in outputs}
+
+
+def _rows(collision: SymbolicModel, history: str) -> int:
+    n, soles = collision.n_servos, 6 * len(collision.held_by.sole_frames(collision.robot))
+    hands = 6 * len(collision.held_by.hand_frames(collision.robot))
+    rows = {"joint_velocity": n, "torque": n, "demand": n, "sole_wrench": soles, "hand_wrench": hands}
+    return {**rows, "ground_wrench": 6, "zmp": 2}.get(history, 1)
+
+
+def _ends(collision: SymbolicModel) -> list[float]:
+    """Where stretches end, as fractions of the contact's duration."""
+    freezes = max(collision.n_freezes, 1)
+    return [float(x) for x in (np.arange(freezes + 1) / freezes) ** _GRADING]
+
+
+def _blocks(collision: SymbolicModel, fraction: float) -> int:
+    """Steps for a fraction of the horizon, in whole blocks."""
+    return -(-number_of_steps(collision, fraction) // _BLOCK) * _BLOCK
+
+
+def _steps(collision: SymbolicModel) -> list[int]:
+    """Steps of each stretch; the last may take as long as the horizon."""
+    shares = [b - a for a, b in pairwise(_ends(collision))]
+    return [_blocks(collision, share) for share in (*shares[:-1], 1.0)]
+
+
+def _columns(collision: SymbolicModel, every: int) -> list[int]:
+    return [-(-count // every) + 1 for count in _steps(collision)]
+
+
+def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: Tree) -> str:
+    """Everything that the kernel has to know of the model, as macros and tables."""
+    robot, terms, settings, n = collision.robot, collision.terms, collision.settings, collision.n_servos
+    model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
+    held = collision.held_by.constraint_frames(robot)
+    soles = collision.held_by.sole_frames(robot)
+    shapes = shapes_in(collision)
+    names = list(shapes)
+    laws, targets = list(model.law.parameters), list(model.target.parameters)
+    switch_count = len(
+        model.target.switches([0.0] * model.target.n_states, 0.0, dict(model.target.parameters))
+    )
+    freezes, ends, counts = collision.n_freezes, _ends(collision), _steps(collision)
+    held_rows = 6 * len(held)
+    numbers: dict[str, Any] = {
+        "N": n,
+        "NQ": robot.nq,
+        "NV": robot.nv,
+        "C": held_rows,
+        "SOLES": len(soles),
+        "NZ": model.target.n_states,
+        "N_LAW": len(laws),
+        "N_TARGET": len(targets),
+        "SWITCHES": switch_count,
+        "ORDER": ORDER,
+        "SIZE": ORDER + 1,
+        "COLUMN(i)": f"((i) >= {robot.nv - n} ? (i) - {robot.nv - n} : {n + 1} + (i))",
+        "LENGTH": repr(float(collision.step_length)),
+        "BEYOND": repr(_BEYOND),
+        "HORIZON": repr(float(collision.horizon)),
+        "TRANSITION": repr(float(model.transition)),
+        "STIFFNESS": int(terms.stiffness and n > 0),
+        "FEEDFORWARD": int(terms.feedforward and n > 0),
+        "SATURATION": int(terms.saturation and n > 0),
+        "FRICTION": int(terms.friction and n > 0),
+        "BIAS": int(terms.bias),
+        "JDOT": int(terms.jdot),
+        "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),
+        "KP_MATRIX": int(n > 0 and terms.stiffness and settings["kp"].ndim == 2),
+        "PEAK": int(model.peak),
+        "SECOND_INTEGRALS": int(model.second_integrals),
+        "FREEZES": freezes,
+        "WRENCHES": int(bool(frozen_for(outputs)) or freezes > 0),
+        "HELD_HISTORY": int(bool({*OF_SOLES, "hand_wrench"} & {*outputs})),
+        "HISTORIES": int(bool({*HISTORIES} & {*outputs})),
+        "EVERY": every,
+        "STEPS_AT_ALL": _blocks(collision, 1.0),
+        "N_IN": len(names),
+        "ARG_law": names.index(f"contact_{laws[0]}") if laws else 0,
+        "ARG_target": names.index(f"target_{targets[0]}") if targets else 0,
+        "ROOT_NONZEROS": len(tree.root),
+        "HELD_NONZEROS": len(tree.held),
+        **{f"ARG_{name}": i for i, name in enumerate(names)},
+        **{f"OUT_{name}": i for i, name in enumerate(outputs)},
+    }
+    text = [f"#define {name} {value}" for name, value in numbers.items()]
+    width, held_width = 8 * -(-(robot.nv + 1) // 8), 8 * max(1, -(-held_rows // 8))
+    text += [
+        _table("int", "ROOT_AT", [r * width + c for r, c in tree.root]),
+        _table("int", "HELD_AT", [r * held_width + c for r, c in tree.held]),
+        *_rows_of_columns("ROOT", tree.root, n + 1),
+        *_rows_of_columns("HELD", tree.held, held_rows),
+        _table("double", "GAMMA", gamma_of(collision.held_by, len(held))),
+        _table("int", "ROWS", [_rows(collision, x) if x in HISTORIES else 0 for x in outputs]),
+        _table("int", "STEPS", counts),
+        _table("int", "N_COLUMNS", _columns(collision, every)),
+        _table("int", "STEPS_TO_MIDDLE", [_blocks(collision, float(x) / 2) for x in np.diff(ends)]),
+        _table("double", "ENDS", list(ends)),
+        names_table("NAMES_IN", names),
+        shapes_table("SHAPES_IN", shapes.values()),
+    ]
+    return "\n".join(text) + "\n"
+
+
+def _rows_of_columns(name: str, places: list[tuple[int, int]], columns: int) -> list[str]:
+    """Tables of the rows of each column's nonzeros, and of where they begin."""
+    rows = [[r for r, c in places if c == column] for column in range(columns)]
+    starts = [0, *(int(x) for x in np.cumsum([len(x) for x in rows]))]
+    return [
+        _table("int", f"{name}_ROWS", starts),
+        _table("int", f"{name}_ROW", [r for column in rows for r in column]),
+    ]
+
+
+def _table(kind: str, name: str, values: Iterable[Any]) -> str:
+    return f"static const {kind} {name}[] = {{{', '.join(map(repr, values)) or '0'}}};"
+
+
+def names_table(name: str, values: Iterable[str]) -> str:
+    return f"static const char *const {name}[] = {{{', '.join(f'{chr(34)}{x}{chr(34)}' for x in values)}}};"
+
+
+def shapes_table(name: str, shapes: Iterable[tuple[int, int]]) -> str:
+    # a 1 after the shape says dense
+    return f"static const long long {name}[][3] = {{{', '.join(f'{{{a}, {b}, 1}}' for a, b in shapes)}}};"

@@ -38,6 +38,7 @@ _TO_BERNSTEIN = bernstein_matrix(_DEGREE)
 # of the terms that a watched form sums up: below this its value is rounding
 _ROUNDING = 64 * np.finfo(float).eps
 _MOST_PHASES = 10_000
+_MOST_HALVINGS = 16
 
 
 def exact_collision(
@@ -156,7 +157,8 @@ def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
 
     Raises
     ------
-    RuntimeError : phases that end as soon as they begin, one after the other.
+    RuntimeError : phases that end as soon as they begin, one after the other; numbers too far apart for
+        floating point.
     """
     z, phase = pieces.start()
     phases, kept, peak = [], [z], 0.0
@@ -172,7 +174,7 @@ def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
         while found is None and z[time] < horizon:
             flow, terms = flow.fitting(z)
             begin, left = z[time], min(1.0, (horizon - z[time]) / flow.step)
-            found = flow.first_exit(z, terms, left)
+            found = flow.first_exit(terms, left)
             s = left if found is None else found[0]
             peak = largest(_TO_BERNSTEIN @ (terms @ flow.force), s, peak)
             ends = (begin / spacing, (begin + s * flow.step) / spacing)
@@ -207,11 +209,14 @@ class _Flow:
     def fitting(self, z: Array) -> tuple[_Flow, Array]:
         """This flow, or one of shorter steps, and its terms: they have to sum up to what the exponential
         gives."""
-        terms, ends, rows = self.terms(z), self.exponential @ z, self.watch.rows
-        size = np.abs(rows) @ (np.abs(ends) + np.abs(z))
-        if (np.abs(rows @ (_value(terms, 1.0) - ends)) <= 1e-12 * size).all():
-            return self, terms
-        return _Flow(self.pieces, self.phase, self.step / 2).fitting(z)
+        flow = self
+        for _ in range(_MOST_HALVINGS):
+            terms, ends = flow.terms(z), flow.exponential @ z
+            off = np.abs(flow.watch.rows @ (_value(terms, 1.0) - ends))
+            if (off <= 1e-12 * flow.sizes(terms)).all():
+                return flow, terms
+            flow = _Flow(flow.pieces, flow.phase, flow.step / 2)
+        raise RuntimeError(f"Taylor's polynomials differ from the exponential in steps of {flow.step:.2g} s")
 
     def terms(self, z: Array) -> Array:
         """(degree + 1, N): z(s step) = sum of s^k times row k."""
@@ -221,14 +226,24 @@ class _Flow:
             out[k + 1] = self.scaled @ out[k] / (k + 1)
         return out
 
-    def first_exit(self, z: Array, terms: Array, end: float) -> tuple[float, int, bool] | None:
+    def sizes(self, terms: Array) -> Array:
+        """Of what the watched forms are sums of, over a step: rounding errors go with these.
+
+        The state's terms, and what these are sums of in their turn: where a nail's force and resistance all
+        but cancel, so do the terms of its speed.
+        """
+        state = np.abs(terms).sum(axis=0)
+        found: Array = np.abs(self.watch.rows) @ (state + np.abs(self.scaled) @ state)
+        return found
+
+    def first_exit(self, terms: Array, end: float) -> tuple[float, int, bool] | None:
         """(place in the step, up to `end`; number of the form; whether above) of the first out of bounds.
 
         Bounds are widened by rounding errors, so that a form that has just come in is not thrown out.
         """
         watch = self.watch
         b = _TO_BERNSTEIN @ (terms @ watch.rows.T)
-        sizes = np.abs(watch.rows) @ (np.abs(z) + np.abs(self.scaled) @ np.abs(z))
+        sizes = self.sizes(terms)
         first: tuple[float, int, bool] | None = None
         for bound, sign in ((watch.lower, 1.0), (watch.upper, -1.0)):
             there = np.isfinite(bound)

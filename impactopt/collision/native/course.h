@@ -153,7 +153,7 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
       memcpy(c->q, q_then, sizeof c->q);
       memcpy(c->v, v_then, sizeof c->v);
     }
-    freeze(q_middle, v_middle, normal, 1e30, F);
+    freeze(q_middle, v_middle, normal, GIVES_WAY, F);
     const double *in[] = {c->q, c->v, normal};
     double *out[] = {&d->hand_speed};
     hand_speed_at(in, out, 0, 0, 0);

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..course import _GRADING
+from ..course import _GIVES_WAY, _GRADING
 from ..events import _BEYOND
 from ..graph import joint_space_model, number_of_steps
 from ..loop import _BLOCK
@@ -104,6 +104,7 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "COLUMN(i)": f"((i) >= {robot.nv - n} ? (i) - {robot.nv - n} : {n + 1} + (i))",
         "LENGTH": repr(float(collision.step_length)),
         "BEYOND": repr(_BEYOND),
+        "GIVES_WAY": repr(_GIVES_WAY),
         "HORIZON": repr(float(collision.horizon)),
         "TRANSITION": repr(float(model.transition)),
         "STIFFNESS": int(terms.stiffness and n > 0),

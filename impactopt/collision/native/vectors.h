@@ -25,9 +25,14 @@ typedef long long bits __attribute__((vector_size(64), may_alias));
 INLINE vec choose(bits condition, vec yes, vec no) {
   return (vec)(((bits)yes & condition) | ((bits)no & ~condition));
 }
+#ifdef __clang__
+#define SHUFFLED(x, ...) __builtin_shufflevector(x, x, __VA_ARGS__)
+#else
+#define SHUFFLED(x, ...) __builtin_shuffle(x, (bits){__VA_ARGS__})
+#endif
 INLINE double sum(vec x) {
-  vec a = x + __builtin_shuffle(x, (bits){4, 5, 6, 7, 0, 1, 2, 3});
-  vec b = a + __builtin_shuffle(a, (bits){2, 3, 0, 1, 6, 7, 4, 5});
+  vec a = x + SHUFFLED(x, 4, 5, 6, 7, 0, 1, 2, 3);
+  vec b = a + SHUFFLED(a, 2, 3, 0, 1, 6, 7, 4, 5);
   return b[0] + b[1];
 }
 INLINE double dot(const vec *a, const vec *b, int count) {

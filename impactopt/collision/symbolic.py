@@ -20,11 +20,11 @@ from .graph import (
     METHODS,
     collision_graph,
     frozen_dynamics,
-    gradient_graph,
     joint_space_model,
     number_of_steps,
 )
 from .interface import CollisionModel
+from .native import native_collision, native_gradient
 from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_outputs
 from .result import Collision
 from .settings import Settings
@@ -161,8 +161,13 @@ class SymbolicModel(CollisionModel):
         every : keep every so many steps, and the last, of the histories.
         """
         self._check_outputs(outputs, every)
-        whole = self._compiled("collision", (*outputs, every), lambda: self.graph(outputs, every=every))
-        return self._with_parameters(whole, parameters)
+        return self._with_parameters(self._collision(tuple(outputs), every), parameters)
+
+    def _collision(self, outputs: tuple[str, ...], every: int = 1) -> Any:
+        """With all settings as inputs, in C written by hand where there is a compiler."""
+        return self._compiled(
+            "collision", (*outputs, every), lambda: native_collision(self, outputs, every=every)
+        )
 
     def gradient_function(self, output: str = "impulse", *, parameters: tuple[str, ...] = ()) -> Any:
         """A compiled ca.Function with the inputs of `function`, to a scalar output and its gradients.
@@ -172,7 +177,7 @@ class SymbolicModel(CollisionModel):
         self._check_outputs((output,), 1)
         if output not in SCALARS:
             raise InputError(f"gradient of {output!r}: only of a number: {', '.join(SCALARS)}")
-        whole = self._compiled("collision_gradient", (output,), lambda: gradient_graph(self, output))
+        whole = self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
         return self._with_parameters(whole, parameters)
 
     def describe(
@@ -310,8 +315,7 @@ class SymbolicModel(CollisionModel):
                 f"{longest:.2g}: give a step below that, or the joints less kd or more armature"
             )
         names = self.available
-        whole = self._compiled("collision", (*names, 1), lambda: self.graph(names))
-        found = whole.call([ca.DM(x) for x in (*arguments, *values.values())])
+        found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
         return Collision.from_outputs(outputs, self.target)
 

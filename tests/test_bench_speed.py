@@ -11,9 +11,16 @@ import small_robots
 from test_native import FRICTION, LAW, TARGET, sdc, situation
 
 from impactopt._compiler import find_compiler
+from impactopt.bench import clock, collision, scaling, skip
+from impactopt.bench.registry import run_bench
+from impactopt.bench.scene import Scene
+from impactopt.cases import Case
 from impactopt.collision import SDC, Terms, VirtualMass
 from impactopt.collision.describe import independent_joints
 from impactopt.errors import InputError
+from impactopt.plotting.pareto import front, pareto_picture
+from impactopt.plotting.scaling import scaling_picture
+from impactopt.plotting.skip import skip_picture
 from impactopt.presets import standin
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -171,3 +178,142 @@ def test_joints_that_share_none_with_the_blow_s_limb_change_nothing() -> None:
     assert np.abs(np.asarray(a.torque)[:, kept] - np.asarray(b.torque)).max() < 1e-9
     assert independent_joints(small) == [] and independent_joints(sdc("biped")) == []
     assert "nothing yet" in whole.describe().left_out
+
+
+# ---------------------------------------------------------------- benches
+def quiet(_text: str) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A small arm's blow: the benches take any."""
+    model = sdc("arm")
+    q, v, torque = situation("arm", model, seed=3)[:3]
+    case = Case(
+        robot=model.robot,
+        name="blow",
+        striker="hand",
+        normal=X,
+        q=q,
+        v=v,
+        torque=0.2 * torque,
+        effective_mass=np.nan,
+        speed=1.5,
+    )
+    return Scene(name="arm", case=case, law=LAW, target=TARGET, horizon=0.05)
+
+
+def test_what_is_timed_in_turns_keeps_its_ratio() -> None:
+    found = clock.medians({"one": lambda: sum(range(2000)), "ten": lambda: sum(range(20000))}, repeats=5)
+    assert 4 < found["ten"] / found["one"] < 25
+
+
+def test_what_takes_long_is_timed_less() -> None:
+    calls: list[int] = []
+    clock.medians({"slow": lambda: calls.append(sum(range(200_000)))}, repeats=50, longest=0.0)
+    assert len(calls) == 2 + 3
+
+
+@compiled
+def test_the_bench_of_collisions_has_each_method_and_the_default_s_ratios(scene: Scene) -> None:
+    numbers = collision.run(quiet, scenes=[scene], quick=True, repeats=3).numbers
+    rows = {(r["method"], r["setting"]): r for r in numbers["rows"]}
+    keys = {"robot", "method", "setting", "time_us", "note", *collision.KEYS}
+    assert all({*r} == keys for r in rows.values())
+    error = {method: rows[method, setting]["impulse_error_pct"] for method, setting in rows}
+    # the same frozen collision, integrated by others
+    for method in ("exact", "sdc, CasADi's C", "CVODES by CasADi"):
+        assert error[method] == pytest.approx(error["sdc"], abs=1e-3)
+    assert abs(error["sdc, 2 freezes"]) < abs(error["sdc"]) < abs(error["virtual mass"])
+    assert abs(error["Pinocchio, loop in Python"]) < 1e-3 and abs(error["MuJoCo, loop in Python"]) < 2.0
+    assert error["MuJoCo, steps alone"] is None and rows["MuJoCo, steps alone", "0.0001 s"]["note"]
+    default = numbers["default"]
+    assert default["integration_error"] < 1e-6
+    assert default["time_us"] == rows[collision.DEFAULT]["time_us"]
+    assert default["speedup_vs_mujoco_1e-4"] > default["speedup_vs_mujoco_1e-4_steps_alone"] > 1
+    assert {"speedup_vs_paper_rk4_1e-4", "gradient_cost_ratio", "impacts_per_second_2_cores"} <= {*default}
+    assert json.dumps(numbers)
+
+
+def test_a_front_is_of_what_nothing_beats() -> None:
+    pairs = [(1.0, -5.0), (2.0, 6.0), (3.0, 1.0), (4.0, -1.0), (5.0, 0.1)]
+    rows = [
+        {"robot": "r", "method": "sdc", "time_us": t, "impulse_error_pct": e, "setting": ""} for t, e in pairs
+    ]
+    assert [r["time_us"] for r in front(rows)] == [1.0, 3.0, 5.0]
+    assert len(pareto_picture(rows).axes) == 1
+
+
+@compiled
+def test_a_step_that_is_unstable_has_a_row_that_says_so(scene: Scene) -> None:
+    from impactopt.bench import methods
+
+    found, refused = [], []
+    maker = methods._ours(scene, quiet, found, refused)
+    maker("sdc", "0.01 s", lambda: scene.model(SDC, step=0.01, kd=1e3))
+    assert not found and "unstable" in refused[0]["note"]
+
+
+@compiled
+def test_the_bench_of_skipping_says_what_each_saves(scene: Scene) -> None:
+    numbers = skip.run(quiet, scene=scene, repeats=3).numbers
+    rows = {r["skipped"]: r for r in numbers["rows"]}
+    whole = rows["everything"]
+    assert whole["speedup"] == 1.0
+    for name in ("friction", "saturation", "bias and Jdot", "all but the impulse", "constant parameters"):
+        assert rows[name]["instructions"] < whole["instructions"], name
+    assert rows["histories"]["speedup"] > 1
+    assert len(skip_picture(list(rows.values())).axes) == 2
+
+
+def test_joints_that_are_locked_keep_their_places() -> None:
+    robot = standin()
+    q, v = robot.posture("half_sitting"), np.arange(float(robot.nv))
+    case = Case(
+        robot=robot,
+        name="x",
+        striker="right_hand",
+        normal=X,
+        q=q,
+        v=v,
+        torque=np.arange(float(robot.n)),
+        effective_mass=1.0,
+        speed=1.0,
+    )
+    less, small = skip.locked(case, ["left_knee", "head_yaw"], floating=True)
+    assert small.n == robot.n - 2
+    for name in small.joint_names:
+        k = robot.joint_index(name)
+        assert less.torque[small.joint_index(name)] == k and less.v[6 + small.joint_index(name)] == 6 + k
+        assert small.joint_positions(less.q)[small.joint_index(name)] == robot.joint_positions(q)[k]
+
+
+@compiled
+def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -> None:
+    report = scaling.run(
+        quiet,
+        chains=(2, 4),
+        trees=(8,),
+        humanoids=(),
+        scene=scene,
+        steps=(2.5e-4,),
+        batches=(1, 20),
+        repeats=3,
+    )
+    rows = report.numbers["rows"]
+    assert {r["over"] for r in rows} == {"dof", "step", "batch"}
+    small, large = (r for r in rows if r.get("robot") == "chain")
+    assert large["paper_once"] > small["paper_once"] and large["n"] == 4
+    steps = [r for r in rows if r["over"] == "step" and r["method"] == "events"]
+    assert steps and all(r["integration_error"] < 1e-6 for r in steps if r["step_s"] <= 2.5e-4)
+    assert len(scaling_picture(rows).axes) == 3
+
+
+@pytest.mark.parametrize("name", ["collision", "scaling", "skip"])
+def test_the_benches_are_among_all(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from impactopt.bench.report import Report
+
+    module = {"collision": collision, "scaling": scaling, "skip": skip}[name]
+    monkeypatch.setattr(module, "run", lambda _say, **_options: Report(name=name, numbers={"rows": []}))
+    assert run_bench(name, quiet).name == name

@@ -110,6 +110,34 @@ def virtual_base(as_json: Json = False, out: Out = None, quiet: Quiet = False) -
     _run(["virtual-base"], {}, as_json, out, quiet)
 
 
+@app.command()
+def collision(
+    few: Annotated[bool, typer.Option("--quick", help="The stand-in only, with few settings.")] = False,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run time of a collision against its error: ours, the paper's, Pinocchio, MuJoCo, CVODES."""
+    _run(["collision"], {"collision": {"quick": few}}, as_json, out, quiet)
+
+
+@app.command()
+def scaling(
+    few: Annotated[bool, typer.Option("--quick", help="Up to 32 joints, and one humanoid.")] = False,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """What a collision costs over degrees of freedom, over the step, and over the size of a batch."""
+    _run(["scaling"], {"scaling": {"quick": few}}, as_json, out, quiet)
+
+
+@app.command()
+def skip(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+    """What leaving out what a scene does not need saves, one thing at a time."""
+    _run(["skip"], {}, as_json, out, quiet)
+
+
 @app.command("all")
 def run_all(
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
@@ -123,11 +151,13 @@ def run_all(
     from impactopt.bench.registry import BENCHES
 
     drawn = {"seed": seed, "workers": workers}
-    options = {
+    options: dict[str, dict[str, Any]] = {
         "robustness": {"draws": draws, **drawn},
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
         "fidelity": {"workers": workers, "quick": True},
+        "collision": {"quick": True},
+        "scaling": {"quick": True},
     }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)
 

@@ -21,6 +21,9 @@ BENCHES = {
     "margins": "margins",
     "fidelity": "fidelity",
     "virtual-base": "virtual_base",
+    "collision": "collision",
+    "scaling": "scaling",
+    "skip": "skip",
 }
 
 

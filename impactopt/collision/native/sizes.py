@@ -132,10 +132,9 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         **{f"OUT_{name}": i for i, name in enumerate(outputs)},
     }
     text = [f"#define {name} {value}" for name, value in numbers.items()]
-    width, held_width = 8 * -(-(robot.nv + 1) // 8), 8 * max(1, -(-held_rows // 8))
     text += [
-        _table("int", "ROOT_AT", [r * width + c for r, c in tree.root]),
-        _table("int", "HELD_AT", [r * held_width + c for r, c in tree.held]),
+        _places("ROOT", tree.root),
+        _places("HELD", tree.held),
         *_rows_of_columns("ROOT", tree.root, n + 1),
         *_rows_of_columns("HELD", tree.held, held_rows),
         _table("double", "GAMMA", gamma_of(collision.held_by, len(held))),
@@ -148,6 +147,11 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         shapes_table("SHAPES_IN", shapes.values()),
     ]
     return "\n".join(text) + "\n"
+
+
+def _places(name: str, places: list[tuple[int, int]]) -> str:
+    entries = ", ".join(f"OF_{name}({r}, {c})" for r, c in places)
+    return f"static const int {name}_AT[] = {{{entries or '0'}}};"
 
 
 def _rows_of_columns(name: str, places: list[tuple[int, int]], columns: int) -> list[str]:

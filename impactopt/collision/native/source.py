@@ -62,6 +62,11 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         scalars += backwards(scalars)
         by = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
         shapes |= dict.fromkeys(by, (collision.robot.nv, 1))
+    folder = files(__package__)
+
+    def text(*names: str) -> list[str]:
+        return [folder.joinpath(name).read_text(encoding="utf-8") for name in names]
+
     parts = [
         "#define CASADI_SYMBOL_EXPORT static\n",
         _TREE[0],
@@ -69,17 +74,15 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         _TREE[1],
         c_code("scalars", scalars),
         f"#define GRADIENT {int(gradient)}\n#define NAME {name}\n#define OF_NAME(part) {name}_##part",
+        *text("vectors.h"),
         sizes(collision, outputs, every, tree),
         names_table("NAMES_OUT", shapes),
         shapes_table("SHAPES_OUT", shapes.values()),
         f"#define N_OUT {len(shapes)}",
     ]
     steps = _STEPS[collision.stepping]
-    files_used = ["vectors.h", "freeze.h", "instant.h", f"{steps}.h", "outputs.h", "course.h"]
+    files_used = ["freeze.h", "instant.h", f"{steps}.h", "outputs.h", "course.h"]
     files_used += (
         ["back.h", f"{steps}_back.h", "freeze_back.h", "gradient.c"] if gradient else ["collision.c"]
     )
-    folder = files(__package__)
-    return "\n".join(
-        parts + [folder.joinpath(file).read_text(encoding="utf-8") for file in (*files_used, "interface.c")]
-    )
+    return "\n".join([*parts, *text(*files_used, "interface.c")])

@@ -1,10 +1,16 @@
-/* Vectors of eight numbers, which the compiler maps to what the machine has, and arrays padded to them. */
+/* Vectors as wide as the machine's, and arrays padded to them: wider ones a compiler would take apart badly. */
 #include <math.h>
 #include <string.h>
 
-typedef double vec __attribute__((vector_size(64), may_alias));
-typedef long long bits __attribute__((vector_size(64), may_alias));
+#if defined(__AVX512F__)
 #define LANES 8
+#elif defined(__AVX__)
+#define LANES 4
+#else
+#define LANES 2
+#endif
+typedef double vec __attribute__((vector_size(8 * LANES), may_alias));
+typedef long long bits __attribute__((vector_size(8 * LANES), may_alias));
 #define VECTORS(n) (((n) + LANES - 1) / LANES)
 #define AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
 #define INLINE static inline __attribute__((always_inline))
@@ -19,6 +25,10 @@ typedef long long bits __attribute__((vector_size(64), may_alias));
 #define N1 AT_LEAST_1(N)
 #define NZ1 AT_LEAST_1(NZ)
 
+/* where entries of matrices with such rows lie */
+#define OF_ROOT(r, c) ((r) * VF * LANES + (c))
+#define OF_HELD(r, c) ((r) * VC * LANES + (c))
+
 #define FOR(i, n) for (int i = 0; i < (n); i++)
 #define SIGN_BIT ((bits){} + (long long)0x8000000000000000ULL)
 
@@ -31,9 +41,13 @@ INLINE vec choose(bits condition, vec yes, vec no) {
 #define SHUFFLED(x, ...) __builtin_shuffle(x, (bits){__VA_ARGS__})
 #endif
 INLINE double sum(vec x) {
-  vec a = x + SHUFFLED(x, 4, 5, 6, 7, 0, 1, 2, 3);
-  vec b = a + SHUFFLED(a, 2, 3, 0, 1, 6, 7, 4, 5);
-  return b[0] + b[1];
+#if LANES == 8
+  x += SHUFFLED(x, 4, 5, 6, 7, 0, 1, 2, 3);
+  x += SHUFFLED(x, 2, 3, 0, 1, 6, 7, 4, 5);
+#elif LANES == 4
+  x += SHUFFLED(x, 2, 3, 0, 1);
+#endif
+  return x[0] + x[1];
 }
 INLINE double dot(const vec *a, const vec *b, int count) {
   vec s = a[0] * b[0];
@@ -41,8 +55,10 @@ INLINE double dot(const vec *a, const vec *b, int count) {
   return sum(s);
 }
 INLINE int any(bits x) {
-#ifdef __AVX512DQ__
+#if defined(__AVX512DQ__)
   return __builtin_ia32_cvtq2mask512(x) != 0;
+#elif LANES == 4
+  return __builtin_ia32_movmskpd256((vec)x) != 0;
 #else
   long long found = 0;
   FOR(i, LANES) found |= x[i];

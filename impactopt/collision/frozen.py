@@ -134,6 +134,23 @@ class FrozenDynamics:
         """j P j' [1/kg]: one over the effective mass."""
         return self._form("hand", "hand")
 
+    # ------------------------------------------------------------ what rounding leaves
+    @cached_property
+    def pivots(self) -> Any:
+        """(c): what is left of each diagonal entry of the held frames' Delassus matrix in its factorization.
+
+        Zero where the frame's direction is held already by those before it: a relative rounding error of
+        1e-16 over this is left in all that is computed.
+        """
+        held = self._roots["held"]
+        diagonal = ca.sum1(held**2).T + ca.diag(self._gamma)
+        return 1 / (ca.diag(self._cholesky) ** 2 * diagonal)
+
+    @cached_property
+    def freedom(self) -> Any:
+        """`m` over what it is with nothing held; zero where the hand is held fast."""
+        return self.m / ca.sumsqr(self._roots["hand"])
+
     # ------------------------------------------------------------ drifts
     # Accelerations without torque or contact force.
     @cached_property

@@ -111,6 +111,20 @@ def virtual_base(as_json: Json = False, out: Out = None, quiet: Quiet = False) -
 
 
 @app.command()
+def stability(
+    seed: Seed = 0,
+    workers: Workers = 2,
+    few: Annotated[bool, typer.Option("--quick", help="A tenth of the cases, small robots only.")] = False,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Collisions at the edges of what numbers can hold: is each right, or refused with a reason?"""
+    options = {"quick": few, "seed": seed, "workers": workers}
+    _run(["stability"], {"stability": options}, as_json, out, quiet)
+
+
+@app.command()
 def collision(
     few: Annotated[bool, typer.Option("--quick", help="The stand-in only, with few settings.")] = False,
     as_json: Json = False,
@@ -158,6 +172,7 @@ def run_all(
         "fidelity": {"workers": workers, "quick": True},
         "collision": {"quick": True},
         "scaling": {"quick": True},
+        "stability": {"quick": True, **drawn},
     }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)
 

@@ -24,6 +24,7 @@ BENCHES = {
     "collision": "collision",
     "scaling": "scaling",
     "skip": "skip",
+    "stability": "stability",
 }
 
 

@@ -1,10 +1,10 @@
 """The course of a collision: one freeze from contact to separation, or several, one after the other.
 
 With N freezes on the way, the freeze at contact only estimates the contact's duration T, and predicts. The
-course is cut into N stretches of T / N (shorter ones first would be no better). Each goes by a freeze at its
-*middle*, which the freeze before it predicts. The prediction's
-error is of second order in the stretch's length, and so is that of a coefficient frozen in the middle: the
-course converges to full dynamics with 1/N^2.
+course is cut into N stretches of T / N (shorter ones first are no better). Each goes by a freeze at its
+*middle*, which the freeze before it predicts. The prediction's error is of second order in the stretch's
+length, and so is that of a coefficient frozen in the middle: the course converges to full dynamics with
+1/N^2.
 """
 
 from __future__ import annotations
@@ -15,17 +15,15 @@ from itertools import pairwise
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from .frozen import FrozenDynamics
 from .loop import run
 from .model import JointSpaceModel
 
-__all__ = ["Course", "Stretch"]
+__all__ = ["GIVES_WAY", "Course", "Stretch", "cuts"]
 
-_GRADING = 1.0
 # [1/kg] of a target that takes no impulse: drifts are frozen at the velocity given, see frozen.py
-_GIVES_WAY = 1e30
+GIVES_WAY = 1e30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +45,11 @@ class Stretch:
     states: Any
     v_after: Callable[[], Any]
     q_after: Callable[[], Any]
+
+
+def cuts(freezes: int) -> list[float]:
+    """Where stretches begin and end, as fractions of the contact's duration (freezes + 1)."""
+    return [i / freezes for i in range(freezes + 1)]
 
 
 class Course:
@@ -91,25 +94,24 @@ class Course:
         data |= {"velocity_before": ca.MX.zeros(n), "until": ca.MX(self.horizon)}
         start = ca.MX(self.model.start())
         duration = self._time(self._loop(data, start, 1.0, record=False)[0])
-        fractions = (np.arange(self.freezes + 1) / self.freezes) ** _GRADING
         stretches: list[Stretch] = []
         reached, frozen_at, contact = start, q, ca.MX(1.0)
-        for i, (a, b) in enumerate(pairwise(fractions)):
+        for i, (a, b) in enumerate(pairwise(cuts(self.freezes))):
             last = i == self.freezes - 1
             # what was frozen before goes on to the middle of this stretch
             ahead = data | {"until": self._time(reached) + duration * (b - a) / 2}
-            middle = self._loop(ahead, reached, float(b - a) / 2, record=False)[0]
+            middle = self._loop(ahead, reached, (b - a) / 2, record=False)[0]
             q_middle, v_middle = self._moved(data, frozen_at, q, v, middle)
             if stretches:
                 q, v = stretches[-1].q_after(), stretches[-1].v_after()
             frozen_at = q_middle
-            data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], _GIVES_WAY)
+            data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], GIVES_WAY)
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             data["velocity_before"] = (v - inputs["v"])[-n:]
             # no stretch begins after separation
             length = self.horizon - duration * a if last else duration * (b - a)
             data["until"] = ca.if_else(contact, length, -1.0)
-            share = 1.0 if last else float(b - a)
+            share = 1.0 if last else b - a
             stretches.append(self._stretch(data, frozen_at, q, v, start, share, duration * a))
             reached = stretches[-1].final
             start = self._handed_on(reached)

@@ -9,11 +9,11 @@ import casadi as ca
 
 from .jets import Jet, value_at
 
-__all__ = ["first_event", "level_jet", "refine"]
+__all__ = ["BEYOND", "first_event", "level_jet", "refine"]
 
 # a step that ends on an event goes on by this fraction of its full length, so that the next one starts in
 # the new phase
-_BEYOND = 1e-5
+BEYOND = 1e-5
 
 
 def level_jet(jet: Jet, level: Any, length: Any) -> list[Any]:
@@ -52,7 +52,7 @@ def refine(jets: Sequence[Jet], length: Any, first: Any, at: Any) -> Any:
     size = max(len(jet) for jet in jets)
     padded = [[*jet, *[ca.SX(0.0)] * (size - len(jet))] for jet in jets]
     chosen = [ca.dot(at, ca.vertcat(*[jet[k] for jet in padded])) for k in range(size)]
-    time = ca.fmax(_newton(chosen, first), 0.0) + _BEYOND * length
+    time = ca.fmax(_newton(chosen, first), 0.0) + BEYOND * length
     return ca.if_else(ca.sum1(at) > 0, ca.fmin(time, length), length)
 
 

@@ -9,10 +9,10 @@ import casadi as ca
 
 from .model import JointSpaceModel
 
-__all__ = ["run"]
+__all__ = ["BLOCK", "run"]
 
 # steps in a block: a block is skipped when the contact is over before it begins
-_BLOCK = 16
+BLOCK = 16
 
 
 def run(
@@ -30,7 +30,7 @@ def run(
     small = [x for x, name in zip(data, model.data, strict=True) if name != "A"]
     y = ca.MX(start)
     history = [y]
-    for _ in range(-(-steps // _BLOCK)):
+    for _ in range(-(-steps // BLOCK)):
         out = advance.call([running(y, *small), y, *data])
         y = out[0]
         history += out[1:]
@@ -40,7 +40,7 @@ def run(
 def _block(model: JointSpaceModel, step: Any, record: bool) -> Any:
     y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
     states = [y]
-    for _ in range(_BLOCK):
+    for _ in range(BLOCK):
         states.append(step(states[-1], *data))
     out = [states[-1], ca.horzcat(*states[1:])] if record else [states[-1]]
     return ca.Function("block", [y, *data], out)
@@ -48,7 +48,7 @@ def _block(model: JointSpaceModel, step: Any, record: bool) -> Any:
 
 def _still(model: JointSpaceModel, record: bool) -> Any:
     y, data = ca.MX.sym("y", model.n_states), list(model.symbols(ca.MX).values())
-    out = [y, ca.repmat(y, 1, _BLOCK)] if record else [y]
+    out = [y, ca.repmat(y, 1, BLOCK)] if record else [y]
     return ca.Function("still", [y, *data], out)
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..course import _GIVES_WAY, _GRADING
-from ..events import _BEYOND
+from ..course import GIVES_WAY, cuts
+from ..events import BEYOND
 from ..graph import joint_space_model, number_of_steps
-from ..loop import _BLOCK
+from ..loop import BLOCK
 from ..model import shape_of
 from ..outputs import HISTORIES, OF_SOLES, frozen_for
 from ..taylor import ORDER
@@ -56,13 +56,12 @@ def _rows(collision: SymbolicModel, history: str) -> int:
 
 def _ends(collision: SymbolicModel) -> list[float]:
     """Where stretches end, as fractions of the contact's duration."""
-    freezes = max(collision.n_freezes, 1)
-    return [float(x) for x in (np.arange(freezes + 1) / freezes) ** _GRADING]
+    return cuts(max(collision.n_freezes, 1))
 
 
 def _blocks(collision: SymbolicModel, fraction: float) -> int:
     """Steps for a fraction of the horizon, in whole blocks."""
-    return -(-number_of_steps(collision, fraction) // _BLOCK) * _BLOCK
+    return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 
 def _steps(collision: SymbolicModel) -> list[int]:
@@ -103,8 +102,8 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "SIZE": ORDER + 1,
         "COLUMN(i)": f"((i) >= {robot.nv - n} ? (i) - {robot.nv - n} : {n + 1} + (i))",
         "LENGTH": repr(float(collision.step_length)),
-        "BEYOND": repr(_BEYOND),
-        "GIVES_WAY": repr(_GIVES_WAY),
+        "BEYOND": repr(BEYOND),
+        "GIVES_WAY": repr(GIVES_WAY),
         "HORIZON": repr(float(collision.horizon)),
         "TRANSITION": repr(float(model.transition)),
         "STIFFNESS": int(terms.stiffness and n > 0),

@@ -54,6 +54,13 @@ def test_first_of_several_roots_and_the_largest_value() -> None:
     assert largest(b, 1.0, 7.0) == 7.0
 
 
+def test_the_largest_value_where_rounding_is_all_that_tells_neighbours_apart() -> None:
+    for top in np.linspace(0.05, 0.95, 19):
+        powers = np.zeros(21)
+        powers[:3] = 400.0 - 1e-2 * top**2, 2e-2 * top, -1e-2
+        assert largest(bernstein_matrix(20) @ powers, 1.0, 0.0) == pytest.approx(400.0, rel=1e-13)
+
+
 # ------------------------------------------------------------ closed forms
 @pytest.mark.parametrize("mass, target, ratio", [(4.0, 5.0, 0.2), (1.0, 50.0, 0.7), (6.0, 0.5, 0.0)])
 def test_two_masses_in_closed_form(mass: float, target: float, ratio: float) -> None:

@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 
 # parts of [0, 1] below this length are not told apart
 _SHORTEST = 2.0**-50
-# next to an extremum the polynomial is flat: so far from it nothing changes
-_NEXT = 1e-9
+# relative: halves of a polynomial are exact up to this
+_ROUNDING = 1e-14
 
 
 def bernstein_matrix(degree: int) -> Array:
@@ -49,21 +49,19 @@ def first_negative(b: Array, start: float = 0.0, length: float = 1.0) -> float |
 
 
 def largest(b: Array, end: float, least: float) -> float:
-    """The greatest of `least` and a polynomial's values on [0, end]."""
-    if b.max() <= least:
+    """The greatest of `least` and a polynomial's values on [0, end], but for rounding.
+
+    No value is above the greatest coefficient, which comes down to the values with the square of the length
+    of the parts.
+    """
+    if b.max() <= least + _ROUNDING * np.abs(b).max():
         return least
-    b = _halves(b, end)[0]
+    b = _halves(b, end)[0] if end < 1.0 else b
     least = max(least, float(b[0]), float(b[-1]))
-    slope = np.diff(b)
-    if b.max() <= least or (slope >= 0).all() or (slope <= 0).all():
+    if b.max() <= least + _ROUNDING * np.abs(b).max():
         return least
-    # up to the next extremum, and on from just beyond it
-    place = first_negative(slope if slope[0] >= 0 else -slope)
-    if place is None:
-        return least
-    least = max(least, float(_halves(b, place)[0][-1]))
-    place = max(place, _NEXT)
-    return least if place >= 1.0 else largest(_halves(b, place)[1], 1.0, least)
+    left, right = _halves(b, 0.5)
+    return largest(right, 1.0, largest(left, 1.0, least))
 
 
 def _halves(b: Array, s: float) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 _ACCURACY = {"events": 1e-5, "rk4": 1e-2}
 # of a factorization's pivot, and of the hand's mobility, relative: with less, rounding reaches 1e-7
 _LEAST_PIVOT = 1e-9
+# force that pulls at separation, of the peak's; steps that find their events leave 1e-5 of a step's change
+_OVERSHOT = 1e-4
 
 
 def check_frozen(frozen: dict[str, Array]) -> None:
@@ -74,7 +77,7 @@ def check_course(
         )
     if result.duration == 0:
         return
-    if result.impulse < 0:
+    if result.impulse < 0 or (method == "events" and _overshot(collision, result, data) > _OVERSHOT):
         raise InputError(
             f"step [s]: the contact ends within {result.duration:.2g} s, too soon for steps of "
             f"{length:g}: give a shorter step, or a v that approaches faster"
@@ -92,3 +95,15 @@ def check_course(
         f"step [s]: {length:g} is too long to follow this contact, whose rate is {contact:.2g} 1/s, within "
         f"{_ACCURACY[method]:g} of its impulse: give a step below {step:.2g}"
     )
+
+
+def _overshot(collision: SymbolicModel, result: Collision, data: dict[str, Array]) -> float:
+    """How far below zero the force is at separation, of its peak: the search for events starts from a whole
+    step, and may miss a separation that comes after a small part of it."""
+    if not result.separated:
+        return 0.0
+    law = collision.law
+    numbers = {name: float(data[f"contact_{name}"].item()) for name in law.parameters}
+    rate = float(result.hand_speed[-1] - result.target_speed[-1])
+    left = ca.DM(law.branch(float(result.penetration[-1]), rate, False, numbers))
+    return max(0.0, -float(left)) / max(result.peak_force, 1e-300)

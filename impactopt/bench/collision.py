@@ -7,13 +7,14 @@ need the interpreter, its row has no error and says so in `note`.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from impactopt.bench.clock import medians, runner
+from impactopt.bench.clock import medians, runner, shortest
 from impactopt.bench.methods import Entry, entries
 from impactopt.bench.peers import mujoco_rollouts, pinocchio_calls
 from impactopt.bench.report import Report, Say, cell, make_table
@@ -31,7 +32,7 @@ from impactopt.collision import SDC, Collision
 from impactopt.plotting.pareto import pareto_picture
 from impactopt.reference import FullDynamics
 
-BATCH, ROLLOUTS = 2000, 8
+BATCH, ROLLOUTS = 200, 2
 DEFAULT = ("sdc", "2.5e-4 s")
 KEYS = ("impulse_error_pct", "peak_force_error_pct", "zmp_error_mm", "torque_error_pct")
 
@@ -78,7 +79,9 @@ def timed_rows(
 ) -> list[dict[str, Any]]:
     """Rows with times and errors; errors are None where nothing is known of the outcome."""
     names = {f"{e.method}|{e.setting}": e for e in found}
-    times = medians({name: e.run for name, e in names.items()}, repeats=repeats, longest=2.0)
+    times = medians(
+        {name: e.run for name, e in names.items()}, repeats=repeats, longest=2.0, clock=time.thread_time
+    )
     rows = []
     for name, e in names.items():
         row: dict[str, Any] = {"robot": scene.name, "method": e.method, "setting": e.setting}
@@ -98,20 +101,20 @@ def default_of(scene: Scene, true: Collision, rows: Sequence[dict[str, Any]], re
     """What the default model takes, and ratios to the others of the same run."""
     case, model = scene.case, scene.model(SDC)
     at = {(r["method"], r["setting"]): r["time_us"] for r in rows}
-    time = at[DEFAULT]
+    own = at[DEFAULT]
 
     def ratio(method: str, setting: str) -> float | None:
         other = at.get((method, setting))
-        return None if other is None else other / time
+        return None if other is None else other / own
 
     exact = scene.model(SDC, method="exact").collide(case.q, case.v, case.torque)
     gradient = runner(compiled_gradient(model, "impulse"), inputs(model, case))
     usual = runner(model.function(("impulse",)), [case.q, case.v, case.torque])
     runs = {"value": run_of(model, case, ("impulse",)), "gradient": gradient, "function": usual}
-    value = medians(runs, repeats=repeats)
-    throughput = batches(scene, true, max(3, repeats // 3))
+    value = medians(runs, repeats=repeats, clock=time.thread_time)
+    throughput = batches(scene, true, 3 * repeats)
     return {
-        "time_us": time,
+        "time_us": own,
         "impulse_alone_us": 1e6 * value["value"],
         "impulse_by_function_us": 1e6 * value["function"],
         "integration_error": abs(outcome(model, case).impulse / exact.impulse - 1),
@@ -134,7 +137,7 @@ def batches(scene: Scene, true: Collision, repeats: int) -> dict[str, Any]:
     for k in (1, 2):
         runs[f"ours {k}"] = partial(model.batch, q, v, case.torque, outputs=("impulse",), threads=k)
         runs[f"mujoco {k}"] = mujoco_rollouts(scene, 1e-4, true.duration, ROLLOUTS, k)
-    times = medians(runs, repeats=repeats)
+    times = shortest(runs, repeats=repeats)
     return {
         "impacts_per_second_1_core": BATCH / times["ours 1"],
         "impacts_per_second_2_cores": BATCH / times["ours 2"],
@@ -157,7 +160,8 @@ def profile(scene: Scene, repeats: int) -> dict[str, float]:
         "all": run_of(model, case, wanted),
     }
     theirs = {f"pinocchio {name}": call for name, call in pinocchio_calls(scene).items()}
-    times = {name: 1e6 * t for name, t in medians({**ours, **theirs}, repeats=repeats).items()}
+    found = medians({**ours, **theirs}, repeats=repeats, clock=time.thread_time)
+    times = {name: 1e6 * t for name, t in found.items()}
     steps = outcome(model, case).time.size - 1
     step = (times["impulse"] - times["freeze"]) / max(1, steps - 1)
     out = {

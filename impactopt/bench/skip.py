@@ -6,6 +6,7 @@ a beginning of their own, which they name.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -58,17 +59,17 @@ def run(say: Say, *, scene: Scene | None = None, repeats: int = 25) -> Report:
     for variant in found:
         say(f"compiling without {variant.skipped}")
         runs[variant.skipped] = run_of(variant.model, variant.case, variant.outputs)
-    times = medians(runs, repeats=repeats)
+    times = medians(runs, repeats=repeats, clock=time.thread_time)
     rows = []
     for variant in found:
         parts = instructions(variant.model, variant.outputs)
-        time = times[variant.skipped]
+        own = times[variant.skipped]
         row: dict[str, Any] = {
             "skipped": variant.skipped,
             "instructions": sum(parts.values()),
-            "time_us": 1e6 * time,
+            "time_us": 1e6 * own,
         }
-        row |= {"speedup": times[variant.beside] / time, "beside": variant.beside}
+        row |= {"speedup": times[variant.beside] / own, "beside": variant.beside}
         rows.append({**row, "freeze_instructions": parts["freeze"], "step_instructions": parts["step"]})
     rows += not_timed(scene, found)
     table = make_table(

@@ -18,7 +18,7 @@ from impactopt.reference import FullDynamics
 __all__ = ["Entry", "entries"]
 
 PAPER_STEPS = (1e-3, 1e-4, 1e-5, 2e-6)  # [s]; 1e-6 would be more steps than a model allows
-OUR_STEPS = (1e-3, 5e-4, 2.5e-4, 1e-4)
+OUR_STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)
 FREEZES = (1, 2, 4, 8)
 FULL_STEPS = (4e-4, 2e-4, 1e-4)
 MUJOCO_STEPS = (1e-3, 2e-4, 1e-4, 5e-5)

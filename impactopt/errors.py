@@ -65,3 +65,12 @@ def check_array(
         allowed = "a finite number" if finite else "a number"
         raise InputError(f"{name}: {array[place]}{where}; give {allowed}")
     return array
+
+
+def check_direction(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """A float64 copy of a unit vector (3,); InputError as of `check_array`, or for another length."""
+    array = check_array(name, value, (3,))
+    length = float(np.linalg.norm(array))
+    if abs(length - 1.0) > 1e-6:
+        raise InputError(f"{name}: not a unit vector (length {length:.6g}); divide it by its length")
+    return array

@@ -545,6 +545,16 @@ def test_every_keeps_every_so_many_steps_and_the_last():
 
 
 # ------------------------------------------------------------ gradient
+def check_gradient(robot, value, arguments, by_q, by_v, directions, *, rel, h=1e-5):
+    """Gradients by q and v against central differences of value(q, v, ...) along directions (k, nv)."""
+    q, v, *rest = arguments
+    for d in directions:
+        along_q = [float(value(pin.integrate(robot.model, q, s * h * d), v, *rest)) for s in (1, -1)]
+        along_v = [float(value(q, v + s * h * d, *rest)) for s in (1, -1)]
+        assert by_q @ d == pytest.approx((along_q[0] - along_q[1]) / (2 * h), rel=rel)
+        assert by_v @ d == pytest.approx((along_v[0] - along_v[1]) / (2 * h), rel=rel)
+
+
 @pytest.mark.parametrize("seed, speed", [(9, 0.6), (10, 2.5)])
 def test_gradient_against_central_differences(seed, speed):
     robot, sdc = robot_named("talos"), default_sdc("talos")
@@ -552,13 +562,8 @@ def test_gradient_against_central_differences(seed, speed):
     value, by_q, by_v = (np.array(x).ravel() for x in sdc.gradient_function("impulse")(q, v, torque))
     impulse = sdc.function(("impulse",))
     assert value == pytest.approx(float(impulse(q, v, torque)), rel=1e-12)
-    rng, h = np.random.default_rng(0), 1e-5
-    for _ in range(6):
-        d = rng.normal(size=robot.nv)
-        along_q = [float(impulse(pin.integrate(robot.model, q, s * h * d), v, torque)) for s in (1, -1)]
-        along_v = [float(impulse(q, v + s * h * d, torque)) for s in (1, -1)]
-        assert by_q @ d == pytest.approx((along_q[0] - along_q[1]) / (2 * h), rel=1e-6)
-        assert by_v @ d == pytest.approx((along_v[0] - along_v[1]) / (2 * h), rel=1e-6)
+    directions = np.random.default_rng(0).normal(size=(6, robot.nv))
+    check_gradient(robot, impulse, (q, v, torque), by_q, by_v, directions, rel=1e-6)
 
 
 # ------------------------------------------------------------ the virtual base

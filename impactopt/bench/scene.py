@@ -19,7 +19,6 @@ from impactopt.bench.clock import runner
 from impactopt.cases import Case, paper_motions
 from impactopt.codegen import cached
 from impactopt.collision import SDC, Collision
-from impactopt.collision.native import native_gradient
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.presets import load_robot
@@ -88,7 +87,7 @@ def compiled(model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) 
 
 def compiled_gradient(model: SymbolicModel, output: str) -> Any:
     """The collision's output and its gradient in q and v, likewise."""
-    return model._compiled("collision_gradient", (output,), lambda: native_gradient(model, output))
+    return model._gradient(output)
 
 
 def graph(model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> Any:

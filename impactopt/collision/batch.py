@@ -22,7 +22,7 @@ from ..codegen import cached, library_path
 from ..errors import InputError, check_array
 from .native import native_collision
 from .outputs import HISTORIES, SCALARS
-from .settings import _NO_LIMIT
+from .settings import NO_LIMIT
 
 if TYPE_CHECKING:
     from .symbolic import SymbolicModel
@@ -91,11 +91,7 @@ class Batch:
         first = {name: given[name][0] for name in self.model.settings}
         first = {name: x.reshape(self.model.settings[name].shape) for name, x in first.items()}
         longest, step = self.model.stable_step(given["q"][0], **first), self.model.step_length
-        if step >= longest:
-            raise InputError(
-                f"step [s]: {step:g} is unstable in the first collision, where the fastest mode allows "
-                f"{longest:.2g}: give the model a step below that, or the joints less kd or more armature"
-            )
+        self.model.check_step(step, longest, "in the first collision")
 
     def _shaped(self, name: str, flat: Array, shape: tuple[int, int]) -> Array:
         """Collisions first, then instants; matrices of CasADi's lie by columns."""
@@ -192,6 +188,6 @@ def _settings(model: SymbolicModel, settings: Mapping[str, Any], count: int) -> 
             whole = name == "normal" or usual.ndim == 2
             for one in value if whole else (value.min(axis=0), value.max(axis=0)):
                 model.settings.override({name: one})
-            capped = np.minimum(value, _NO_LIMIT) if name == "torque_limit" else value
+            capped = np.minimum(value, NO_LIMIT) if name == "torque_limit" else value
             out[name] = capped if usual.ndim else capped.reshape(count, 1)
     return out

@@ -87,6 +87,7 @@ class Course:
     def run(self, inputs: dict[str, Any], target_yield: Any) -> list[Stretch]:
         """The stretches, in order; `inputs` are q, v, feedforward and settings by name."""
         q, v = inputs["q"], inputs["v"]
+        inputs = inputs | {"joint_velocity": v[-self.frozen.robot.n :]}
         data = inputs | self._frozen(q, v, inputs["normal"], target_yield)
         if not self.freezes:
             return [self._stretch(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0)]
@@ -124,7 +125,6 @@ class Course:
     def _stretch(
         self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, start: Any, fraction: float, since: Any
     ) -> Stretch:
-        data = data | {"joint_velocity": data["v"][-self.frozen.robot.n :]}
         final, states = self._loop(data, start, fraction, record=self.record > 0)
         if states is not None and self.record > 1:
             last = states.size2() - 1
@@ -139,7 +139,6 @@ class Course:
         )
 
     def _loop(self, data: dict[str, Any], start: Any, fraction: float, *, record: bool) -> tuple[Any, Any]:
-        data = data | {"joint_velocity": data["v"][-self.frozen.robot.n :]}
         constants = [data[key] for key in self.model.data]
         return run(self.model, self.step, start, self.steps(fraction), constants, record=record)
 

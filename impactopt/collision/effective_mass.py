@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..codegen import cached, model_hash
-from ..errors import InputError, check_array
+from ..errors import check_direction
 from ..robot import Robot
 from ..stance import Stance, usual_stance
 from .frozen import FrozenDynamics
@@ -28,11 +28,7 @@ def effective_mass(robot: Robot, *, striker: str, normal: ArrayLike, stance: Sta
     InputError : an unknown striker; a normal that is not a unit vector; a stance the robot cannot take.
     """
     frame = robot.striker(striker).model_frame
-    n = check_array("normal", normal, (3,))
-    if abs(np.linalg.norm(n) - 1.0) > 1e-6:
-        raise InputError(
-            f"normal: not a unit vector (length {np.linalg.norm(n):.6g}); divide it by its length"
-        )
+    n = check_direction("normal", normal)
     held_by = usual_stance(robot) if stance is None else stance
 
     def build() -> list[Any]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from ..contact import ContactLaw, Target
-from ..errors import InputError, check_array
+from ..errors import InputError, check_array, check_direction
 from ..robot import Robot
 from ..stance import Stance, usual_stance
 from .result import Collision
@@ -51,12 +50,7 @@ class CollisionModel(ABC):
         frame = self.robot.striker(self.striker).model_frame
         if frame in self.held_by.constraint_frames(self.robot):
             raise InputError(f"striker {self.striker!r}: it is held by the stance; strike with another")
-        normal = check_array("normal", self.normal, (3,))
-        if abs(np.linalg.norm(normal) - 1.0) > 1e-6:
-            raise InputError(
-                f"normal: not a unit vector (length {np.linalg.norm(normal):.6g}); divide it by its length"
-            )
-        object.__setattr__(self, "normal", normal)
+        object.__setattr__(self, "normal", check_direction("normal", self.normal))
         if not check_array("horizon [s]", self.horizon, ()) > 0:
             raise InputError(f"horizon [s]: {self.horizon:g}; give a number > 0")
 
@@ -64,6 +58,24 @@ class CollisionModel(ABC):
     def held_by(self) -> Stance:
         """The stance, or the robot's usual one."""
         return usual_stance(self.robot) if self.stance is None else self.stance
+
+    # ------------------------------------------------------------ what all of them refuse
+    def check_step(self, step: float, longest: float, where: str = "here") -> None:
+        """InputError for a step [s] that is not below the longest stable one."""
+        if step >= longest:
+            raise InputError(
+                f"step [s]: {step:g} is unstable {where}, where the fastest mode allows {longest:.2g}: give "
+                f"{type(self).__name__} a step below that, or the joints less kd or more armature"
+            )
+
+    @staticmethod
+    def check_separation(result: Collision) -> None:
+        """InputError for a contact that has not ended."""
+        if not result.separated:
+            raise InputError(
+                f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
+                "or pass require_separation=False for what happened so far"
+            )
 
     @abstractmethod
     def collide(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..contact import ContactLaw, Target
-from ..errors import InputError, check_array, did_you_mean
+from ..errors import InputError, check_array, check_direction, did_you_mean
 from ..robot import Robot
 from .terms import JointFriction, Terms
 
@@ -22,7 +22,7 @@ _SIGN = {"kp": ">= 0", "kd": ">= 0", "torque_limit": "> 0", "viscous": ">= 0", "
 
 
 # infinity would make 0 x infinity out of a limit that is not reached
-_NO_LIMIT = 1e12  # [N m]
+NO_LIMIT = 1e12  # [N m]
 
 
 class Settings(Mapping[str, Array]):
@@ -63,16 +63,14 @@ class Settings(Mapping[str, Array]):
         }
 
     def _check(self, name: str, value: ArrayLike) -> Array:
-        shape = (3,) if name == "normal" else self._values[name].shape
-        if len(shape) == 1 and name != "normal" and np.ndim(value) == 0:
+        if name == "normal":
+            return check_direction(name, value)
+        shape = self._values[name].shape
+        if len(shape) == 1 and np.ndim(value) == 0:
             value = np.full(shape, value)
         array = check_array(name, value, shape, finite=name != "torque_limit")
         if name == "torque_limit":
-            array = np.minimum(array, _NO_LIMIT)
-        if name == "normal" and abs(np.linalg.norm(array) - 1.0) > 1e-6:
-            raise InputError(
-                f"normal: not a unit vector (length {np.linalg.norm(array):.6g}); divide it by its length"
-            )
+            array = np.minimum(array, NO_LIMIT)
         if name in ("kp", "kd") and array.ndim == 2:
             # it may not feed energy
             least = float(np.linalg.eigvalsh((array + array.T) / 2).min())

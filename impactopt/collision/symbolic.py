@@ -189,8 +189,11 @@ class SymbolicModel(CollisionModel):
         self._check_outputs((output,), 1)
         if output not in SCALARS:
             raise InputError(f"gradient of {output!r}: only of a number: {', '.join(SCALARS)}")
-        whole = self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
-        return self._with_parameters(whole, parameters)
+        return self._with_parameters(self._gradient(output), parameters)
+
+    def _gradient(self, output: str) -> Any:
+        """Likewise, with its gradients."""
+        return self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
 
     def describe(
         self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = ()
@@ -313,21 +316,13 @@ class SymbolicModel(CollisionModel):
             result = self._exact(q, v, arguments[2] if self.terms.feedforward else None, values)
         else:
             result = self._by_steps(arguments, values)
-        if require_separation and not result.separated:
-            raise InputError(
-                f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
-                "or pass require_separation=False for what happened so far"
-            )
+        if require_separation:
+            self.check_separation(result)
         return result
 
     def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
         frozen = self._frozen_at(arguments[0], values)
-        longest = self._longest(frozen, values)
-        if self.step_length >= longest:
-            raise InputError(
-                f"step [s]: {self.step_length:g} is unstable here, where the fastest mode allows "
-                f"{longest:.2g}: give a step below that, or the joints less kd or more armature"
-            )
+        self.check_step(self.step_length, self._longest(frozen, values))
         names = self.available
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}

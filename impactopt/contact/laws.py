@@ -70,7 +70,20 @@ class ContactLaw(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SpringDamper(ContactLaw):
+class _SpringAndDamper(ContactLaw):
+    """The numbers of a linear spring and a linear damper."""
+
+    stiffness: float
+    damping: float
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        positive(f"{kind}: stiffness [N/m]", self.stiffness)
+        positive(f"{kind}: damping [N s/m]", self.damping, zero=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringDamper(_SpringAndDamper):
     """f = k x + d dx/dt while compressing, f = k x in restitution (paper, figs. 1 and 9).
 
     That the damper acts in compression only is not written in the paper, but it is what its Table III
@@ -86,13 +99,6 @@ class SpringDamper(ContactLaw):
     InputError : a number out of its range.
     """
 
-    stiffness: float
-    damping: float
-
-    def __post_init__(self) -> None:
-        positive("SpringDamper: stiffness [N/m]", self.stiffness)
-        positive("SpringDamper: damping [N s/m]", self.damping, zero=True)
-
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
     ) -> Any:
@@ -102,7 +108,7 @@ class SpringDamper(ContactLaw):
 
 
 @dataclass(frozen=True, kw_only=True)
-class KelvinVoigt(ContactLaw):
+class KelvinVoigt(_SpringAndDamper):
     """f = k x + d dx/dt in both phases, until the force has fallen to zero: it never pulls.
 
     Two masses part with e = exp(-2 zeta acos(zeta) / sqrt(1 - zeta^2)) of their speed of approach, where
@@ -117,13 +123,6 @@ class KelvinVoigt(ContactLaw):
     ------
     InputError : a number out of its range.
     """
-
-    stiffness: float
-    damping: float
-
-    def __post_init__(self) -> None:
-        positive("KelvinVoigt: stiffness [N/m]", self.stiffness)
-        positive("KelvinVoigt: damping [N s/m]", self.damping, zero=True)
 
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None

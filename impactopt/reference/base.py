@@ -111,11 +111,8 @@ class ReferenceModel(CollisionModel):
         forces, normal = self._forces(v, torque, overrides)
         self._check_step(step, q, v, forces, normal)
         result = self._run(step, q, v, forces, normal)
-        if require_separation and not result.separated:
-            raise InputError(
-                f"horizon [s]: the contact has not ended after {result.duration:.3g} s: raise the horizon, "
-                "or pass require_separation=False for what happened so far"
-            )
+        if require_separation:
+            self.check_separation(result)
         return result
 
     @property
@@ -131,13 +128,7 @@ class ReferenceModel(CollisionModel):
         body.look(q, v)
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         rate = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
-        if step * rate > self._stable:
-            kind = type(self).__name__
-            raise InputError(
-                f"step [s]: {step:g} is unstable here, where the fastest mode allows "
-                f"{self._stable / rate:.2g}: give {kind} a step below that, or the joints less kd or more "
-                "armature"
-            )
+        self.check_step(step, self._stable / rate if rate > 0 else np.inf)
 
     # ------------------------------------------------------------ numbers
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from impactopt.bench import replay, robustness, truth
 from impactopt.bench.registry import BENCHES, run_bench
-from impactopt.bench.report import Report, make_table, save_report
+from impactopt.bench.report import Report, columns_table, make_table, save_report
 from impactopt.cli import app
 from impactopt.errors import InputError
 from impactopt.problem import ImpactProblem
@@ -182,6 +182,15 @@ def test_what_is_not_finite_is_null_in_json(tmp_path: Path) -> None:
 def test_cells_are_text_not_markup() -> None:
     table = make_table("a [red]", ["b [red]"], [["c [red]"]])
     assert list(table.columns[0].cells) == ["c \\[red]"]
+
+
+def test_rows_by_key_fill_columns() -> None:
+    columns = (("what", "name", 0), ("a", "a", 2), ("b", "b", ".1e"), ("c", "c", 0))
+    rows = [{"name": "one", "a": 1.2345, "b": 1.2345e-5, "c": True, "unseen": 1}, {"name": "two", "a": None}]
+    table = columns_table("title", columns, rows)
+    assert [column.header for column in table.columns] == ["what", "a", "b", "c"]
+    found = [list(column.cells) for column in table.columns]
+    assert found == [["one", "two"], ["1.23", "-"], ["1.2e-05", "-"], ["yes", "-"]]
 
 
 def test_every_report_says_where_it_comes_from() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from impactopt.baseline import minimum_jerk_baseline
 from impactopt.bench.planning import DEMO, plan_of
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.errors import InputError
 from impactopt.plan import Trajectory
 from impactopt.planner import solve
@@ -49,15 +49,14 @@ def run(say: Say, *, file: Path = DEMO, draws: int = 50, seed: int = 0, workers:
         except InputError as error:  # a method that finds no plan stays in
             say(f"{name}: {error}")
             rows.append({**dict.fromkeys(KEYS), "method": name, "reason": str(error), "standing": False})
-    cells = [[r["method"], *(cell(r.get(key), digits) for _, key, digits in COLUMNS)] for r in rows]
     title = f"what people do today, and ours: {file}, replayed on free soles"
-    table = make_table(title, ["method", *(heading for heading, _, _ in COLUMNS)], cells)
+    table = columns_table(title, COLUMNS, rows)
     numbers = {"rows": rows, "problem": str(file), "draws": draws, "seed": seed}
     return Report(name="baselines", numbers=numbers, tables=(table,))
 
 
-# heading, key, digits
-COLUMNS: tuple[tuple[str, str, int], ...] = (
+COLUMNS = (
+    ("method", "method", 0),
     ("planned N s", "impulse_planned_Ns", 2),
     ("replayed N s", "impulse_replayed_Ns", 2),
     ("stands", "standing", 0),
@@ -66,7 +65,7 @@ COLUMNS: tuple[tuple[str, str, int], ...] = (
     ("lift mm", "sole_lift_mm", 1),
     ("torque demand", "torque_ratio", 2),
 )
-KEYS = ("method", *(key for _, key, _ in COLUMNS), "reason")
+KEYS = (*(key for _, key, _ in COLUMNS), "reason")
 
 
 def methods(file: Path, say: Say) -> Iterator[tuple[str, Callable[[], Method]]]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from impactopt._workers import map_on_workers
 from impactopt.bench.ladder import GAINS, HORIZON, LADDER, LAW, MASS_RATIOS, TARGETS, Rung, situations
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, cell, columns_table, make_table
 from impactopt.cases import PAPER_SPEEDS, Case, errors_against
 from impactopt.collision import Collision
 from impactopt.errors import InputError
@@ -26,12 +26,20 @@ from impactopt.plotting.fidelity import fidelity_picture
 TOLERANCE = 1e-5  # relative, of the reference's impulse
 ORDER_FROM = 2  # freezes
 
-# heading, key of a row, digits
 COLUMNS = (
+    ("model", "label", 0),
     ("worst %", "worst_impulse_error_pct", 4),
     ("median %", "median_impulse_error_pct", 4),
     ("ZMP mm", "worst_zmp_error_mm", 2),
     ("torque %", "worst_torque_error_pct", 2),
+    ("failed", "failed", 0),
+    ("pushes", "pushes", 0),
+)
+PLACES = (
+    ("model", "label", 0),
+    ("worst impulse", "worst_impulse_error_at", 0),
+    ("worst torque", "worst_torque_error_at", 0),
+    ("joint", "worst_torque_joint", 0),
 )
 ERRORS = ("impulse_error_pct", "f_max_error_pct", "zmp_error_mm", "torque_error_pct")
 
@@ -261,20 +269,17 @@ def tables_of(rows: Sequence[dict[str, Any]], numbers: dict[str, Any]) -> tuple[
     """One a robot, one of where the worst are, and one of the orders and of MuJoCo."""
     tables = []
     for robot in dict.fromkeys(r["robot"] for r in rows):
-        own = [r for r in rows if r["robot"] == robot]
-        cells, places = [], []
-        for r in own:
-            rung = Rung(model=r["model"], freezes=r["freezes"]).label
-            failed = [str(r["failed"]), str(len(r["pushes"]))]
-            cells.append([rung, *(cell(r[key], digits) for _, key, digits in COLUMNS), *failed])
-            keys = ("worst_impulse_error_at", "worst_torque_error_at", "worst_torque_joint")
-            places.append([rung, *(str(r[key] or "-") for key in keys)])
+        own = [
+            {
+                **r,
+                "label": Rung(model=r["model"], freezes=r["freezes"]).label,
+                "pushes": len(r["pushes"]),
+            }
+            for r in rows
+            if r["robot"] == robot
+        ]
         title = f"{robot}: errors of {own[0]['collisions']} collisions against full dynamics"
-        headings = ["model", *(heading for heading, _, _ in COLUMNS), "failed", "pushes"]
-        tables.append(make_table(title, headings, cells))
-        tables.append(
-            make_table(f"{robot}: where", ["model", "worst impulse", "worst torque", "joint"], places)
-        )
+        tables += [columns_table(title, COLUMNS, own), columns_table(f"{robot}: where", PLACES, own)]
     last = [
         ["order in freezes, of the worst impulse error", cell(numbers["order_in_freezes"], 2)],
         ["order in freezes, of the median", cell(numbers["order_in_freezes_median"], 2)],

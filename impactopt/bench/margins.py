@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.bench.planning import DEMO
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.errors import InputError
 from impactopt.planner import solve
 from impactopt.plotting.margins import margins_picture
@@ -148,8 +148,7 @@ OPTIONS = (
     ),
 )
 
-# heading, key, digits
-COLUMNS: tuple[tuple[str, str, int], ...] = (
+COLUMNS = (
     ("planned N s", "impulse_planned_Ns", 2),
     ("replayed", "impulse_replayed_Ns", 2),
     ("stands", "standing", 0),
@@ -242,13 +241,11 @@ def tables_of(rows: list[dict[str, Any]]) -> tuple[Any, ...]:
     tables = []
     for option in dict.fromkeys(r["option"] for r in rows):
         chosen = [r for r in rows if r["option"] == option]
-        cells = []
+        shown = []
         for r in chosen:
-            numbers = [cell(r[key], digits) for _, key, digits in COLUMNS]
-            if r["impulse_planned_Ns"] is None:
-                numbers[0] = r["status"]
-            cells.append([f"{r['value']}{' (base)' if r['base'] else ''}", *numbers])
+            value = f"{r['value']}{' (base)' if r['base'] else ''}"
+            planned = r["status"] if r["impulse_planned_Ns"] is None else r["impulse_planned_Ns"]
+            shown.append({**r, "value": value, "impulse_planned_Ns": planned})
         unit = f" [{chosen[0]['unit']}]" if chosen[0]["unit"] else ""
-        headings = [heading for heading, _, _ in COLUMNS]
-        tables.append(make_table(f"margins: {option}{unit}", ["value", *headings], cells))
+        tables.append(columns_table(f"margins: {option}{unit}", (("value", "value", 0), *COLUMNS), shown))
     return tuple(tables)

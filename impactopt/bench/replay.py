@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.bench.planning import DEMO, plan_of
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.errors import InputError
 from impactopt.plotting.convergence import convergence_picture
 from impactopt.solution import Solution
@@ -20,6 +20,15 @@ from impactopt.validation import Conditions, Simulation
 STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2.5e-5)  # [s]
 STEP = 2e-4  # of the rows that change something else
 FLOOR = Conditions().floor_time
+COLUMNS = (
+    ("impulse N s", "impulse_Ns", 3),
+    ("change %", "impulse_change_pct", 3),
+    ("peak N", "peak_force_N", 1),
+    ("change %", "peak_force_change_pct", 2),
+    ("slip mm", "slip_mm", 2),
+    ("base mm", "base_change_mm", 2),
+    ("stands", "standing", 0),
+)
 OTHERS: dict[str, dict[str, Any]] = {
     "iterations 50": {"iterations": 50},
     "iterations 10": {"iterations": 10},
@@ -53,18 +62,11 @@ def run(say: Say, *, file: Path = DEMO, steps: tuple[float, ...] = STEPS) -> Rep
         found = _replay(solution, say, step=STEP, **options)
         if isinstance(default, Simulation):
             others.append(row({"step": STEP, "setting": name}, found, default))
-    columns = ["impulse N s", "change %", "peak N", "change %", "slip mm", "base mm", "stands"]
+    title = f"{file}: changes from the replay with the smallest step"
+    other = f"changes from the replay with a step of {STEP:g} s and default settings"
     tables = (
-        make_table(
-            f"{file}: changes from the replay with the smallest step",
-            ["step [s]", *columns],
-            [[f"{r['step']:g}", *_cells(r)] for r in rows],
-        ),
-        make_table(
-            f"changes from the replay with a step of {STEP:g} s and default settings",
-            ["setting", *columns],
-            [[r["setting"], *_cells(r)] for r in others],
-        ),
+        columns_table(title, (("step [s]", "step", "g"), *COLUMNS), rows),
+        columns_table(other, (("setting", "setting", 0), *COLUMNS), others),
     )
     return Report(
         name="replay",
@@ -110,19 +112,6 @@ def order(rows: list[dict[str, Any]], key: str) -> float | None:
         return None
     x, y = np.log(np.array(used)).T
     return float(np.polyfit(x, y, 1)[0])
-
-
-def _cells(found: dict[str, Any]) -> list[str]:
-    columns = (
-        ("impulse_Ns", 3),
-        ("impulse_change_pct", 3),
-        ("peak_force_N", 1),
-        ("peak_force_change_pct", 2),
-        ("slip_mm", 2),
-        ("base_change_mm", 2),
-        ("standing", 0),
-    )
-    return [cell(found.get(key), digits) for key, digits in columns]
 
 
 def _replay(solution: Solution, say: Say, **options: Any) -> Simulation | str:

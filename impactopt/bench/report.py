@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
 
-__all__ = ["Report", "Say", "cell", "machine", "make_table", "save_report", "timed"]
+__all__ = ["Report", "Say", "cell", "columns_table", "machine", "make_table", "save_report", "timed"]
 
 Say = Callable[[str], None]  # told in words what is being done
+Column = tuple[str, str, int | str]  # heading, key of a row, digits or format
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,13 +88,25 @@ def make_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     return table
 
 
-def cell(value: Any, digits: int) -> str:
-    """A number, or yes or no, as a table has it; "-" for what there is not."""
+def columns_table(title: str, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Rows by key, in the order of the columns; "-" where a row has no such key."""
+    cells = [[cell(row.get(key), digits) for _, key, digits in columns] for row in rows]
+    return make_table(title, [heading for heading, _, _ in columns], cells)
+
+
+def cell(value: Any, digits: int | str) -> str:
+    """A number, or yes or no, as a table has it; text stays as it is; "-" for what there is not.
+
+    digits : behind the point, or a format.
+    """
     if value is None:
         return "-"
+    if isinstance(value, str):
+        return value
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.{digits}f}"
+    form = digits if isinstance(digits, str) else f".{digits}f"
+    return f"{value:{form}}"
 
 
 def save_report(report: Report, directory: Path) -> list[Path]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from impactopt.bench.clock import medians, shortest
 from impactopt.bench.costs import Tree, cost_sdc, even_tree
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.bench.scene import Scene, compiled, inputs, run_of
 from impactopt.bench.trees import random_robot, tip_speed
 from impactopt.cases import Case
@@ -33,6 +33,28 @@ STEPS = (1e-3, 5e-4, 2.5e-4, 1e-4, 5e-5, 2e-5, 1e-5)  # [s]
 BATCHES = (1, 10, 100, 1000)
 X = np.array([1.0, 0.0, 0.0])
 SPEED = 1.0  # [m/s] of the tip
+OVER_DOF = (
+    ("robot", "robot", 0),
+    ("joints", "n", 0),
+    ("freeze us", "freeze_us", 2),
+    ("step us", "step_us", 3),
+    ("steps", "steps", 0),
+    ("collision us", "time_us", 1),
+    ("paper: once", "paper_once", 0),
+    ("a stage", "paper_iteration", 0),
+)
+OVER_STEP = (
+    ("method", "method", 0),
+    ("step s", "step_s", "g"),
+    ("collision us", "time_us", 1),
+    ("integration error", "integration_error", ".1e"),
+)
+OVER_BATCH = (
+    ("batch", "batch", 0),
+    ("threads", "threads", 0),
+    ("us each", "time_us", 1),
+    ("a second", "impacts_per_second", 0),
+)
 WANTED = ("impulse", "duration")
 
 
@@ -182,42 +204,9 @@ def tables_of(rows: Sequence[dict[str, Any]]) -> tuple[Any, ...]:
     """One a thing that it goes over."""
     of = {over: [r for r in rows if r["over"] == over] for over in ("dof", "step", "batch")}
     return (
-        make_table(
-            "over degrees of freedom",
-            ["robot", "joints", "freeze us", "step us", "steps", "collision us", "paper: once", "a stage"],
-            [
-                [
-                    r["robot"],
-                    str(r["n"]),
-                    cell(r["freeze_us"], 2),
-                    cell(r["step_us"], 3),
-                    str(r["steps"]),
-                    cell(r["time_us"], 1),
-                    cell(r["paper_once"], 0),
-                    cell(r["paper_iteration"], 0),
-                ]
-                for r in of["dof"]
-            ],
+        columns_table("over degrees of freedom", OVER_DOF, of["dof"]),
+        columns_table(
+            "over the step: the frozen collision against its exact solution", OVER_STEP, of["step"]
         ),
-        make_table(
-            "over the step: the frozen collision against its exact solution",
-            ["method", "step s", "collision us", "integration error"],
-            [
-                [r["method"], f"{r['step_s']:g}", cell(r["time_us"], 1), f"{r['integration_error']:.1e}"]
-                for r in of["step"]
-            ],
-        ),
-        make_table(
-            "over the batch's size",
-            ["batch", "threads", "us each", "a second"],
-            [
-                [
-                    str(r["batch"]),
-                    str(r["threads"]),
-                    cell(r["time_us"], 1),
-                    cell(r["impacts_per_second"], 0),
-                ]
-                for r in of["batch"]
-            ],
-        ),
+        columns_table("over the batch's size", OVER_BATCH, of["batch"]),
     )

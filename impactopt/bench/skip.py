@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.bench.clock import medians
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.bench.scene import Scene, run_of
 from impactopt.cases import Case
 from impactopt.collision import SDC, JointFriction, Terms
@@ -31,6 +31,14 @@ FRICTION = JointFriction(viscous=1.0, coulomb=1.0, transition=0.05)
 WHOLE, FIXED = "everything", "everything, fixed base"
 # joints of the stand-in that a blow of the right hand can do without: they are held as they stand
 LOCKED = ("head", "left_wrist", "left_elbow", "right_wrist")
+COLUMNS = (
+    ("left out", "skipped", 0),
+    ("instructions", "instructions", 0),
+    ("of the freeze", "freeze_instructions", 0),
+    ("of a step", "step_instructions", 0),
+    ("time us", "time_us", 1),
+    ("speed-up", "speedup", 2),
+)
 NOT_DONE = {
     "symmetric limbs": "in a posture that is its own mirror image the second leg's part of the freeze could "
     "be copied from the first's; that of a blow with one hand is none, so it is not done: at most, the "
@@ -72,21 +80,8 @@ def run(say: Say, *, scene: Scene | None = None, repeats: int = 25) -> Report:
         row |= {"speedup": times[variant.beside] / own, "beside": variant.beside}
         rows.append({**row, "freeze_instructions": parts["freeze"], "step_instructions": parts["step"]})
     rows += not_timed(scene, found)
-    table = make_table(
-        f"{scene.name}, {scene.case.name}: what is left out, and what it saves",
-        ["left out", "instructions", "of the freeze", "of a step", "time us", "speed-up"],
-        [
-            [
-                r["skipped"],
-                cell(r["instructions"], 0),
-                cell(r["freeze_instructions"], 0),
-                cell(r["step_instructions"], 0),
-                cell(r["time_us"], 1),
-                cell(r["speedup"], 2),
-            ]
-            for r in rows
-        ],
-    )
+    title = f"{scene.name}, {scene.case.name}: what is left out, and what it saves"
+    table = columns_table(title, COLUMNS, rows)
     numbers = {"rows": rows, "not_done": NOT_DONE, "describe": found[0].model.describe().as_dict()}
     return Report(name="skip", numbers=numbers, tables=(table,), figures={"skip": lambda: skip_picture(rows)})
 

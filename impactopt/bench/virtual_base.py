@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bench.report import Report, Say, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.collision import SDC
 from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model, number_of_steps
 from impactopt.collision.loop import run as time_loop
@@ -39,16 +39,21 @@ POSTURE, STRIKER, NORMAL = "half_sitting", "right_hand", (1.0, 0.0, 0.0)
 SPEED = 0.7  # [m/s] of the hand at contact: the middle one of the paper's
 DIGITS = 60
 
-# heading, key
 COLUMNS = (
-    ("M_g kg", "M_g"),
-    ("model alone", "error_60_digits"),
-    ("ours", "error_model"),
-    ("literal", "error_literal"),
-    ("impulse, ours", "impulse_error_model"),
-    ("impulse, literal", "impulse_error_literal"),
-    ("rounding, ours", "rounding_model"),
-    ("rounding, literal", "rounding_literal"),
+    ("M_g kg", "M_g", ".0e"),
+    ("model alone", "error_60_digits", ".0e"),
+    ("ours", "error_model", ".0e"),
+    ("literal", "error_literal", ".0e"),
+    ("impulse, ours", "impulse_error_model", ".0e"),
+    ("impulse, literal", "impulse_error_literal", ".0e"),
+    ("rounding, ours", "rounding_model", ".0e"),
+    ("rounding, literal", "rounding_literal", ".0e"),
+)
+EXACT = (
+    ("robot", "robot", 0),
+    ("posture", "posture", 0),
+    ("effective mass kg", "mass_kg", 3),
+    ("rounding", "rounding", ".0e"),
 )
 
 
@@ -61,20 +66,15 @@ def run(say: Say, *, robots: Sequence[str] = ROBOTS, masses: Sequence[float] = M
         rows += rows_of(robot, masses)
         exact += exact_rows(robot)
     tables = tuple(
-        make_table(
+        columns_table(
             f"{name}: relative errors against exactly held soles",
-            [heading for heading, _ in COLUMNS],
-            [[_cell(r[key]) for _, key in COLUMNS] for r in rows if r["robot"] == name],
+            COLUMNS,
+            [_shown(r) for r in rows if r["robot"] == name],
         )
         for name in robots
     )
-    tables += (
-        make_table(
-            "soles held exactly (the default): rounding",
-            ["robot", "posture", "effective mass kg", "rounding"],
-            [[r["robot"], r["posture"], f"{r['mass_kg']:.3f}", _cell(r["rounding"])] for r in exact],
-        ),
-    )
+    shown = [_shown(r) for r in exact]
+    tables += (columns_table("soles held exactly (the default): rounding", EXACT, shown),)
     numbers = {
         "rows": rows,
         "exact": exact,
@@ -244,5 +244,5 @@ def _solved(matrix: Any, right: Any) -> Any:
     return both[:, n:]
 
 
-def _cell(value: float | None) -> str:
-    return "fails" if value is None else f"{value:.0e}"
+def _shown(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: "fails" if value is None else value for key, value in row.items()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impactopt.bench.costs import HRP2, TOTAL_TIME, cost_aba, cost_full, cost_sdc, iterations
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, cell, columns_table
 from impactopt.cases import striking_velocity
 from impactopt.presets import standin
 from impactopt.reproduce.timing import Times, measure
@@ -20,6 +20,15 @@ __all__ = ["run"]
 STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5, 1e-6)  # [s]
 # what the paper's text says of fig. 3: C_r1 "about 0.016", C_r3 "about 1/4"
 PRINTED = {"C_r1": {1e-3: 0.016}, "C_r3": {1e-4: 0.25}}
+COLUMNS = (
+    ("t_s s", "t_s_s", "g"),
+    ("C_r1", "C_r1", 4),
+    ("paper", "C_r1_paper", 3),
+    ("measured", "C_r1_measured", 4),
+    ("C_r3", "C_r3", 4),
+    ("paper", "C_r3_paper", 2),
+    ("measured", "C_r3_measured", 4),
+)
 
 
 def ratios(step: float) -> dict[str, float]:
@@ -44,22 +53,8 @@ def run(say: Say) -> Report:
         "measured_on": "standin",
         "times": times.microseconds(),
     }
-    table = make_table(
-        f"Fig. 3: n = 28, 0.1 s. Measured on the stand-in, {in_words(times)}",
-        ["t_s s", "C_r1", "paper", "measured", "C_r3", "paper", "measured"],
-        [
-            [
-                f"{r['t_s_s']:g}",
-                cell(r["C_r1"], 4),
-                cell(r["C_r1_paper"], 3),
-                cell(r["C_r1_measured"], 4),
-                cell(r["C_r3"], 4),
-                cell(r["C_r3_paper"], 2),
-                cell(r["C_r3_measured"], 4),
-            ]
-            for r in rows
-        ],
-    )
+    title = f"Fig. 3: n = 28, 0.1 s. Measured on the stand-in, {in_words(times)}"
+    table = columns_table(title, COLUMNS, rows)
     return Report(name="fig3", numbers=numbers, tables=(table,), figures={"fig3": lambda: draw(rows)})
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impactopt.bench.costs import cost_aba, cost_full, cost_sdc, even_tree, iterations
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.bench.trees import random_robot, tip_speed
 from impactopt.reproduce.timing import measure
 
@@ -27,6 +27,17 @@ LEAST = 8  # the formula of C_3 is next to zero for a single joint
 MEASURED = (8, 16, 24, 32, 40, 48)
 MOST_DENSE = 36  # joints whose dense code is compiled
 PAPER = "under 100 DOF, the complexity ratio is under one"
+COLUMNS = (
+    ("n", "n", 0),
+    ("C_r1", "C_r1", 4),
+    ("measured", "C_r1_measured", 4),
+    ("C_r3", "C_r3", 4),
+    ("measured", "C_r3_measured", 4),
+    ("dense", "full_us", 2),
+    ("freeze", "freeze_us", 2),
+    ("stage", "stage_us", 2),
+    ("ABA", "aba_us", 2),
+)
 
 
 def ratios(n: float) -> dict[str, float]:
@@ -74,24 +85,8 @@ def run(say: Say, *, measured: Sequence[int] = MEASURED) -> Report:
         "C_r3_first_n_not_below_1": first,
         "C_r3_paper": PAPER,
     }
-    table = make_table(
-        f"Fig. 4: four limbs, 1e-4 s; C_r3 reaches 1 at n = {first}. Times in us",
-        ["n", "C_r1", "measured", "C_r3", "measured", "dense", "freeze", "stage", "ABA"],
-        [
-            [
-                str(r["n"]),
-                cell(r["C_r1"], 4),
-                cell(r["C_r1_measured"], 4),
-                cell(r["C_r3"], 4),
-                cell(r["C_r3_measured"], 4),
-                *(
-                    cell(r["times"][f"{k}_us"] if r["times"] else None, 2)
-                    for k in ("full", "freeze", "stage", "aba")
-                ),
-            ]
-            for r in rows
-        ],
-    )
+    title = f"Fig. 4: four limbs, 1e-4 s; C_r3 reaches 1 at n = {first}. Times in us"
+    table = columns_table(title, COLUMNS, [{**r, **(r["times"] or {})} for r in rows])
     return Report(name="fig4", numbers=numbers, tables=(table,), figures={"fig4": lambda: draw(rows)})
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.collision import Collision
 from impactopt.reproduce.motions import LADDER, WHOSE, motions, reference
 from impactopt.reproduce.paper import OPENHRP3, TABLE_2, TABLE_3
@@ -26,6 +26,16 @@ LABELS = {
     "virtual-mass": "virtual mass",
 }
 PRINTED = {"full": OPENHRP3, "sdc-paper": TABLE_2, "virtual-mass": TABLE_3}
+COLUMNS = (
+    ("motion", "motion", 0),
+    ("model", "model", 0),
+    ("v_c m/s", "v_c_m_s", 1),
+    ("f_max N", "f_max_N", 1),
+    ("paper", "f_max_paper_N", 1),
+    ("f_n N s", "impulse_Ns", 2),
+    ("paper", "impulse_paper_Ns", 1),
+    ("ms", "duration_ms", 1),
+)
 
 
 def run(say: Say, *, robot: str = ROBOT) -> Report:
@@ -41,22 +51,10 @@ def run(say: Say, *, robot: str = ROBOT) -> Report:
             results |= {name: case.collide(model) for name, model in models.items()}
             found[case.name], speeds[case.name] = results, case.speed
             rows += [_row(case.name, case.speed, name, result) for name, result in results.items()]
-    table = make_table(
+    table = columns_table(
         f"Fig. 7: type {TYPE} on {robot}, {WHOSE[robot]}; the paper's full dynamics are OpenHRP3's",
-        ["motion", "model", "v_c m/s", "f_max N", "paper", "f_n N s", "paper", "ms"],
-        [
-            [
-                r["motion"],
-                LABELS[r["model"]],
-                cell(r["v_c_m_s"], 1),
-                cell(r["f_max_N"], 1),
-                cell(r["f_max_paper_N"], 1),
-                cell(r["impulse_Ns"], 2),
-                cell(r["impulse_paper_Ns"], 1),
-                cell(1e3 * r["duration_s"], 1),
-            ]
-            for r in rows
-        ],
+        COLUMNS,
+        [{**r, "model": LABELS[r["model"]], "duration_ms": 1e3 * r["duration_s"]} for r in rows],
     )
     return Report(
         name="fig7",

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.cases import Case
 from impactopt.reproduce.motions import ROBOTS, WHOSE, motions
 from impactopt.reproduce.paper import MOTIONS
 
 __all__ = ["run"]
 
-# heading, key, digits
 COLUMNS = (
+    ("motion", "motion", 0),
     ("m_a kg", "m_a_kg", 4),
     ("paper", "m_a_paper_kg", 1),
     ("v_c m/s", "v_c_m_s", 2),
@@ -38,13 +38,8 @@ def run(say: Say, *, robots: Sequence[str] = ROBOTS) -> Report:
     for robot, cases in motions(robots, say):
         own = [row(robot, case) for case in cases]
         rows += own
-        tables.append(
-            make_table(
-                f"Table I on {robot}, {WHOSE[robot]} (speed, torque: of joints, over limit)",
-                ["motion", *(heading for heading, _, _ in COLUMNS)],
-                [[r["motion"], *(cell(r[key], digits) for _, key, digits in COLUMNS)] for r in own],
-            )
-        )
+        title = f"Table I on {robot}, {WHOSE[robot]} (speed, torque: of joints, over limit)"
+        tables.append(columns_table(title, COLUMNS, own))
     return Report(name="table1", numbers={"rows": rows}, tables=tables)
 
 

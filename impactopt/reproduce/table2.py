@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.cases import Case, errors_against
 from impactopt.collision import Collision, CollisionModel
 from impactopt.reproduce.motions import HORIZON, LADDER, ROBOTS, WHOSE, Rung, motions, reference
@@ -19,7 +19,29 @@ __all__ = ["run"]
 
 ERRORS = ("impulse_error_pct", "f_max_error_pct", "zmp_error_mm", "torque_error_pct")
 PRINTED = {"sdc-paper": TABLE_2, "virtual-mass": TABLE_3}
-HEADINGS = ("model", "freezes", "f_n N s", "err %", "paper f_n", "err %", "ZMP mm", "torque %", "parted")
+COLUMNS = (
+    ("motion", "motion", 0),
+    ("model", "model", 0),
+    ("freezes", "freezes", 0),
+    ("f_n N s", "impulse_Ns", 3),
+    ("err %", "impulse_error_pct", 2),
+    ("paper f_n", "impulse_paper_Ns", 1),
+    ("err %", "impulse_error_paper_pct", 1),
+    ("ZMP mm", "zmp_error_mm", 2),
+    ("torque %", "torque_error_pct", 2),
+    ("parted", "separated", 0),
+)
+WORST_COLUMNS = (
+    ("robot", "robot", 0),
+    ("model", "model", 0),
+    ("freezes", "freezes", 0),
+    ("worst", "worst_impulse_motion", 0),
+    ("f_n %", "worst_impulse_error_pct", 2),
+    ("median", "median_impulse_error_pct", 2),
+    ("f_max %", "worst_f_max_error_pct", 3),
+    ("ZMP mm", "worst_zmp_error_mm", 2),
+    ("torque %", "worst_torque_error_pct", 2),
+)
 
 
 def run(say: Say, *, robots: Sequence[str] = ROBOTS, rungs: Sequence[Rung] = LADDER) -> Report:
@@ -48,15 +70,10 @@ def run(say: Say, *, robots: Sequence[str] = ROBOTS, rungs: Sequence[Rung] = LAD
             }
         )
         rows += own
-        tables.append(
-            make_table(
-                f"Table II on {robot}, {WHOSE[robot]} (errors against full dynamics; the paper's: eq. 24)",
-                ["motion", *HEADINGS],
-                _cells(references[-len(cases) :], own),
-            )
-        )
+        title = f"Table II on {robot}, {WHOSE[robot]} (errors against full dynamics; the paper's: eq. 24)"
+        tables.append(columns_table(title, COLUMNS, _by_motion(references[-len(cases) :], own)))
     worst = _worst(rows)
-    tables.append(_worst_table(worst))
+    tables.append(columns_table("largest errors over the nine motions", WORST_COLUMNS, worst))
     numbers: dict[str, Any] = {
         "rows": rows,
         "worst": worst,
@@ -136,50 +153,10 @@ def _worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
-def _cells(references: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[list[str]]:
+def _by_motion(references: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Each motion's reference, and below it its models."""
     out = []
     for true in references:
-        motion, parted = true["motion"], cell(true["separated"], 0)
-        full = ["full", "-", cell(true["impulse_Ns"], 3), "-", cell(true["impulse_openhrp3_Ns"], 1)]
-        out.append([motion, *full, "-", "-", "-", parted])
-        out += [
-            [
-                "",
-                r["model"],
-                cell(r["freezes"], 0),
-                cell(r["impulse_Ns"], 3),
-                cell(r["impulse_error_pct"], 2),
-                cell(r["impulse_paper_Ns"], 1),
-                cell(r["impulse_error_paper_pct"], 1),
-                cell(r["zmp_error_mm"], 2),
-                cell(r["torque_error_pct"], 2),
-                cell(r["separated"], 0),
-            ]
-            for r in rows
-            if r["motion"] == motion
-        ]
+        out.append({**true, "model": "full", "impulse_paper_Ns": true["impulse_openhrp3_Ns"]})
+        out += [{**r, "motion": ""} for r in rows if r["motion"] == true["motion"]]
     return out
-
-
-def _worst_table(worst: list[dict[str, Any]]) -> Any:
-    columns = (
-        ("f_n %", "worst_impulse_error_pct", 2),
-        ("median", "median_impulse_error_pct", 2),
-        ("f_max %", "worst_f_max_error_pct", 3),
-        ("ZMP mm", "worst_zmp_error_mm", 2),
-        ("torque %", "worst_torque_error_pct", 2),
-    )
-    return make_table(
-        "largest errors over the nine motions",
-        ["robot", "model", "freezes", "worst", *(heading for heading, _, _ in columns)],
-        [
-            [
-                r["robot"],
-                r["model"],
-                cell(r["freezes"], 0),
-                r["worst_impulse_motion"],
-                *(cell(r[key], digits) for _, key, digits in columns),
-            ]
-            for r in worst
-        ],
-    )

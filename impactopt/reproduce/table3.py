@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, columns_table
 from impactopt.collision import VirtualMass
 from impactopt.reproduce.paper import LAW, MOTIONS, STEP, TABLE_3, TARGET
 from impactopt.robot import Robot, Striker
@@ -20,6 +20,9 @@ from impactopt.robot import Robot, Striker
 __all__ = ["point_mass", "run"]
 
 COLUMNS = (
+    ("motion", "motion", 0),
+    ("m_a kg", "m_a_kg", 1),
+    ("v_c m/s", "v_c_m_s", 1),
     ("f_max N", "f_max_N", 1),
     ("paper", "f_max_paper_N", 1),
     ("off %", "f_max_error_pct", 2),
@@ -65,19 +68,8 @@ def run(say: Say) -> Report:
         "impulses_equal": sum(row["impulse_equal"] for row in rows),
         "f_max_worst_error_pct": max(abs(row["f_max_error_pct"]) for row in rows),
     }
-    table = make_table(
-        "Table III: the virtual mass, ours and the paper's (equal: at its printed 0.1 N s)",
-        ["motion", "m_a kg", "v_c m/s", *(heading for heading, _, _ in COLUMNS)],
-        [
-            [
-                row["motion"],
-                cell(row["m_a_kg"], 1),
-                cell(row["v_c_m_s"], 1),
-                *(cell(row[key], digits) for _, key, digits in COLUMNS),
-            ]
-            for row in rows
-        ],
-    )
+    title = "Table III: the virtual mass, ours and the paper's (equal: at its printed 0.1 N s)"
+    table = columns_table(title, COLUMNS, rows)
     return Report(name="table3", numbers=numbers, tables=(table,))
 
 

@@ -642,7 +642,8 @@ def test_compiled_functions_give_what_the_graphs_give(tmp_path, monkeypatch):
     arguments = ([0.0], [1.3], [0.2])
 
     def results():
-        sdc = SDC(robot=slider(2.5), striker="tip", normal=X, law=LAW, target=TARGET, horizon=0.1)
+        given = {"robot": slider(2.5), "striker": "tip", "normal": X, "law": LAW, "target": TARGET}
+        sdc = SDC(**given, method="events", horizon=0.1)
         gradient = sdc.gradient_function()(*arguments)
         return [
             *gradient,

@@ -201,7 +201,8 @@ def _of_leg(name: str) -> bool:
 def constant_step(variant: Variant) -> int:
     """Instructions of a step whose settings are constants of the graph."""
     model = joint_space_model(variant.model, variant.outputs)
-    step = METHODS[variant.model.stepping](model, variant.model.step_length)
+    method, length = variant.model.of_graph
+    step = METHODS[method](model, length)
     names = step.name_in()
     free = {name: ca.SX.sym(name, *step.size_in(name)) for name in names}
     given = [variant.model.settings.get(name, free[name]) for name in names]

@@ -182,7 +182,8 @@ def _strike(robot: Robot) -> Any:
     collision = _model(robot, None)
     model = joint_space_model(collision)
     data = model.symbols(ca.MX)
-    step = METHODS[collision.stepping](model, collision.step_length)
+    method, length = collision.of_graph
+    step = METHODS[method](model, length)
     steps = number_of_steps(collision)
     final, _ = time_loop(model, step, ca.MX(model.start()), steps, list(data.values()), record=False)
     function = ca.Function("impulse", list(data.values()), [model.part(final, "impulse")])

@@ -75,7 +75,7 @@ def check_course(
             f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; raise the horizon "
             "or give a shorter step, both of which make more steps"
         )
-    if result.duration == 0:
+    if result.duration == 0 or method == "implicit":
         return
     if result.impulse < 0 or (method == "events" and _overshot(collision, result, data) > _OVERSHOT):
         raise InputError(

@@ -86,7 +86,8 @@ def instructions(collision: SymbolicModel, outputs: tuple[str, ...]) -> dict[str
     whole = ("L_tau", "L_f", "L_0", "drift_velocity") if collision.n_freezes else ()
     names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs), *whole)))
     freeze = frozen_dynamics(collision).function("frozen", names)
-    step = METHODS[collision.stepping](model, collision.step_length)
+    method, length = collision.of_graph
+    step = METHODS[method](model, length)
     return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}
 
 

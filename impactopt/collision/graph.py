@@ -60,8 +60,9 @@ def frozen_dynamics(collision: SymbolicModel) -> FrozenDynamics:
 def number_of_steps(collision: SymbolicModel, fraction: float = 1.0) -> int:
     """Steps that reach this fraction of the horizon; where they end on events, with two events a joint on the
     way."""
-    steps = ceil(fraction * collision.horizon / collision.step_length - 1e-9)
-    return steps + (2 * collision.n_servos + 4 if collision.stepping == "events" else 0)
+    method, length = collision.of_graph
+    steps = ceil(fraction * collision.horizon / length - 1e-9)
+    return steps + (2 * collision.n_servos + 4 if method == "events" else 0)
 
 
 def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
@@ -105,10 +106,11 @@ def _expressions(
         inputs["feedforward"] = ca.MX.sym("feedforward", collision.robot.n)
     inputs |= {key: ca.MX.sym(key, *shape_of(value)) for key, value in collision.settings.items()}
     inputs["normal"] = frozen.normal
+    method, length = collision.of_graph
     course = Course(
         model,
         frozen,
-        step=METHODS[collision.stepping](model, collision.step_length),
+        step=METHODS[method](model, length),
         steps=lambda fraction: number_of_steps(collision, fraction),
         horizon=collision.horizon,
         freezes=collision.n_freezes,

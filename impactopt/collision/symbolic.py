@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._compiler import find_compiler
 from ..codegen import cached, model_hash
 from ..errors import InputError, check_array, did_you_mean
 from .batch import Batch
@@ -25,6 +26,7 @@ from .graph import (
     joint_space_model,
     number_of_steps,
 )
+from .implicit import is_linear
 from .interface import CollisionModel
 from .model import JointSpaceModel
 from .native import native_collision, native_gradient
@@ -36,9 +38,9 @@ from .terms import JointFriction, Terms
 
 __all__ = ["SymbolicModel"]
 
-# [s] by method: Taylor steps are held by events and by the servo's fastest mode, not by accuracy; the other
-# is the paper's
-_STEPS = {"events": 2.5e-4, "rk4": 1e-4, "exact": 2.5e-4}
+# [s] by method: of the histories, where steps find their own length; of Taylor's steps, which are held by
+# events and by the servo's fastest mode; and the paper's
+_STEPS = {"implicit": 1e-3, "exact": 2.5e-4, "events": 2.5e-4, "rk4": 1e-4}
 _MOST_STEPS = 50_000
 
 
@@ -49,14 +51,18 @@ class SymbolicModel(CollisionModel):
     Attributes
     ----------
     terms : effects that are taken into account.
-    method : "events", Taylor steps of order six that end on events, with the impulse within 1e-5 of the exact
-        solution, most often within 1e-9; or "rk4", the paper's fixed Runge-Kutta steps, for laws that have no
-        such derivatives, within 1e-2. Both are of the impulse, or of a plastic blow's where contact is broken
-        off before; `collide` refuses a step that it estimates not to hold this. None: the first that law and
-        target allow. Or "exact", up to rounding, where law and target are linear between events, to measure
-        the others by: for `collide` only.
-    step : [s] length of a step, below `stable_step(q)`; None: 2.5e-4 for "events", the paper's 1e-4 for
-        "rk4". With "exact", where it need not be stable, it is the histories' spacing: None is 2.5e-4.
+    method : how the frozen system is integrated; None: the first of these that law, target and gains allow.
+        "implicit": A-stable steps of order eight that end on events and find their own length, for laws and
+        targets that are linear between events and gains that are one number a joint, with a C compiler.
+        "events": Taylor steps of order six that end on events, with the impulse within 1e-5 of the exact
+        solution, most often within 1e-9. "rk4": the paper's fixed Runge-Kutta steps, for laws that have no
+        such derivatives, within 1e-2. The last two are of the impulse, or of a plastic blow's where contact
+        is broken off before; `collide` refuses a step that it estimates not to hold this.
+        Or "exact", up to rounding, where law and target are linear between events, to measure the others by:
+        for `collide` only.
+    step : [s] of "events" and "rk4", their length, below `stable_step(q)`; None: 2.5e-4, and the paper's
+        1e-4. Of "implicit" and "exact", which any step suits, the histories' spacing; None: 1e-3 and 2.5e-4.
+    tolerance : of "implicit", what a step may leave out of the hand's speed, relative to its changes.
     report : told what is going on while functions are compiled, one line a call.
 
     Raises
@@ -68,15 +74,15 @@ class SymbolicModel(CollisionModel):
     terms: Terms = field(default_factory=Terms)
     method: str | None = None
     step: float | None = None
+    tolerance: float = 1e-6
     report: Callable[[str], None] | None = None
     _functions: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        methods = (*METHODS, "exact")
-        if self.method is not None and self.method not in methods:
+        if self.method is not None and self.method not in _STEPS:
             raise InputError(
-                f"method {self.method!r}{did_you_mean(self.method, methods)}; there are {', '.join(methods)}"
+                f"method {self.method!r}{did_you_mean(self.method, _STEPS)}; there are {', '.join(_STEPS)}"
             )
         for thing in (self.law, self.target):
             if self.method == "events" and not thing.analytic:
@@ -84,18 +90,20 @@ class SymbolicModel(CollisionModel):
                     f"method 'events': {type(thing).__name__} lacks the derivatives that Taylor steps need; "
                     "use 'rk4'"
                 )
+        if not 1e-14 <= check_array("tolerance", self.tolerance, ()) <= 1e-2:
+            raise InputError(f"tolerance: {self.tolerance:g}; give a number from 1e-14 to 1e-2")
         if not check_array("step [s]", self.step_length, ()) > 0:
             raise InputError(f"step [s]: {self.step_length:g}; give a number > 0")
         if self.step_length > self.horizon:
             raise InputError(f"step [s]: {self.step_length:g} is longer than the horizon, {self.horizon:g} s")
         steps = number_of_steps(self)
-        if self.stepping != "exact" and steps > _MOST_STEPS:
+        if self.method != "exact" and steps > _MOST_STEPS:
             raise InputError(
                 f"step [s]: {self.step_length:g} takes {steps} steps to the horizon, {self.horizon:g} s, and "
                 f"{_MOST_STEPS} are the most: shorten the horizon, or lengthen the step"
             )
-        # checks the numbers now, and not when they are first used
-        _ = self.settings
+        if self.method == "implicit" and (why := self._not_implicit()):
+            raise InputError(f"method 'implicit': {why}; use 'events' or 'rk4'")
         if self.method == "exact":
             if self.n_freezes:
                 raise InputError("method 'exact': only without further freezes: freezes=0, or use 'events'")
@@ -117,15 +125,37 @@ class SymbolicModel(CollisionModel):
         """Freezes on the way, besides the one at contact."""
         return 0
 
-    @property
+    @cached_property
     def stepping(self) -> str:
-        """The method, or what law and target allow."""
-        return self.method or ("events" if self.law.analytic and self.target.analytic else "rk4")
+        """The method, or the first that can be had."""
+        if self.method is not None:
+            return self.method
+        return self._explicit if self._not_implicit() else "implicit"
 
     @property
     def step_length(self) -> float:
         """The step [s], or the method's own."""
-        return _STEPS[self.stepping] if self.step is None else self.step
+        return min(_STEPS[self.stepping], self.horizon) if self.step is None else self.step
+
+    @property
+    def of_graph(self) -> tuple[str, float]:
+        """Method and step [s] of `graph`: "implicit" finds its way as it goes, which a graph cannot, and has
+        Taylor steps there."""
+        if self.stepping in METHODS:
+            return self.stepping, self.step_length
+        return self._explicit, min(_STEPS[self._explicit], self.horizon)
+
+    @property
+    def _explicit(self) -> str:
+        return "events" if self.law.analytic and self.target.analytic else "rk4"
+
+    def _not_implicit(self) -> str:
+        """What stands against implicit steps, or nothing."""
+        if not is_linear(self.law, self.target):
+            return f"{type(self.law).__name__} and {type(self.target).__name__} are not linear between events"
+        if any(value.ndim == 2 for value in self.settings.values()):
+            return "kp and kd have to be one number a joint"
+        return "" if find_compiler() else "there is no C compiler"
 
     @cached_property
     def settings(self) -> Settings:
@@ -259,7 +289,8 @@ class SymbolicModel(CollisionModel):
         kinds = (self.law.formula(), self.target.formula(), self.terms, transition)
         shapes = tuple((name, value.shape) for name, value in self.settings.items())
         frame = self.robot.striker(self.striker).model_frame
-        course = (self.stepping, self.step_length, number_of_steps(self), self.horizon, self.n_freezes)
+        steps = (self.stepping, self.step_length, self.tolerance, *self.of_graph, number_of_steps(self))
+        course = (*steps, self.horizon, self.n_freezes)
         return (model_hash(self.robot.model), self.n_servos, frame, *held_by, *kinds, shapes, *course)
 
     def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
@@ -322,7 +353,8 @@ class SymbolicModel(CollisionModel):
 
     def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
         frozen = self._frozen_at(arguments[0], values)
-        self.check_step(self.step_length, self._longest(frozen, values))
+        if self.stepping != "implicit":
+            self.check_step(self.step_length, self._longest(frozen, values))
         names = self.available
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
@@ -341,7 +373,8 @@ class SymbolicModel(CollisionModel):
         return ExactCollision(self)
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
-        """[s] that the step has to stay below at q: 2.6 over the fastest mode's rate, no joint saturated.
+        """[s] that steps of "events" and "rk4" have to stay below at q: 2.6 over the fastest mode's rate, with no
+        joint saturated.
 
         InputError where what holds the robot cannot be told apart.
         """

@@ -101,7 +101,8 @@ def _sdc_functions(sdc: SDC) -> tuple[Any, Any]:
     model, frozen = joint_space_model(sdc), frozen_dynamics(sdc)
 
     def build() -> list[Any]:
-        step = METHODS[sdc.stepping](model, sdc.step_length)
+        method, length = sdc.of_graph
+        step = METHODS[method](model, length)
         y, data = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
         end = y
         for _ in range(STEPS):

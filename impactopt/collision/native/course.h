@@ -1,10 +1,4 @@
-/* The time loop, and the course of a collision over its freezes; see collision/loop.py and course.py. */
-
-/* states at the begin of all steps, for those who go back */
-typedef struct {
-  int made;
-  State states[GRADIENT ? STEPS_AT_ALL + 1 : 1];
-} Tape;
+/* The course of a collision over its freezes; see collision/course.py. */
 
 typedef struct {
   Frozen frozen;
@@ -12,40 +6,6 @@ typedef struct {
   Tape tape;
   double q[NQ], v[NV], normal[3];
 } Work;
-
-/* steps in a block of the graph's loop, which looks once more at what stands still, but not between blocks */
-#define BLOCK 16
-
-/* from y to separation, or the freeze's end; the phase at the end */
-static Instant run(const Data *d, State *y, int steps, const Record *record, Tape *tape) {
-  Instant now;
-  int made = 0;
-  for (;; made++) {
-    look(d, y, &now);
-    judge(d, y, &now);
-    if (record && made % EVERY == 0 && made < steps) write_column(d, y, &now, record, made / EVERY);
-    if (made == steps || !now.contact || !(y->time < d->until)) break;
-    if (GRADIENT) tape->states[made] = *y;
-    advance(d, y, &now, fmin(LENGTH, d->until - y->time));
-  }
-  if (GRADIENT) tape->states[made] = *y, tape->made = made;
-  if (made % BLOCK) stand_still(d, y, &now);
-  if (!(now.rate == now.rate)) {
-    /* no number in, none out */
-    y->impulse = y->time = y->penetration = y->peak = NAN;
-    FOR(i, V) y->torque[i] = y->torque2[i] = (vec){0} + NAN;
-    FOR(i, NZ) y->target[i] = NAN;
-    y->impulse2 = NAN;
-    look(d, y, &now);
-    now.contact = 1;
-  }
-  if (record) {
-    const int column = made < steps ? (made + EVERY - 1) / EVERY : record->columns - 1;
-    write_column(d, y, &now, record, column);
-    repeat_column(record, column);
-  }
-  return now;
-}
 
 static void load(const double *from, double *to, int n) {
   FOR(i, n) to[i] = from ? from[i] : 0.0;

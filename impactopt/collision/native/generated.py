@@ -10,6 +10,7 @@ import casadi as ca
 from ...stance import Stance
 from ..frozen import FrozenDynamics
 from ..graph import target_yield
+from ..implicit import linear_contact
 from ..jets import derivative
 from ..model import JointSpaceModel
 from ..taylor import ORDER
@@ -71,8 +72,9 @@ def gamma_of(stance: Stance, held: int) -> list[float]:
     return [float(x) for x in stance.compliance] * held
 
 
-def scalar_functions(model: JointSpaceModel, *, taylor: bool) -> list[Any]:
-    """Law and target, and with Taylor steps their time derivatives order by order, as SX functions.
+def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
+    """Law and target as SX functions; with Taylor steps also their time derivatives order by order, and with
+    implicit ones their coefficients (`linear_contact`).
 
     `law` and `target` are the numbers of both, z the target's state; jets have a column for each order:
 
@@ -104,7 +106,9 @@ def scalar_functions(model: JointSpaceModel, *, taylor: bool) -> list[Any]:
         ca.Function("target_result", [z, target], [column(thing.result(states, of_target))]),
         ca.Function("target_yield", [target], [_number(target_yield(thing, of_target))]),
     ]
-    return functions + (_jets(model, law, target, of_law, of_target) if taylor else [])
+    if method == "implicit":
+        return functions + linear_contact(model.law, model.target)
+    return functions + (_jets(model, law, target, of_law, of_target) if method == "events" else [])
 
 
 def _jets(

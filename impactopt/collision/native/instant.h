@@ -91,18 +91,8 @@ INLINE void servo(const Data *d, const vec *u, const vec *deviation, vec *out) {
 INLINE vec clipped(vec x, vec limit) { return choose(x > limit, limit, choose(x < -limit, -limit, x)); }
 INLINE vec magnitude(vec x) { return (vec)((bits)x & ~SIGN_BIT); }
 
-/* velocities, rate of penetration and servo at a state */
-INLINE void look(const Data *d, const State *y, Instant *now) {
-  now->speed = velocity(d, y->torque, y->impulse, y->time, now->u) + d->hand_speed;
-  now->target_speed = call(target_velocity, y->target, d->target, 0);
-  now->rate = now->speed - now->target_speed;
-#if FREEZES
-  FOR(i, V) now->u[i] += d->before[i];
-#endif
-  servo(d, now->u, y->deviation, now->demand);
-#if FEEDFORWARD
-  FOR(i, V) now->demand[i] += d->feedforward[i];
-#endif
+/* what of its demand the servo gives, and what the joints get */
+INLINE void torques(const Data *d, Instant *now) {
 #if SATURATION
   FOR(i, V) now->torque[i] = clipped(now->demand[i], d->limit[i]);
 #else
@@ -117,6 +107,32 @@ INLINE void look(const Data *d, const State *y, Instant *now) {
 #else
   FOR(i, V) now->net[i] = now->torque[i];
 #endif
+}
+
+/* velocities, rate of penetration and servo at a state */
+INLINE void look(const Data *d, const State *y, Instant *now) {
+  now->speed = velocity(d, y->torque, y->impulse, y->time, now->u) + d->hand_speed;
+  now->target_speed = call(target_velocity, y->target, d->target, 0);
+  now->rate = now->speed - now->target_speed;
+#if FREEZES
+  FOR(i, V) now->u[i] += d->before[i];
+#endif
+  servo(d, now->u, y->deviation, now->demand);
+#if FEEDFORWARD
+  FOR(i, V) now->demand[i] += d->feedforward[i];
+#endif
+  torques(d, now);
+}
+
+/* no number in, none out */
+static void no_number(const Data *d, State *y, Instant *now) {
+  if (now->rate == now->rate) return;
+  y->impulse = y->time = y->penetration = y->peak = NAN;
+  FOR(i, V) y->torque[i] = y->torque2[i] = (vec){0} + NAN;
+  FOR(i, NZ) y->target[i] = NAN;
+  y->impulse2 = NAN;
+  look(d, y, now);
+  now->contact = 1;
 }
 
 /* phase: contact is over when, in restitution, no force is left */

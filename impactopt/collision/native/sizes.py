@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import pairwise
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from ..course import GIVES_WAY, cuts
 from ..events import BEYOND
 from ..graph import joint_space_model, number_of_steps
+from ..implicit import STAGES, gamma, tables
 from ..loop import BLOCK
 from ..model import shape_of
 from ..outputs import HISTORIES, OF_SOLES, frozen_for
@@ -21,6 +23,10 @@ if TYPE_CHECKING:
     from ..symbolic import SymbolicModel
 
 __all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes"]
+
+
+# where steps find their own length
+_MOST_STEPS = 2000
 
 
 def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:
@@ -60,7 +66,9 @@ def _ends(collision: SymbolicModel) -> list[float]:
 
 
 def _blocks(collision: SymbolicModel, fraction: float) -> int:
-    """Steps for a fraction of the horizon, in whole blocks."""
+    """Steps for a fraction of the horizon, in whole blocks; or the most, where they find their own length."""
+    if collision.stepping == "implicit":
+        return _MOST_STEPS
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 
@@ -71,6 +79,10 @@ def _steps(collision: SymbolicModel) -> list[int]:
 
 
 def _columns(collision: SymbolicModel, every: int) -> list[int]:
+    if collision.stepping == "implicit":
+        shares = [b - a for a, b in pairwise(_ends(collision))]
+        spacing = every * collision.step_length
+        return [ceil(share * collision.horizon / spacing - 1e-9) + 1 for share in (*shares[:-1], 1.0)]
     return [-(-count // every) + 1 for count in _steps(collision)]
 
 
@@ -103,6 +115,9 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "COLUMN(i)": f"((i) >= {robot.nv - n} ? (i) - {robot.nv - n} : {n + 1} + (i))",
         "LENGTH": repr(float(collision.step_length)),
         "BEYOND": repr(BEYOND),
+        "STAGES": STAGES,
+        "TOLERANCE": repr(float(collision.tolerance)),
+        "GAMMA_OF_STEPS": repr(gamma()),
         "GIVES_WAY": repr(GIVES_WAY),
         "HORIZON": repr(float(collision.horizon)),
         "TRANSITION": repr(float(model.transition)),
@@ -145,6 +160,8 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         names_table("NAMES_IN", names),
         shapes_table("SHAPES_IN", shapes.values()),
     ]
+    if collision.stepping == "implicit":
+        text += [_matrix(name, x) for name, x in tables().items()]
     return "\n".join(text) + "\n"
 
 
@@ -161,6 +178,14 @@ def _rows_of_columns(name: str, places: list[tuple[int, int]], columns: int) -> 
         _table("int", f"{name}_ROWS", starts),
         _table("int", f"{name}_ROW", [r for column in rows for r in column]),
     ]
+
+
+def _matrix(name: str, values: Any) -> str:
+    if np.ndim(values) == 0:
+        return f"#define {name} {values!r}"
+    shape = "".join(f"[{size}]" for size in values.shape)
+    entries = str(values.tolist()).replace("[", "{").replace("]", "}")
+    return f"static const double {name}{shape} = {entries};"
 
 
 def _table(kind: str, name: str, values: Iterable[Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["native_collision", "native_gradient"]
 
 # the kernel's files of the steps
-_STEPS = {"events": "taylor", "rk4": "rk4"}
+_STEPS = {"events": ("taylor.h", "steps.h"), "rk4": ("rk4.h", "steps.h"), "implicit": ("implicit.h",)}
 # the tree's code is long and straight: -O1 makes it 5 % faster, and takes three times as long to compile
 _TREE = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
@@ -41,6 +42,9 @@ def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, ever
 
 def native_gradient(collision: SymbolicModel, output: str) -> Any:
     """C code of the function that `gradient_graph` gives; with several freezes, that graph itself."""
+    if collision.stepping == "implicit":
+        method, step = collision.of_graph
+        collision = replace(collision, method=method, step=step)
     if collision.n_freezes:
         return gradient_graph(collision, output)
     return NativeCode(
@@ -55,7 +59,7 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
     ground = bool({"ground_wrench", "zmp"} & {*outputs})
     tree = tree_functions(frozen, collision.n_servos, ground=ground)
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
-    scalars = scalar_functions(model, taylor=collision.stepping == "events")
+    scalars = scalar_functions(model, method=collision.stepping)
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
     if gradient:
         of_tree = [*of_tree, *backwards(of_tree), tangent_back(frozen)]
@@ -81,8 +85,10 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         f"#define N_OUT {len(shapes)}",
     ]
     steps = _STEPS[collision.stepping]
-    files_used = ["freeze.h", "instant.h", f"{steps}.h", "outputs.h", "course.h"]
+    files_used = ["freeze.h", "instant.h", "outputs.h", *steps, "course.h"]
     files_used += (
-        ["back.h", f"{steps}_back.h", "freeze_back.h", "gradient.c"] if gradient else ["collision.c"]
+        ["back.h", steps[0].replace(".h", "_back.h"), "freeze_back.h", "gradient.c"]
+        if gradient
+        else ["collision.c"]
     )
     return "\n".join([*parts, *text(*files_used, "interface.c")])

@@ -54,7 +54,7 @@ def tables() -> dict[str, Array | float]:
     """What the kernel needs.
 
     POWERS (9, 9) : coefficients of the powers of theta of each p_j. AT_ONE (9) : p_j(1).
-    HULL (9, 9) : Bernstein coefficients of a sum of w_j p_j are HULL w.
+    HULL (9, 16) : Bernstein coefficients of a sum of w_j p_j are w' HULL, and zeros.
     BOUND (9) : largest |p_j| on [0, 1].
     LEFT_OUT : |p_9(1)|, what a further term would be multiplied by.
     """
@@ -63,7 +63,7 @@ def tables() -> dict[str, Array | float]:
     return {
         "POWERS": P,
         "AT_ONE": P.sum(axis=1),
-        "HULL": bernstein_matrix(STAGES) @ P.T,
+        "HULL": np.pad(P @ bernstein_matrix(STAGES).T, ((0, 0), (0, 16 - STAGES - 1))),
         "BOUND": np.abs(values).max(axis=0),
         "LEFT_OUT": float(abs(polynomials(STAGES + 1)[-1].sum())),
     }

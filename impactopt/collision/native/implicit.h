@@ -11,7 +11,8 @@
 /* of the stiffest of contact's modes, the first step; how much an error has to be below what is allowed for longer
    steps; error of a joint's demand, of its limit */
 #define FIRST_STEP 0.5
-#define WORTH_LONGER 1e-3
+#define WORTH_LONGER 2e-3
+#define AIMED_AT 0.2
 #define OF_LIMIT 1e-2
 #define MOST_TRIES 200
 
@@ -72,12 +73,12 @@ INLINE vec vector(const vec (*w)[V], int i, const double *p) {
   for (int j = 1; j < TERMS; j++) s += p[j] * w[j][i];
   return s;
 }
+/* Bernstein coefficients */
 INLINE void hull(const double *w, double *b) {
-  FOR(i, TERMS) {
-    double s = w[0];
-    for (int j = 1; j <= STAGES; j++) s += HULL[i][j] * w[j];
-    b[i] = s;
-  }
+  vec s[VECTORS(TERMS)];
+  FOR(k, VECTORS(TERMS)) s[k] = (vec){0} + w[0];
+  for (int j = 1; j < TERMS; j++) FOR(k, VECTORS(TERMS)) s[k] += w[j] * ((const vec *)HULL[j])[k];
+  memcpy(b, s, TERMS * sizeof(double));
 }
 
 /* a polynomial's value and slope from its Bernstein coefficients (de Casteljau) */
@@ -171,7 +172,45 @@ static double largest(const double *w, double end, double most, double *where) {
 }
 
 /* ------------------------------------------------------------ the factor that steps of one length share */
-/* D to D + change at joint i: a product of one column with itself */
+/* joints that are taken in at once: as many of their columns as registers hold */
+#define BLOCK (LANES < 4 ? LANES : 4)
+#define BLOCKS ((N + BLOCK - 1) / BLOCK)
+
+/* X from Q and D: with columns x of some joints, X - x (1 + g D x_own)^-1 g D x' takes their dampers in */
+static void sweep_all(const vec (*Q)[V], Resolvent *r) {
+  const vec(*from)[V] = Q;
+  if (!BLOCKS) memcpy(r->X, Q, sizeof r->X);
+  FOR(first, BLOCKS) {
+    const int at = first * BLOCK;
+    double M[BLOCK][BLOCK], W[BLOCK][V * LANES] __attribute__((aligned(64)));
+    vec x[BLOCK][V];
+    FOR(a, BLOCK) FOR(k, V) x[a][k] = at + a <= N ? from[at + a][k] : (vec){0};
+    FOR(a, BLOCK) {
+      const double by = at + a < N ? r->g * ((double *)r->D)[at + a] : 0.0;
+      FOR(b, BLOCK) M[a][b] = (a == b) + by * ((double *)x[a])[at + b];
+      FOR(k, V) ((vec *)W[a])[k] = by * x[a][k];
+    }
+    FOR(a, BLOCK) {
+      const double pivot = 1.0 / M[a][a];
+      FOR(b, BLOCK) if (b != a) {
+        const double by = M[b][a] * pivot;
+        FOR(c, BLOCK) M[b][c] -= by * M[a][c];
+        FOR(k, V) ((vec *)W[b])[k] -= by * ((vec *)W[a])[k];
+      }
+      FOR(k, V) ((vec *)W[a])[k] *= pivot;
+      FOR(c, BLOCK) M[a][c] *= pivot;
+    }
+    FOR(j, N + 1) {
+      vec column[V];
+      FOR(k, V) column[k] = from[j][k];
+      FOR(a, BLOCK) FOR(k, V) column[k] -= W[a][j] * x[a][k];
+      FOR(k, V) r->X[j][k] = column[k];
+    }
+    from = (const vec(*)[V])r->X;
+  }
+}
+
+/* D to D + change at joint i alone */
 INLINE void sweep(Resolvent *r, int i, double change) {
   const double pivot = ((double *)r->X[i])[i], factor = r->g * change / (1.0 + r->g * change * pivot);
   vec x[V];
@@ -259,10 +298,11 @@ static void prepare(const Data *d, const State *y, const Instant *now, double h,
   }
   if (anew) {
     r->h = h, r->g = g;
-    memcpy(r->X, d->frozen->Q, sizeof r->X);
-    FOR(i, N) if (is[i] != 0.0) sweep(r, i, is[i]);
+    memcpy(r->D, D, sizeof D);
+    sweep_all((const vec(*)[V])d->frozen->Q, r);
+  } else {
+    memcpy(r->D, D, sizeof D);
   }
-  memcpy(r->D, D, sizeof D);
   memcpy(r->kp, kp, sizeof kp);
   contact_here(d, y, now, g, ((double *)r->X[N])[N], &r->contact);
 }
@@ -406,8 +446,12 @@ typedef struct {
 } Event;
 
 static void look_at(const double *b, double sign, double level, double end, int kind, int number, Event *e) {
-  double mine[TERMS];
-  FOR(i, TERMS) mine[i] = sign * b[i] + level;
+  double mine[TERMS], lowest = INFINITY;
+  FOR(i, TERMS) {
+    mine[i] = sign * b[i] + level;
+    lowest = mine[i] < lowest ? mine[i] : lowest;
+  }
+  if (lowest >= 0.0) return;
   const double at = first_below(mine);
   if (at < fmin(end, e->at)) *e = (Event){.at = at, .kind = kind, .number = number, .sign = sign};
 }
@@ -426,11 +470,23 @@ static void look_at_joint(const vec (*w)[V], int i, double offset, double level,
   }
 }
 
-/* whether a joint's series may cross the level in this step, a joint a lane */
+/* whether a joint's series may cross the level in this step, a joint a lane: from its terms' sizes, and where these
+   leave it open from its hull */
 INLINE bits may_cross(const vec (*w)[V], int i, vec offset, vec level) {
   vec reach = BOUND[1] * magnitude(w[1][i]);
   for (int j = 2; j < TERMS; j++) reach += BOUND[j] * magnitude(w[j][i]);
-  return magnitude(magnitude(w[0][i] + offset) - level) <= reach;
+  const vec start = w[0][i] + offset, size = magnitude(start);
+  const bits open = magnitude(size - level) <= reach;
+  if (!any(open)) return open;
+  const bits within = size <= level, sign = (bits)start & SIGN_BIT;
+  bits crosses = {0};
+  for (int k = 1; k < TERMS; k++) {
+    vec b = start;
+    for (int j = 1; j < TERMS; j++) b += HULL[j][k] * w[j][i];
+    const vec out = magnitude(b) - level, in = level - (vec)((bits)b ^ sign);
+    crosses |= choose(within, out, in) > 0.0;
+  }
+  return crosses & open;
 }
 
 static void find_event(const Data *d, const State *y, const Instant *now, const Series *s, double end, Event *e) {
@@ -560,7 +616,10 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
     if (GRADIENT) tape->states[made] = *y, tape->lengths[made] = h, tape->parts[made] = theta;
     move(y, &s, h, theta);
     if (theta == end && end < 1.0) y->time = d->until;
-    if (!e.kind && error < WORTH_LONGER && left > 4.0 * h) h *= 2.0;
+    if (!e.kind && error < WORTH_LONGER && left > 2.0 * h) {
+      const double longer = pow(AIMED_AT / error, 1.0 / TERMS);
+      h *= longer < 4.0 ? longer : 4.0;
+    }
   }
   if (GRADIENT) tape->states[made] = *y, tape->made = made;
   no_number(d, y, &now);

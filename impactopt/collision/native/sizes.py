@@ -185,7 +185,7 @@ def _matrix(name: str, values: Any) -> str:
         return f"#define {name} {values!r}"
     shape = "".join(f"[{size}]" for size in values.shape)
     entries = str(values.tolist()).replace("[", "{").replace("]", "}")
-    return f"static const double {name}{shape} = {entries};"
+    return f"static const double {name}{shape} __attribute__((aligned(64))) = {entries};"
 
 
 def _table(kind: str, name: str, values: Iterable[Any]) -> str:

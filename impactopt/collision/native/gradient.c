@@ -28,14 +28,12 @@ static void evaluate(const double **arg, double **res, Work *w) {
   Back all;
   State y_;
   const Data *d = &w->data;
-  const Tape *tape = &w->tape;
   collide(arg, 0, w, &c);
   const double value = final_value(d, &c, &y_);
   if (res[0]) *res[0] = value;
   if (!res[1] && !res[2]) return;
   memset(&all, 0, sizeof all);
-  if (tape->made % BLOCK && c.in_contact) step_back(d, &tape->states[tape->made], 0, &y_, &all);
-  for (int i = tape->made - 1; i >= 0; i--) step_back(d, &tape->states[i], 1, &y_, &all);
+  run_back(d, &w->tape, c.in_contact != 0.0, &y_, &all);
 
   FreezeBack room;
   double by_q[NV], by_v[NV];

@@ -37,10 +37,21 @@ typedef struct {
   double impulse[TERMS], penetration[TERMS], rate[TERMS], force[TERMS], target[NZ1][TERMS];
 } Series;
 
+enum { OF_NONE, OF_RATE, OF_FORCE, OF_DEMAND, OF_SLIDING, OF_SWITCH };
+
+typedef struct {
+  double at;
+  int kind, number;
+  double sign; /* of the series, which is above zero at the begin */
+} Event;
+
+/* of each step what those who go back need: the state at its begin, its length, the part of it that was gone, and the
+   event that this depends on */
 typedef struct {
   int made;
   State states[GRADIENT ? STEPS_AT_ALL + 1 : 1];
   double lengths[GRADIENT ? STEPS_AT_ALL + 1 : 1], parts[GRADIENT ? STEPS_AT_ALL + 1 : 1];
+  Event events[GRADIENT ? STEPS_AT_ALL + 1 : 1];
 } Tape;
 
 /* ------------------------------------------------------------ polynomials */
@@ -437,14 +448,6 @@ INLINE double error_of(const Data *d, const Series *s, double scale) {
 }
 
 /* ------------------------------------------------------------ events */
-enum { OF_NONE, OF_RATE, OF_FORCE, OF_DEMAND, OF_SLIDING, OF_SWITCH };
-
-typedef struct {
-  double at;
-  int kind, number;
-  double sign; /* of the series, which is above zero at the begin */
-} Event;
-
 static void look_at(const double *b, double sign, double level, double end, int kind, int number, Event *e) {
   double mine[TERMS], lowest = INFINITY;
   FOR(i, TERMS) {
@@ -613,7 +616,10 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
     repeated = e.kind && e.at < 1e-6 && repeated < 7 ? repeated + 1 : 0;
     const double theta = e.kind ? fmin(end, e.at + JUST_BEYOND * (1 << 3 * repeated)) : end;
     if (record) column = sample(d, y, &now, &s, &r.contact, h, theta, record, column);
-    if (GRADIENT) tape->states[made] = *y, tape->lengths[made] = h, tape->parts[made] = theta;
+    if (GRADIENT) {
+      tape->states[made] = *y, tape->lengths[made] = h, tape->parts[made] = theta, tape->events[made] = e;
+      if (theta == end) tape->events[made].kind = OF_NONE;
+    }
     move(y, &s, h, theta);
     if (theta == end && end < 1.0) y->time = d->until;
     if (!e.kind && error < WORTH_LONGER && left > 2.0 * h) {

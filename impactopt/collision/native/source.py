@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +21,13 @@ if TYPE_CHECKING:
 
 __all__ = ["native_collision", "native_gradient"]
 
-# the kernel's files of the steps
+# the kernel's files of the steps, and of the way back
 _STEPS = {"events": ("taylor.h", "steps.h"), "rk4": ("rk4.h", "steps.h"), "implicit": ("implicit.h",)}
+_BACK = {
+    "events": ("taylor_back.h", "steps_back.h"),
+    "rk4": ("rk4_back.h", "steps_back.h"),
+    "implicit": ("implicit_back.h",),
+}
 # the tree's code is long and straight: -O1 makes it 5 % faster, and takes three times as long to compile
 _TREE = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
@@ -42,9 +46,6 @@ def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, ever
 
 def native_gradient(collision: SymbolicModel, output: str) -> Any:
     """C code of the function that `gradient_graph` gives; with several freezes, that graph itself."""
-    if collision.stepping == "implicit":
-        method, step = collision.of_graph
-        collision = replace(collision, method=method, step=step)
     if collision.n_freezes:
         return gradient_graph(collision, output)
     return NativeCode(
@@ -84,11 +85,7 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         shapes_table("SHAPES_OUT", shapes.values()),
         f"#define N_OUT {len(shapes)}",
     ]
-    steps = _STEPS[collision.stepping]
-    files_used = ["freeze.h", "instant.h", "outputs.h", *steps, "course.h"]
-    files_used += (
-        ["back.h", steps[0].replace(".h", "_back.h"), "freeze_back.h", "gradient.c"]
-        if gradient
-        else ["collision.c"]
-    )
+    method = collision.stepping
+    files_used = ["freeze.h", "instant.h", "outputs.h", *_STEPS[method], "course.h"]
+    files_used += ["back.h", *_BACK[method], "freeze_back.h", "gradient.c"] if gradient else ["collision.c"]
     return "\n".join([*parts, *text(*files_used, "interface.c")])

@@ -84,6 +84,24 @@ INLINE vec vector(const vec (*w)[V], int i, const double *p) {
   for (int j = 1; j < TERMS; j++) s += p[j] * w[j][i];
   return s;
 }
+/* derivatives of p_j, and of a sum of w_j p_j */
+INLINE void slopes(double theta, double *p) {
+  FOR(j, TERMS) {
+    double x = j * POWERS[j][j];
+    for (int k = j - 1; k >= 1; k--) x = x * theta + k * POWERS[j][k];
+    p[j] = x;
+  }
+}
+INLINE double change(const double *w, const double *slope) {
+  double s = 0.0;
+  for (int j = 1; j < TERMS; j++) s += slope[j] * w[j];
+  return s;
+}
+INLINE vec changes(const vec (*w)[V], int i, const double *slope) {
+  vec s = {0};
+  for (int j = 1; j < TERMS; j++) s += slope[j] * w[j][i];
+  return s;
+}
 /* Bernstein coefficients */
 INLINE void hull(const double *w, double *b) {
   vec s[VECTORS(TERMS)];
@@ -557,27 +575,33 @@ INLINE void move(State *y, const Series *s, double h, double theta) {
 }
 
 /* ------------------------------------------------------------ from y to separation, or the freeze's end */
+/* an instant within a step, with no more of a state than columns need */
+INLINE void within(const Data *d, const State *y, const Instant *now, const Series *s, const Contact *c, double part,
+                   State *then, Instant *at) {
+  double p[TERMS];
+  powers(part, p);
+  then->penetration = value(s->penetration, p);
+  at->rate = value(s->rate, p);
+  at->target_speed = now->target_speed;
+  FOR(i, NZ) for (int j = 1; j < TERMS; j++) at->target_speed += c->at[i] * p[j] * s->target[i][j];
+  at->speed = at->rate + at->target_speed;
+  FOR(i, V) {
+    at->u[i] = vector(s->speeds, i, p);
+    at->demand[i] = vector(s->demand, i, p);
+  }
+  torques(d, at);
+}
+
 /* the columns of the histories that lie in a step; the number of the next */
 static int sample(const Data *d, const State *y, const Instant *now, const Series *s, const Contact *c, double h,
                   double theta, const Record *record, int column) {
   State then;
   Instant at;
-  double p[TERMS];
   for (;; column++) {
-    const double time = column * (EVERY * LENGTH), part = (time - y->time) / h;
+    const double part = (column * (EVERY * LENGTH) - y->time) / h;
     if (part >= theta || column >= record->columns - 1) return column;
-    powers(part, p);
-    then.time = time;
-    then.penetration = value(s->penetration, p);
-    at.rate = value(s->rate, p);
-    at.target_speed = now->target_speed;
-    FOR(i, NZ) for (int j = 1; j < TERMS; j++) at.target_speed += c->at[i] * p[j] * s->target[i][j];
-    at.speed = at.rate + at.target_speed;
-    FOR(i, V) {
-      at.u[i] = vector(s->speeds, i, p);
-      at.demand[i] = vector(s->demand, i, p);
-    }
-    torques(d, &at);
+    within(d, y, now, s, c, part, &then, &at);
+    then.time = column * (EVERY * LENGTH);
     write_column(d, &then, &at, record, column);
   }
 }

@@ -23,25 +23,6 @@ typedef struct {
   Right by;
 } Seed;
 
-/* derivatives of p_j */
-INLINE void slopes(double theta, double *p) {
-  FOR(j, TERMS) {
-    double x = j * POWERS[j][j];
-    for (int k = j - 1; k >= 1; k--) x = x * theta + k * POWERS[j][k];
-    p[j] = x;
-  }
-}
-INLINE double change(const double *w, const double *slope) {
-  double s = 0.0;
-  for (int j = 1; j < TERMS; j++) s += slope[j] * w[j];
-  return s;
-}
-INLINE vec changes(const vec (*w)[V], int i, const double *slope) {
-  vec s = {0};
-  for (int j = 1; j < TERMS; j++) s += slope[j] * w[j][i];
-  return s;
-}
-
 /* how an output changes with theta, from its derivatives by the state there */
 static double by_place(const Series *s, double h, const State *y_, double theta) {
   double slope[TERMS];

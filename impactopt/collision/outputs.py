@@ -18,6 +18,7 @@ __all__ = [
     "OUTPUTS",
     "SCALARS",
     "Outputs",
+    "check_jacobian",
     "check_outputs",
     "frozen_for",
 ]
@@ -59,6 +60,20 @@ def check_outputs(names: tuple[str, ...]) -> None:
             raise InputError(
                 f"no output {name!r}{did_you_mean(name, OUTPUTS)}; there are {', '.join(OUTPUTS)}"
             )
+
+
+def check_jacobian(names: tuple[str, ...], method: str, freezes: int, why_not_implicit: str) -> None:
+    """InputError for outputs, or a model, without compiled Jacobians."""
+    for name in names:
+        if name not in (*SCALARS, *HISTORIES):
+            raise InputError(f"Jacobian of {name!r}: only of {', '.join((*SCALARS, *HISTORIES))}")
+    instead = "differentiate what `graph` gives by ca.jacobian instead"
+    if why_not_implicit:
+        raise InputError(f"jacobian_function: only of method 'implicit', and {why_not_implicit}; {instead}")
+    if method != "implicit":
+        raise InputError(f"jacobian_function: only of method 'implicit', not of {method!r}; or {instead}")
+    if freezes:
+        raise InputError(f"jacobian_function: only without further freezes; give freezes=0, or {instead}")
 
 
 def frozen_for(names: tuple[str, ...]) -> tuple[str, ...]:

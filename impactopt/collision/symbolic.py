@@ -29,8 +29,8 @@ from .graph import (
 from .implicit import is_linear
 from .interface import CollisionModel
 from .model import JointSpaceModel
-from .native import native_collision, native_gradient
-from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_outputs
+from .native import native_collision, native_gradient, native_jacobian
+from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_jacobian, check_outputs
 from .result import Collision
 from .settings import Settings
 from .stability import longest_stable_step, slope_function
@@ -224,6 +224,34 @@ class SymbolicModel(CollisionModel):
     def _gradient(self, output: str) -> Any:
         """Likewise, with its gradients."""
         return self._compiled("collision_gradient", (output,), lambda: native_gradient(self, output))
+
+    def jacobian_function(
+        self,
+        outputs: tuple[str, ...] = ("zmp", "torque"),
+        *,
+        parameters: tuple[str, ...] = (),
+        every: int = 1,
+    ) -> Any:
+        """A compiled ca.Function with the inputs of `function`, to outputs and their Jacobians by q and v.
+
+        Of each output, in turn: its value, `<output>_by_q` and `<output>_by_v` (number of its entries, nv),
+        dense; rows are the entries column by column, instant after instant; q's Jacobian is in the basis of
+        v, as `pin.integrate` moves q. Instants stay where they are in time, but for that of separation, and
+        those after it, which repeat it: they move with it.
+
+        Only with implicit steps and a single freeze, and neither of what the target's `results` say nor of
+        configuration and velocity: else InputError. For more than a few collisions, a horizon not much longer
+        than contact keeps the Jacobians small.
+        """
+        self._check_outputs(outputs, every)
+        check_jacobian(outputs, self.stepping, self.n_freezes, self._not_implicit())
+        return self._with_parameters(self._jacobian(tuple(outputs), every), parameters)
+
+    def _jacobian(self, outputs: tuple[str, ...], every: int) -> Any:
+        """Likewise, with all settings as inputs."""
+        return self._compiled(
+            "collision_jacobian", (*outputs, every), lambda: native_jacobian(self, outputs, every=every)
+        )
 
     def describe(
         self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = ()

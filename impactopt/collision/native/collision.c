@@ -1,50 +1,5 @@
 /* A collision: (q, v[, feedforward], settings) -> outputs; see collision/outputs.py. */
 
-static void outputs_of(const Course *c, Work *w, double **res) {
-  const State *y = &c->final;
-  (void)y;
-#ifdef OUT_impulse
-  if (res[OUT_impulse]) *res[OUT_impulse] = c->impulse;
-#endif
-#ifdef OUT_peak_force
-  if (res[OUT_peak_force]) *res[OUT_peak_force] = y->peak;
-#endif
-#ifdef OUT_duration
-  if (res[OUT_duration]) *res[OUT_duration] = c->duration;
-#endif
-#ifdef OUT_separated
-  if (res[OUT_separated]) *res[OUT_separated] = 1.0 - c->in_contact;
-#endif
-#ifdef OUT_energy
-  double rest[NZ1] = {0};
-  if (res[OUT_energy])
-    *res[OUT_energy] =
-        call(target_energy, y->target, w->data.target, 0) - call(target_energy, rest, w->data.target, 0);
-#endif
-#ifdef OUT_target_result
-  if (res[OUT_target_result]) {
-    const double *in[] = {y->target, w->data.target};
-    target_result(in, &res[OUT_target_result], 0, 0, 0);
-  }
-#endif
-#ifdef OUT_velocity
-  if (res[OUT_velocity]) {
-    double change[NV];
-    velocity_change(&w->frozen, y->torque, y->impulse, y->time, change);
-    FOR(i, NV) res[OUT_velocity][i] = c->v[i] + change[i];
-  }
-#endif
-#ifdef OUT_configuration
-  if (res[OUT_configuration]) {
-    double way[NV];
-    velocity_change(&w->frozen, y->torque2, y->impulse2, y->time * y->time / 2, way);
-    FOR(i, NV) way[i] = c->v[i] * y->time + way[i];
-    const double *in[] = {c->q, way};
-    integrate(in, &res[OUT_configuration], 0, 0, 0);
-  }
-#endif
-}
-
 static void evaluate(const double **arg, double **res, Work *w) {
   Course course;
   collide(arg, res, w, &course);

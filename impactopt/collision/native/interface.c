@@ -1,10 +1,13 @@
 /* CasADi's interface of external functions. All memory is the caller's work vector, so that threads do not meet. */
 
+#ifndef ROOM
+#define ROOM Work
+#endif
 #define EXPORT __attribute__((visibility("default")))
 typedef long long Int;
 
 EXPORT int NAME(const double **arg, double **res, Int *iw, double *w, int mem) {
-  evaluate(arg, res, (Work *)(((size_t)w + 63) & ~(size_t)63));
+  evaluate(arg, res, (ROOM *)(((size_t)w + 63) & ~(size_t)63));
   return 0;
 }
 EXPORT void OF_NAME(incref)(void) {}
@@ -24,6 +27,6 @@ EXPORT int OF_NAME(work)(Int *sz_arg, Int *sz_res, Int *sz_iw, Int *sz_w) {
   if (sz_arg) *sz_arg = N_IN;
   if (sz_res) *sz_res = N_OUT;
   if (sz_iw) *sz_iw = 0;
-  if (sz_w) *sz_w = sizeof(Work) / sizeof(double) + 8;
+  if (sz_w) *sz_w = sizeof(ROOM) / sizeof(double) + 8;
   return 0;
 }

@@ -7,7 +7,21 @@ typedef struct {
   int column, columns; /* of the present stretch: the first, and how many */
 } Record;
 
+/* outputs that are no derivatives */
+#define N_VALUES ((int)(sizeof ROWS / sizeof *ROWS))
 #define COLUMN_OF(name, rows) (out[OUT_##name] + (long)(rows) * column)
+
+/* of the ground on the robot about the world's origin, from the wrenches at the soles */
+static void ground_wrench_of(const Frozen *F, const double *w, double *total) {
+  memcpy(total, F->unmodelled, sizeof F->unmodelled);
+  FOR(s, SOLES) {
+    const double *f = w + 6 * s, *p = F->soles + 3 * s;
+    FOR(i, 6) total[i] += f[i];
+    total[3] += p[1] * f[2] - p[2] * f[1];
+    total[4] += p[2] * f[0] - p[0] * f[2];
+    total[5] += p[0] * f[1] - p[1] * f[0];
+  }
+}
 
 static void write_column(const Data *d, const State *y, const Instant *now, const Record *record, int column) {
   double **out = record->out;
@@ -53,14 +67,7 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
 #endif
 #if defined(OUT_ground_wrench) || defined(OUT_zmp)
   double total[6];
-  memcpy(total, d->frozen->unmodelled, sizeof total);
-  FOR(s, SOLES) {
-    const double *f = w + 6 * s, *p = d->frozen->soles + 3 * s;
-    FOR(i, 6) total[i] += f[i];
-    total[3] += p[1] * f[2] - p[2] * f[1];
-    total[4] += p[2] * f[0] - p[0] * f[2];
-    total[5] += p[0] * f[1] - p[1] * f[0];
-  }
+  ground_wrench_of(d->frozen, w, total);
 #endif
 #ifdef OUT_ground_wrench
   if (out[OUT_ground_wrench]) memcpy(COLUMN_OF(ground_wrench, 6), total, sizeof total);
@@ -77,7 +84,7 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
 /* the columns after `column` repeat it */
 static void repeat_column(const Record *record, int column) {
   const int begin = record->column + column, end = record->column + record->columns;
-  FOR(i, N_OUT) {
+  FOR(i, N_VALUES) {
     const int rows = ROWS[i];
     if (!rows || !record->out[i]) continue;
     const double *from = record->out[i] + (long)rows * begin;

@@ -22,7 +22,7 @@ from .generated import Tree, gamma_of
 if TYPE_CHECKING:
     from ..symbolic import SymbolicModel
 
-__all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes"]
+__all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_jacobians"]
 
 
 # where steps find their own length
@@ -51,6 +51,15 @@ def shapes_out(collision: SymbolicModel, outputs: tuple[str, ...], every: int) -
         rows = _rows(collision, name)
         shapes[name] = (columns, 1) if rows == 1 else (rows, columns)
     return {name: shapes[name] for name in outputs}
+
+
+def with_jacobians(shapes: dict[str, tuple[int, int]], nv: int) -> dict[str, tuple[int, int]]:
+    """Each followed by its Jacobians by q and v."""
+    made: dict[str, tuple[int, int]] = {}
+    for name, (rows, columns) in shapes.items():
+        made[name] = (rows, columns)
+        made |= dict.fromkeys((f"{name}_by_q", f"{name}_by_v"), (rows * columns, nv))
+    return made
 
 
 def _rows(collision: SymbolicModel, history: str) -> int:

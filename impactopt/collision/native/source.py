@@ -6,6 +6,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from ...codegen import NativeCode
+from ...errors import InputError
 from ..graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from .generated import (
     backwards,
@@ -14,12 +15,13 @@ from .generated import (
     tangent_back,
     tree_functions,
 )
-from .sizes import names_table, shapes_out, shapes_table, sizes
+from .lanes import tree_in_lanes
+from .sizes import names_table, shapes_out, shapes_table, sizes, with_jacobians
 
 if TYPE_CHECKING:
     from ..symbolic import SymbolicModel
 
-__all__ = ["native_collision", "native_gradient"]
+__all__ = ["native_collision", "native_gradient", "native_jacobian"]
 
 # the kernel's files of the steps, and of the way back
 _STEPS = {"events": ("taylor.h", "steps.h"), "rk4": ("rk4.h", "steps.h"), "implicit": ("implicit.h",)}
@@ -55,8 +57,20 @@ def native_gradient(collision: SymbolicModel, output: str) -> Any:
     )
 
 
+def native_jacobian(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
+    """C code of what `SymbolicModel.jacobian_function` gives, for implicit steps and one freeze."""
+
+    def none() -> Any:
+        raise InputError("jacobian_function: the C compiler failed, and nothing else computes it")
+
+    return NativeCode(
+        name="collision_jacobian", code=_code(collision, "collision_jacobian", outputs, every), graph=none
+    )
+
+
 def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: int) -> str:
     frozen, gradient = frozen_dynamics(collision), name == "collision_gradient"
+    jacobian = name == "collision_jacobian"
     ground = bool({"ground_wrench", "zmp"} & {*outputs})
     tree = tree_functions(frozen, collision.n_servos, ground=ground)
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
@@ -67,6 +81,13 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         scalars += backwards(scalars)
         by = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
         shapes |= dict.fromkeys(by, (collision.robot.nv, 1))
+    lanes: list[str] = []
+    if jacobian:
+        moved = tree_in_lanes(frozen, tree, ground=ground)
+        of_tree = [*of_tree, *[parts for parts, _ in moved]]
+        lanes = [_TREE[0], *[code for _, code in moved], _TREE[1]]
+        scalars += backwards([f for f in scalars if f.name() == "target_energy"])
+        shapes = with_jacobians(shapes, collision.robot.nv)
     folder = files(__package__)
 
     def text(*names: str) -> list[str]:
@@ -78,8 +99,10 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         c_code("tree", of_tree),
         _TREE[1],
         c_code("scalars", scalars),
-        f"#define GRADIENT {int(gradient)}\n#define NAME {name}\n#define OF_NAME(part) {name}_##part",
+        f"#define GRADIENT {int(gradient or jacobian)}",
+        f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",
         *text("vectors.h"),
+        *lanes,
         sizes(collision, outputs, every, tree),
         names_table("NAMES_OUT", shapes),
         shapes_table("SHAPES_OUT", shapes.values()),
@@ -87,5 +110,11 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
     ]
     method = collision.stepping
     files_used = ["freeze.h", "instant.h", "outputs.h", *_STEPS[method], "course.h"]
-    files_used += ["back.h", *_BACK[method], "freeze_back.h", "gradient.c"] if gradient else ["collision.c"]
+    if gradient:
+        files_used += ["back.h", *_BACK[method], "freeze_back.h", "gradient.c"]
+    elif jacobian:
+        forward = ["forward.h", "freeze_forward.h", "outputs_forward.h", "implicit_forward.h"]
+        files_used += ["results.h", *forward, "jacobian.c"]
+    else:
+        files_used += ["results.h", "collision.c"]
     return "\n".join([*parts, *text(*files_used, "interface.c")])

@@ -1,0 +1,52 @@
+/* Tangents: what moves with q and v, a direction a lane. The directions of q, in v's basis, are one kind and those of
+   v another; what is frozen of the inertia moves with q alone. Symbols as in freeze.h and implicit.h. */
+
+/* vectors of directions of a kind; how many of them at once, with how many rows, registers hold */
+#define VD ((NV + LANES - 1) / LANES)
+#if VD % 5 == 0 && LANES == 8
+#define WIDE 5
+#elif VD % 4 == 0 && LANES == 8
+#define WIDE 4
+#elif VD % 3 == 0
+#define WIDE 3
+#elif VD % 2 == 0
+#define WIDE 2
+#else
+#define WIDE 1
+#endif
+#define HIGH (LANES < 4 ? LANES : 4)
+/* joints and hand, and what fills the last vector of them */
+#define ROWS_OF_V (V * LANES)
+enum { BY_Q, BY_V };
+
+#define FOR_EACH(k) FOR(k, VD)
+
+typedef struct {
+  vec Q[ROWS_OF_V][N + 1][VD]; /* with q, as P and the soles */
+  vec P[C1][N + 1][VD];
+  vec soles[AT_LEAST_1(3 * SOLES)][VD];
+  vec drift[2][ROWS_OF_V][VD], L_0[2][C1][VD], hand_speed[2][VD], unmodelled[2][6][VD];
+} FrozenTangent;
+
+/* out += A x: A has a row of vectors for each of `count` rows of x, which like those of `out` are `width` vectors */
+INLINE void add_product(const vec (*A)[V], int count, const vec *x, int width, vec *out) {
+  for (int i = 0; i < ROWS_OF_V; i += HIGH)
+    for (int m = 0; m < width; m += WIDE) {
+      vec s[HIGH][WIDE];
+      FOR(a, HIGH) FOR(b, WIDE) s[a][b] = out[(i + a) * width + m + b];
+      FOR(j, count) {
+        const double *by = (const double *)A[j] + i;
+        const vec *of = x + j * width + m;
+        FOR(a, HIGH) FOR(b, WIDE) s[a][b] += by[a] * of[b];
+      }
+      FOR(a, HIGH) FOR(b, WIDE) out[(i + a) * width + m + b] = s[a][b];
+    }
+}
+
+INLINE vec either(int condition, vec yes, vec no) {
+  if (condition) return yes;
+  return no;
+}
+
+/* numbers, a direction each, from and to the lanes of a direction of v */
+INLINE double *lane(vec *x, int direction) { return (double *)x + direction; }

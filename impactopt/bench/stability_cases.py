@@ -52,6 +52,7 @@ class Rig:
     friction: bool = False
     paper: bool = False
     point: bool = False
+    method: str | None = None
     step: float | None = None
     horizon: float = 0.1
     seed: int = 0
@@ -60,6 +61,7 @@ class Rig:
     def name(self) -> str:
         kind = "paper" if self.paper else "point" if self.point else "SDC"
         kind += " with friction" if self.friction else ""
+        kind += f" by {self.method}" if self.method else ""
         return f"{self.robot}, {self.law}, {self.target}, {kind}" + (
             f", {self.step:g} s" if self.step else ""
         )
@@ -79,29 +81,35 @@ class Rig:
         if self.paper:
             return SDC.paper(**options)
         if self.point:
-            return VirtualMass(**options, step=self.step)
+            return VirtualMass(**options, method=self.method, step=self.step)
         friction = JointFriction(viscous=0.5, coulomb=1.0, transition=0.05) if self.friction else None
-        return SDC(**options, step=self.step, terms=Terms(friction=self.friction), friction=friction)
+        options |= {"method": self.method, "step": self.step}
+        return SDC(**options, terms=Terms(friction=self.friction), friction=friction)
 
 
-# steps for slow contacts, for fast and for the fastest
+# steps of a fixed length for slow contacts, for fast and for the fastest
 _FINE: dict[str, Any] = {"step": 1e-5, "horizon": 0.01}
 _FINEST: dict[str, Any] = {"step": 1e-6, "horizon": 1e-3}
+_TAYLOR: tuple[dict[str, Any], ...] = tuple({"method": "events", **s} for s in ({}, _FINE, _FINEST))
 RIGS = (
-    *(Rig(robot=r, **s) for r in ("arm", "slider") for s in ({}, _FINE, _FINEST)),
-    *(Rig(robot=r, **s) for r in ("bare arm", "whip", "mace") for s in ({}, _FINE, _FINEST)),
-    *(Rig(robot="arm", target=t, **s) for t in ("wall", "nail", "board") for s in ({}, _FINE)),
-    *(Rig(robot="arm", law=law, **s) for law in ("kelvin", "hertz", "hunt") for s in ({}, _FINE)),
-    Rig(robot="slider", law="hunt", target="wall", **_FINE),
+    *(Rig(robot=r) for r in ("arm", "slider", "bare arm", "whip", "mace")),
+    *(Rig(robot="arm", horizon=horizon) for horizon in (1e-3, 1.0)),
+    *(Rig(robot="arm", target=t) for t in ("wall", "nail", "board")),
+    Rig(robot="arm", law="kelvin"),
+    Rig(robot="whip", law="kelvin", target="nail"),
     Rig(robot="arm", friction=True),
-    Rig(robot="arm", paper=True),
     Rig(robot="walker", share=0.5),
-    Rig(robot="walker", share=0.3, **_FINE),
     Rig(robot="planar walker", share=0.1),
     Rig(robot="arm", point=True),
-    Rig(robot="whip", point=True, **_FINE),
+    Rig(robot="whip", point=True),
     Rig(robot="standin", share=0.25),
     Rig(robot="talos", share=0.25),
+    *(Rig(robot=r, **s) for r in ("arm", "mace") for s in _TAYLOR),
+    *(Rig(robot="arm", target=t, **_TAYLOR[1]) for t in ("wall", "nail", "board")),
+    Rig(robot="arm", friction=True, **_TAYLOR[0]),
+    *(Rig(robot="arm", law=law, **s) for law in ("hertz", "hunt") for s in ({}, _FINE)),
+    Rig(robot="slider", law="hunt", target="wall", **_FINE),
+    Rig(robot="arm", paper=True),
 )
 
 

@@ -70,12 +70,23 @@ def check_course(
     """
     length, method = collision.step_length, collision.stepping
     if not result.separated and result.duration < collision.horizon * (1 - 1e-9):
+        mend = (
+            "shorten the horizon, or give a larger tolerance"
+            if method == "implicit"
+            else "raise the horizon or give a shorter step, both of which make more steps"
+        )
         raise InputError(
             f"horizon [s]: the steps are used up by events after {result.duration:.3g} s, before the "
-            f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; raise the horizon "
-            "or give a shorter step, both of which make more steps"
+            f"horizon, {collision.horizon:g} s: joints saturate or slide again and again; {mend}"
         )
-    if result.duration == 0 or method == "implicit":
+    if result.duration == 0:
+        return
+    if method == "implicit":
+        if result.impulse < 0:
+            raise InputError(
+                f"v: the contact ends within {result.duration:.2g} s, where rounding hides its force: give one "
+                "that approaches faster"
+            )
         return
     if result.impulse < 0 or (method == "events" and _overshot(collision, result, data) > _OVERSHOT):
         raise InputError(

@@ -6,8 +6,10 @@
    beside that. */
 
 #define TERMS (STAGES + 1)
-/* of a full step, by which one goes on beyond an event, so that the next begins in the new phase */
+/* of a step up to an event, by which one goes on beyond it, so that the next begins in the new phase; and of a full
+   step, below which an event comes at once */
 #define JUST_BEYOND 1e-7
+#define AT_ONCE 1e-5
 /* of the stiffest of contact's modes, the first step; how much an error has to be below what is allowed for longer
    steps; error of a joint's demand, of its limit */
 #define FIRST_STEP 0.5
@@ -453,7 +455,9 @@ INLINE void make_series(const Data *d, const State *y, const Instant *now, const
 
 /* what a further term would add to the hand's speed and the joints' demands, of what is allowed */
 INLINE double error_of(const Data *d, const Series *s, double scale) {
-  double error = fabs(s->rate[STAGES]) * LEFT_OUT / (TOLERANCE * fmax(scale, fabs(s->rate[1])));
+  double error = fabs(s->rate[STAGES]) / fmax(scale, fabs(s->rate[1]));
+  error = fmax(error, fabs(s->impulse[STAGES]) / fmax(s->impulse[0], fabs(s->impulse[1])));
+  error *= LEFT_OUT / TOLERANCE;
 #if SATURATION
   vec most = {0};
   FOR(i, V) {
@@ -636,9 +640,10 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
     }
     const double end = fmin(1.0, left / h);
     find_event(d, y, &now, &s, end, &e);
-    /* events that follow each other at once: farther each time */
-    repeated = e.kind && e.at < 1e-6 && repeated < 7 ? repeated + 1 : 0;
-    const double theta = e.kind ? fmin(end, e.at + JUST_BEYOND * (1 << 3 * repeated)) : end;
+    /* events that follow each other at once, because rounding hides that they are over: farther each time */
+    repeated = e.kind && e.at < AT_ONCE && repeated < 8 ? repeated + 1 : 0;
+    const double beyond = JUST_BEYOND * fmax(e.at, AT_ONCE * (1 << 3 * repeated));
+    const double theta = e.kind ? fmin(end, e.at + beyond) : end;
     if (record) column = sample(d, y, &now, &s, &r.contact, h, theta, record, column);
     if (GRADIENT) {
       tape->states[made] = *y, tape->lengths[made] = h, tape->parts[made] = theta, tape->events[made] = e;

@@ -26,7 +26,7 @@ __all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "w
 
 
 # where steps find their own length
-_MOST_STEPS = 2000
+_MOST_STEPS = 5000
 
 
 def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:

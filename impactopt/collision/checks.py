@@ -84,8 +84,8 @@ def check_course(
     if method == "implicit":
         if result.impulse < 0:
             raise InputError(
-                f"v: the contact ends within {result.duration:.2g} s, where rounding hides its force: give one "
-                "that approaches faster"
+                f"v: the contact ends within {result.duration:.2g} s, where rounding hides its force: "
+                "give one that approaches faster"
             )
         return
     if result.impulse < 0 or (method == "events" and _overshot(collision, result, data) > _OVERSHOT):

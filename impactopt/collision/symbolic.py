@@ -401,8 +401,8 @@ class SymbolicModel(CollisionModel):
         return ExactCollision(self)
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
-        """[s] that steps of "events" and "rk4" have to stay below at q: 2.6 over the fastest mode's rate, with no
-        joint saturated.
+        """[s] that steps of "events" and "rk4" have to stay below at q: 2.6 over the fastest mode's rate, with
+        no joint saturated.
 
         InputError where what holds the robot cannot be told apart.
         """

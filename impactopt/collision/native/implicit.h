@@ -8,7 +8,7 @@
 #define TERMS (STAGES + 1)
 /* of a step up to an event, by which one goes on beyond it, so that the next begins in the new phase; and of a full
    step, below which an event comes at once */
-#define JUST_BEYOND 1e-7
+#define JUST_BEYOND 1e-9
 #define AT_ONCE 1e-5
 /* of the stiffest of contact's modes, the first step; how much an error has to be below what is allowed for longer
    steps; error of a joint's demand, of its limit */

@@ -251,7 +251,7 @@ def test_a_step_that_is_unstable_has_a_row_that_says_so(scene: Scene) -> None:
 
     found, refused = [], []
     maker = methods._ours(scene, quiet, found, refused)
-    maker("sdc", "0.01 s", lambda: scene.model(SDC, step=0.01, kd=1e3))
+    maker("sdc", "0.01 s", lambda: scene.model(SDC, method="events", step=0.01, kd=1e3))
     assert not found and "unstable" in refused[0]["note"]
 
 

@@ -18,12 +18,13 @@ from impactopt.reference import FullDynamics
 __all__ = ["Entry", "entries"]
 
 PAPER_STEPS = (1e-3, 1e-4, 1e-5, 2e-6)  # [s]; 1e-6 would be more steps than a model allows
-OUR_STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)
+TAYLOR_STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)
+OUR_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10)
 FREEZES = (1, 2, 4, 8)
 FULL_STEPS = (4e-4, 2e-4, 1e-4)
 MUJOCO_STEPS = (1e-3, 2e-4, 1e-4, 5e-5)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
-COLUMN = 1e-4  # [s] between instants of the histories, where steps are shorter
+COLUMN = 1e-3  # [s] between instants of the histories, the same for all that are not longer steps
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,14 +48,18 @@ def entries(scene: Scene, true: Collision, say: Say, quick: bool) -> tuple[list[
     found: list[Entry] = []
     refused: list[dict[str, Any]] = []
     case, ours = scene.case, _ours(scene, say, found, refused)
-    ours("virtual mass", "2.5e-4 s", lambda: scene.model(VirtualMass))
+    usual = f"tolerance {scene.model(SDC).tolerance:g}"
+    ours("virtual mass", usual, lambda: scene.model(VirtualMass))
     paper = partial(scene.model, SDC.paper)
     for step in (1e-4,) if quick else PAPER_STEPS:
         ours("paper, by hand", f"{step:g} s", partial(_stepped, paper, step))
-    for step in (2.5e-4,) if quick else OUR_STEPS:
-        ours("sdc", f"{_plain(step)} s", partial(scene.model, SDC, step=step))
+    for tolerance in (1e-6,) if quick else OUR_TOLERANCES:
+        ours("sdc", f"tolerance {tolerance:g}", partial(scene.model, SDC, tolerance=tolerance))
+    for step in (2.5e-4,) if quick else TAYLOR_STEPS:
+        taylor = partial(scene.model, SDC, method="events", step=step)
+        ours("sdc, Taylor's steps", f"{_plain(step)} s", taylor)
     for freezes in (2,) if quick else FREEZES:
-        ours(f"sdc, {freezes} freezes", "2.5e-4 s", partial(scene.model, SDC, freezes=freezes))
+        ours(f"sdc, {freezes} freezes", usual, partial(scene.model, SDC, freezes=freezes))
     found += _by_graph(scene, paper, say)
     exact = scene.model(SDC, method="exact")
     frozen = exact.collide(case.q, case.v, case.torque)
@@ -81,7 +86,7 @@ def _ours(
         try:
             model = make()
             longest = model.stable_step(case.q)
-            if model.step_length >= longest:
+            if model.stepping != "implicit" and model.step_length >= longest:
                 raise InputError(f"unstable: the longest stable step is {longest:.2g} s")
         except InputError as error:
             refused.append({"method": method, "setting": setting, "note": str(error)})
@@ -106,7 +111,8 @@ def _plain(step: float) -> str:
 def _by_graph(scene: Scene, paper: Callable[..., Any], say: Say) -> list[Entry]:
     """The paper's scheme and ours by CasADi's route: from the graph to C, at -O1."""
     made = []
-    for method, model in (("paper, CasADi's C", paper()), ("sdc, CasADi's C", scene.model(SDC))):
+    taylor = scene.model(SDC, method="events")
+    for method, model in (("paper, CasADi's C", paper()), ("sdc, CasADi's C", taylor)):
         say(f"{scene.name}: {method}")
         wanted = tuple(name for name in EVALUATION if name in model.available)
         run = runner(graph(model, wanted), inputs(model, scene.case))

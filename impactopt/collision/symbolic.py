@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import ceil
 from typing import Any
 
 import casadi as ca
@@ -96,7 +97,9 @@ class SymbolicModel(CollisionModel):
             raise InputError(f"step [s]: {self.step_length:g}; give a number > 0")
         if self.step_length > self.horizon:
             raise InputError(f"step [s]: {self.step_length:g} is longer than the horizon, {self.horizon:g} s")
-        steps = number_of_steps(self)
+        steps = (
+            ceil(self.horizon / self.step_length) if self.stepping == "implicit" else number_of_steps(self)
+        )
         if self.method != "exact" and steps > _MOST_STEPS:
             raise InputError(
                 f"step [s]: {self.step_length:g} takes {steps} steps to the horizon, {self.horizon:g} s, and "
@@ -401,8 +404,8 @@ class SymbolicModel(CollisionModel):
         return ExactCollision(self)
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
-        """[s] that steps of "events" and "rk4" have to stay below at q: 2.6 over the fastest mode's rate, with
-        no joint saturated.
+        """[s] that steps of "events" and "rk4" have to stay below at q: 2.6 over the fastest rate, with no
+        joint saturated.
 
         InputError where what holds the robot cannot be told apart.
         """

@@ -241,16 +241,15 @@ static void instant_forward(const Linear *l, double part, const vec *dpart, cons
   double p[TERMS], slope[TERMS];
   powers(part, p);
   slopes(part, slope);
+  FOR(i, SPEEDS_OF_COLUMNS ? N : 0) {
+    double speed = 0.0;
+    for (int j = 1; j < TERMS; j++) speed += slope[j] * ((const double *)s->speeds[j])[i];
+    FOR_EACH(k) x->speeds[i][k] = ALONG(t->speeds, [i][k]) + speed * dpart[k];
+  }
   FOR(i, N) {
-    double speed = 0.0, demand = 0.0;
-    for (int j = 1; j < TERMS; j++) {
-      speed += slope[j] * ((const double *)s->speeds[j])[i];
-      demand += slope[j] * ((const double *)s->demand[j])[i];
-    }
-    FOR_EACH(k) {
-      x->speeds[i][k] = ALONG(t->speeds, [i][k]) + speed * dpart[k];
-      x->demand[i][k] = ALONG(t->demand, [i][k]) + demand * dpart[k];
-    }
+    double demand = 0.0;
+    for (int j = 1; j < TERMS; j++) demand += slope[j] * ((const double *)s->demand[j])[i];
+    FOR_EACH(k) x->demand[i][k] = ALONG(t->demand, [i][k]) + demand * dpart[k];
   }
   FOR_EACH(k) {
     x->penetration[k] = ALONG(t->penetration, [k]) + change(s->penetration, slope) * dpart[k];

@@ -4,7 +4,13 @@ typedef struct {
   double **by[2]; /* where each output's derivatives go: a column a direction, with the output column by column */
 } RecordTangent;
 
-/* what the columns need of an instant's tangent */
+#if FRICTION || defined(OUT_joint_velocity)
+#define SPEEDS_OF_COLUMNS 1
+#else
+#define SPEEDS_OF_COLUMNS 0
+#endif
+
+/* what the columns need of an instant's tangent; of speeds, only where they are asked for */
 typedef struct {
   vec speeds[ROWS_OF_V][VD], demand[N1][VD];
   vec penetration[VD], rate[VD], force[VD], target_speed[VD], time[VD];

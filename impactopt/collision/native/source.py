@@ -32,6 +32,8 @@ _BACK = {
 }
 # the tree's code is long and straight: -O1 makes it 5 % faster, and takes three times as long to compile
 _TREE = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
+# with a direction a lane, without anything but sums and products: there only the time to compile it counts
+_LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
 
 def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
@@ -85,7 +87,7 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
     if jacobian:
         moved = tree_in_lanes(frozen, tree, ground=ground)
         of_tree = [*of_tree, *[parts for parts, _ in moved]]
-        lanes = [_TREE[0], *[code for _, code in moved], _TREE[1]]
+        lanes = [_LANES[0], *[code for _, code in moved], _LANES[1]]
         scalars += backwards([f for f in scalars if f.name() == "target_energy"])
         shapes = with_jacobians(shapes, collision.robot.nv)
     folder = files(__package__)

@@ -41,52 +41,65 @@ static void roots(const double *q, const double *v, const double *normal, Frozen
   FOR(i, HELD_NONZEROS) to[HELD_AT[i]] = held[i];
 }
 
-/* Cholesky's factor of the Delassus matrix, and Z */
+/* Cholesky's factor of the Delassus matrix, and Z: row by row, as U = D L' of G = L D L', so that only divisions,
+   and no roots, wait for one another */
 static void hold(Frozen *F) {
-  double G[C1][VC * LANES];
+  vec U[C1][VC];
+  double inverse[C1];
   FOR(c, C) {
-    vec s[VC] = {0};
+    vec u[VC] = {0}, z[V] = {0};
     for (int k = HELD_ROWS[c]; k < HELD_ROWS[c + 1]; k++) {
       const int r = HELD_ROW[k];
-      FOR(i, VC) s[i] += ((double *)F->held[r])[c] * F->held[r][i];
+      const double w = ((double *)F->held[r])[c];
+      FOR(i, VC) u[i] += w * F->held[r][i];
+      FOR(i, V) z[i] += w * F->root[r][i];
     }
-    memcpy(G[c], s, sizeof s);
-    G[c][c] += GAMMA[c];
-    vec z[V] = {0};
-    for (int k = HELD_ROWS[c]; k < HELD_ROWS[c + 1]; k++) {
-      const int r = HELD_ROW[k];
-      FOR(i, V) z[i] += ((double *)F->held[r])[c] * F->root[r][i];
+    FOR(k, c) {
+      const double l = ((double *)U[k])[c] * inverse[k];
+      FOR(i, VC) u[i] -= l * U[k][i];
+      FOR(i, V) z[i] -= l * F->Z[k][i];
     }
+    FOR(i, VC) U[c][i] = u[i];
     FOR(i, V) F->Z[c][i] = z[i];
+    inverse[c] = 1.0 / (((double *)U[c])[c] + GAMMA[c]);
   }
-  FOR(c, C) FOR(k, c + 1) {
-    double s = G[c][k];
-    FOR(i, k) s -= F->R[c][i] * F->R[k][i];
-    F->R[c][k] = k < c ? s * F->R[k][k] : 1.0 / sqrt(s);
-  }
-  FOR(i, V) {
-    FOR(c, C) {
-      vec s = F->Z[c][i];
-      FOR(k, c) s -= F->R[c][k] * F->Z[k][i];
-      F->Z[c][i] = s * F->R[c][c];
-    }
+  FOR(c, C) {
+    const double scale = F->R[c][c] = sqrt(inverse[c]);
+    for (int k = c + 1; k < C; k++) F->R[k][c] = ((double *)U[c])[k] * scale;
+    FOR(i, V) F->Z[c][i] *= scale;
+    F->Z[c][V - 1] = to_hand(F->Z[c][V - 1]);
   }
 }
 
-static void inverse_inertia(Frozen *F) {
-  /* the lanes beyond the hand belong to the other velocities */
-  double ones[V * LANES] __attribute__((aligned(64)));
-  FOR(i, V * LANES) ones[i] = i <= N;
-  const vec *kept = (const vec *)ones;
-  FOR(c, C) F->Z[c][V - 1] *= kept[V - 1];
-  FOR(j, N + 1) {
+/* rows of Q, from vector `first` on */
+INLINE void rows_of_inertia(Frozen *F, int first, int begin, int end) {
+  for (int j = begin; j < end; j++) {
     vec s[V] = {0};
     for (int k = ROOT_ROWS[j]; k < ROOT_ROWS[j + 1]; k++) {
       const int r = ROOT_ROW[k];
-      FOR(i, V) s[i] += ((double *)F->root[r])[j] * F->root[r][i];
+      const double w = ((double *)F->root[r])[j];
+      for (int i = first; i < V; i++) s[i] += w * F->root[r][i];
     }
-    FOR(c, C) FOR(i, V) s[i] -= ((double *)F->Z[c])[j] * F->Z[c][i];
-    FOR(i, V) F->Q[j][i] = s[i] * kept[i];
+    FOR(c, C) {
+      const double z = ((double *)F->Z[c])[j];
+      for (int i = first; i < V; i++) s[i] -= z * F->Z[c][i];
+    }
+    s[V - 1] = to_hand(s[V - 1]);
+    for (int i = first; i < V; i++) F->Q[j][i] = s[i];
+  }
+}
+
+/* the upper triangle by vectors, and its mirror image */
+static void inverse_inertia(Frozen *F) {
+#define ROWS_FROM(b, count) \
+  if (V > b) rows_of_inertia(F, b, (b) * LANES, V > (b) + count ? ((b) + count) * LANES : N + 1);
+  ROWS_FROM(0, 1) ROWS_FROM(1, 1) ROWS_FROM(2, 1) ROWS_FROM(3, 1)
+  ROWS_FROM(4, 1) ROWS_FROM(5, 1) ROWS_FROM(6, 1) ROWS_FROM(7, V)
+  for (int b = 1; b < V; b++) FOR(a, b) {
+    vec x[LANES];
+    FOR(i, LANES) x[i] = F->Q[a * LANES + i][b];
+    transpose(x);
+    FOR(i, LANES) if (b * LANES + i <= N) F->Q[b * LANES + i][a] = x[i];
   }
 }
 
@@ -103,18 +116,18 @@ static void times_root_transposed(const Frozen *F, const double *x, double *out)
 static void meeting(const double *v, double yields, Frozen *F) {
   memcpy(F->drift_velocity, v, NV * sizeof(double));
 #if BIAS || JDOT
-  double y[C1], inner[NV], change[NV];
+  /* P j' is in Q for the joints, and the other velocities have no roots but their own */
+  double y[C1], inner[AT_LEAST_1(NV - N)];
   FOR(c, C) y[c] = ((double *)F->Z[c])[N];
   SOLVE_TRANSPOSED(F, y, double)
-  FOR(r, NV) {
-    inner[r] = ((double *)F->root[r])[N];
-    FOR(c, C) inner[r] -= ((double *)F->held[r])[c] * y[c];
-  }
-  times_root_transposed(F, inner, change);
-  const double m = ((double *)F->Q[N])[N];
+  vec held_y[VC];
+  pad(held_y, VC, y, C, 0.0);
+  const double *of_hand = (const double *)F->Q[N];
   const double approach = F->hand_speed < 0.0 ? 0.0 : F->hand_speed;
-  const double impulse = approach / (m + yields);
-  FOR(i, NV) F->drift_velocity[i] -= change[i] * impulse;
+  const double impulse = approach / (of_hand[N] + yields);
+  FOR(r, NV - N) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
+  FOR(i, NV - N) FOR(r, i + 1) F->drift_velocity[i] -= ((double *)F->root[r])[COLUMN(i)] * inner[r] * impulse;
+  FOR(j, N) F->drift_velocity[NV - N + j] -= of_hand[j] * impulse;
 #endif
 }
 
@@ -135,12 +148,15 @@ static void drifts(const double *q, const double *normal, Frozen *F) {
   };
   drift(in, out, 0, 0, 0);
 #if BIAS
-  vec x[VF] = {0};
+  vec x[VF] = {0}, pushed[VC] = {0}, sum_of[V] = {0};
   FOR(i, NV) ((double *)x)[COLUMN(i)] = bias[i];
-  times_root(F, x, F->bias_root);
-  FOR(c, C) for (int k = HELD_ROWS[c]; k < HELD_ROWS[c + 1]; k++)
-    push[c] += ((double *)F->held[HELD_ROW[k]])[c] * F->bias_root[HELD_ROW[k]];
-  FOR(r, NV) FOR(i, V) F->drift[i] -= F->bias_root[r] * F->root[r][i];
+  FOR(r, NV) {
+    const double b = F->bias_root[r] = dot(F->root[r], x, VF);
+    FOR(i, V) sum_of[i] -= b * F->root[r][i];
+    FOR(i, VC) pushed[i] += b * F->held[r][i];
+  }
+  FOR(i, V) F->drift[i] = sum_of[i];
+  FOR(c, C) push[c] = ((double *)pushed)[c];
 #endif
 #if JDOT
   FOR(c, C) push[c] -= of_held[c];
@@ -163,12 +179,11 @@ static void wrenches(Frozen *F) {
   vec y[C1][V];
   memset(F->wrench, 0, sizeof F->wrench);
   memcpy(y, F->Z, sizeof y);
-  FOR(i, V) {
-    for (int c = C - 1; c >= 0; c--) {
-      vec s = y[c][i];
-      for (int k = c + 1; k < C; k++) s -= F->R[k][c] * y[k][i];
-      y[c][i] = s * F->R[c][c];
-    }
+  for (int c = C - 1; c >= 0; c--) {
+    vec s[V];
+    FOR(i, V) s[i] = y[c][i];
+    for (int k = c + 1; k < C; k++) FOR(i, V) s[i] -= F->R[k][c] * y[k][i];
+    FOR(i, V) y[c][i] = s[i] * F->R[c][c];
   }
   FOR(j, N + 1) FOR(c, C) ((double *)F->wrench[j])[c] = -((double *)y[c])[j];
 #endif
@@ -185,8 +200,15 @@ static void freeze(const double *q, const double *v, const double *normal, doubl
 
 /* wrench of all that is held for a torque, a force at the hand and the drift's weight */
 static void wrench_of(const Frozen *F, const double *torque, double force, double weight, vec *out) {
-  FOR(i, VC) out[i] = weight * F->L_0[i] - force * F->wrench[N][i];
-  FOR(j, N) FOR(i, VC) out[i] += torque[j] * F->wrench[j][i];
+  vec a[VC], b[VC] = {0};
+  FOR(i, VC) a[i] = weight * F->L_0[i] - force * F->wrench[N][i];
+  int j = 0;
+  for (; j + 1 < N; j += 2) {
+    FOR(i, VC) a[i] += torque[j] * F->wrench[j][i];
+    FOR(i, VC) b[i] += torque[j + 1] * F->wrench[j + 1][i];
+  }
+  if (N % 2) FOR(i, VC) a[i] += torque[N - 1] * F->wrench[N - 1][i];
+  FOR(i, VC) out[i] = a[i] + b[i];
 }
 
 /* change of v (nv) from integrals of torque and force over a time; or of position, from second integrals */

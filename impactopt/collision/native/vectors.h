@@ -40,6 +40,13 @@ INLINE vec choose(bits condition, vec yes, vec no) {
 #else
 #define SHUFFLED(x, ...) __builtin_shuffle(x, (bits){__VA_ARGS__})
 #endif
+#if LANES == 8
+#define LANE_NUMBERS 0, 1, 2, 3, 4, 5, 6, 7
+#elif LANES == 4
+#define LANE_NUMBERS 0, 1, 2, 3
+#else
+#define LANE_NUMBERS 0, 1
+#endif
 INLINE double sum(vec x) {
 #if LANES == 8
   x += SHUFFLED(x, 4, 5, 6, 7, 0, 1, 2, 3);
@@ -65,6 +72,30 @@ INLINE int any(bits x) {
   return found != 0;
 #endif
 }
+/* a square of numbers, a row a vector, to its transpose: halves change places, then halves of these */
+INLINE void transpose(vec *x) {
+#ifdef __clang__
+  vec y[LANES];
+  FOR(i, LANES) FOR(k, LANES) y[i][k] = x[k][i];
+  FOR(i, LANES) x[i] = y[i];
+#else
+  const bits lane = {LANE_NUMBERS};
+#pragma GCC unroll 8
+  for (int h = LANES / 2; h; h /= 2) {
+    const bits low = lane + ((lane & h) != 0 & (LANES - h)), high = low + h;
+    vec y[LANES];
+#pragma GCC unroll 8
+    FOR(i, LANES) y[i] = i & h ? __builtin_shuffle(x[i - h], x[i], high) : __builtin_shuffle(x[i], x[i + h], low);
+#pragma GCC unroll 8
+    FOR(i, LANES) x[i] = y[i];
+  }
+#endif
+}
+/* of a row's vector V - 1: zeros beyond the hand, where other velocities may lie */
+#define to_hand(x) ((vec)((bits)(x) & ((bits){LANE_NUMBERS} <= (long long)(N % LANES))))
+/* Through a pointer of which the compiler knows nothing: where it knows that what lies behind has not changed, it
+   keeps hundreds of vectors for the next time, which are copies on the stack, made and read again. */
+#define AFRESH(pointer) __asm__ volatile("" : "+r"(pointer))
 /* numbers into the first lanes, and `rest` into the others */
 INLINE void pad(vec *to, int count, const double *from, int n, double rest) {
   double *x = (double *)to;

@@ -43,6 +43,7 @@ INLINE double call(int (*f)(const double **, double **, long long *, double *, i
 /* u and the hand's speed, from integrals of torque and force, and time; or from derivatives of them */
 INLINE double velocity(const Data *d, const vec *torque, double impulse, double time, vec *u) {
   const Frozen *F = d->frozen;
+  AFRESH(F);
   const double *x = (const double *)torque;
   vec a[V], b[V];
 #if BIAS || JDOT
@@ -111,6 +112,7 @@ INLINE void torques(const Data *d, Instant *now) {
 
 /* velocities, rate of penetration and servo at a state */
 INLINE void look(const Data *d, const State *y, Instant *now) {
+  AFRESH(d);
   now->speed = velocity(d, y->torque, y->impulse, y->time, now->u) + d->hand_speed;
   now->target_speed = call(target_velocity, y->target, d->target, 0);
   now->rate = now->speed - now->target_speed;

@@ -10,11 +10,11 @@ typedef struct {
 #define SPEEDS_OF_COLUMNS 0
 #endif
 
-/* what the columns need of an instant's tangent; of speeds, only where they are asked for */
+/* of a state, and what one sees of it; in columns, of speeds only those that are asked for, and the hand's */
 typedef struct {
-  vec speeds[ROWS_OF_V][VD], demand[N1][VD];
-  vec penetration[VD], rate[VD], force[VD], target_speed[VD], time[VD];
-} InstantTangent;
+  vec speeds[ROWS_OF_V][VD], demand[N1][VD], target[NZ1][VD];
+  vec impulse[VD], penetration[VD], time[VD], peak[VD], rate[VD], force[VD], target_speed[VD];
+} StateTangent;
 
 INLINE void put(const vec (*x)[VD], int rows, int columns, int column, double *to) {
   FOR(way, NV) FOR(i, rows) to[(long)way * rows * columns + (long)rows * column + i] = ((const double *)x[i])[way];
@@ -23,7 +23,7 @@ INLINE void put(const vec (*x)[VD], int rows, int columns, int column, double *t
   if (by[OUT_##name]) put((const vec(*)[VD])(x), rows, N_COLUMNS[0], column, by[OUT_##name])
 
 static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F, const vec (*P)[V], int kind,
-                          const Instant *at, double force, const InstantTangent *x, const RecordTangent *record,
+                          const Instant *at, double force, const StateTangent *x, const RecordTangent *record,
                           int column) {
   double **by = record->by[kind];
 #ifdef OUT_time

@@ -69,9 +69,8 @@ def describe(
         "target": type(collision.target).__name__,
         "outputs": list(outputs),
         "method": collision.stepping,
-        "step_s": collision.step_length,
+        **_steps(collision),
         "horizon_s": collision.horizon,
-        "most_steps": number_of_steps(collision),
         "freezes": 1 + collision.n_freezes,
         "inputs": ["q", "v", *(["feedforward"] if collision.terms.feedforward else []), *parameters],
         "fixed_numbers": [name for name in settings if name not in parameters],
@@ -81,7 +80,11 @@ def describe(
 
 
 def instructions(collision: SymbolicModel, outputs: tuple[str, ...]) -> dict[str, int]:
-    """Scalar instructions of one freeze and one step, as CasADi counts them."""
+    """Scalar instructions of one freeze and one step of the graph, as CasADi counts them.
+
+    An implicit step, in C alone, has the freeze of the graph, and in place of its step one that costs some half
+    as much again.
+    """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     whole = ("L_tau", "L_f", "L_0", "drift_velocity") if collision.n_freezes else ()
     names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs), *whole)))
@@ -89,6 +92,12 @@ def instructions(collision: SymbolicModel, outputs: tuple[str, ...]) -> dict[str
     method, length = collision.of_graph
     step = METHODS[method](model, length)
     return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}
+
+
+def _steps(collision: SymbolicModel) -> dict[str, float]:
+    if collision.stepping == "implicit":
+        return {"tolerance": collision.tolerance, "histories_every_s": collision.step_length}
+    return {"step_s": collision.step_length, "most_steps": number_of_steps(collision)}
 
 
 def independent_joints(collision: SymbolicModel) -> list[str]:

@@ -1,19 +1,19 @@
 /* Tangents: what moves with q and v, a direction a lane. The directions of q, in v's basis, are one kind and those of
    v another; what is frozen of the inertia moves with q alone. Symbols as in freeze.h and implicit.h. */
 
-/* vectors of directions of a kind; how many of them at once, with how many rows, registers hold */
-#define VD ((NV + LANES - 1) / LANES)
-#if VD % 5 == 0 && LANES == 8
+/* vectors of directions of a kind, VD; products take as many of them at once, WIDE, with as many rows, HIGH, as
+   registers hold, so that some numbers of vectors are filled up */
+#define NEEDED ((NV + LANES - 1) / LANES)
+#if LANES == 8 && NEEDED % 5 == 0
 #define WIDE 5
-#elif VD % 4 == 0 && LANES == 8
+#elif LANES == 8 && NEEDED > 3 && NEEDED % 3
 #define WIDE 4
-#elif VD % 3 == 0
+#elif NEEDED % 3 == 0
 #define WIDE 3
-#elif VD % 2 == 0
-#define WIDE 2
 #else
-#define WIDE 1
+#define WIDE (NEEDED > 1 ? 2 : 1)
 #endif
+#define VD ((NEEDED + WIDE - 1) / WIDE * WIDE)
 #define HIGH (LANES < 4 ? LANES : 4)
 /* joints and hand, and what fills the last vector of them */
 #define ROWS_OF_V (V * LANES)

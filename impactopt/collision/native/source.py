@@ -121,7 +121,8 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
     if gradient:
         files_used += ["back.h", *_BACK[method], "freeze_back.h", "gradient.c"]
     elif jacobian:
-        forward = ["forward.h", "freeze_forward.h", "outputs_forward.h", "implicit_forward.h"]
+        parts_of_way = ("freeze", "outputs", "implicit", "course")
+        forward = ["forward.h", *(f"{name}_forward.h" for name in parts_of_way)]
         files_used += ["results.h", *forward, "jacobian.c"]
     else:
         files_used += ["results.h", "collision.c"]

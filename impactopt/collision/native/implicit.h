@@ -129,11 +129,10 @@ static double falling_root(const double *b) {
     const double x = bernstein(b, t, &slope);
     if (x > 0.0) low = t;
     else high = t;
-    double next = t - x / slope;
-    if (!(next > low && next < high)) next = (low + high) / 2;
-    const double moved = fabs(next - t);
-    t = next;
-    if (moved <= 4e-16 * t || high - low <= 4e-16 * high) break;
+    const double next = t - x / slope;
+    /* the error goes with the square of the way made last; beyond a bound is what rounding has left */
+    if (slope < 0.0 && fabs(next - t) <= 1e-10 * fmax(t, 1e-4)) return fmin(fmax(next, low), high);
+    t = next > low && next < high ? next : (low + high) / 2;
   }
   return t;
 }

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.resources import files
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 __all__ = ["Batch"]
 
 Array = NDArray[np.float64]
-# slices a thread: collisions differ in length, and a thread that is done takes the next slice
-_SLICES = 4
 _ALIGNED = 8  # doubles
 
 
@@ -111,25 +110,38 @@ class Batch:
 
 # ---------------------------------------------------------------- running
 def _in_threads(loop: Any, work: int, rows: list[Array], found: list[Array], threads: int) -> None:
-    doubles, count = ctypes.POINTER(ctypes.c_double), found[0].shape[0]
-    Pointers, Steps = doubles * len(rows), ctypes.c_longlong * len(rows)
-    arg = Pointers(*[x.ctypes.data_as(doubles) for x in rows])
-    arg_step = Steps(*[0 if x.shape[0] == 1 else x.shape[1] for x in rows])
-    res = (doubles * len(found))(*[x.ctypes.data_as(doubles) for x in found])
-    res_step = (ctypes.c_longlong * len(found))(*[x.shape[1] for x in found])
-    slices = min(count, 1 if threads == 1 else _SLICES * threads)
-    ends = [count * k // slices for k in range(slices + 1)]
+    count, steps, pointers = found[0].shape[0], ctypes.c_longlong, ctypes.c_void_p
+    arg = (pointers * len(rows))(*[x.ctypes.data for x in rows])
+    arg_step = (steps * len(rows))(*[0 if x.shape[0] == 1 else x.shape[1] for x in rows])
+    res = (pointers * len(found))(*[x.ctypes.data for x in found])
+    res_step = (steps * len(found))(*[x.shape[1] for x in found])
+    slices = _slices(count, threads)
 
-    def run(begin: int, end: int) -> None:
+    def run() -> None:
         memory = np.empty(work + _ALIGNED)
-        place = memory.ctypes.data_as(doubles)
-        loop(ctypes.c_longlong(begin), ctypes.c_longlong(end), arg, arg_step, res, res_step, place)
+        place = pointers(memory.ctypes.data)
+        # a thread that is done with one takes the next; the interpreter's lock gives it to one only
+        for begin, end in slices:
+            loop(steps(begin), steps(end), arg, arg_step, res, res_step, place)
 
-    if threads == 1:
-        run(0, count)
-        return
-    with ThreadPoolExecutor(max_workers=threads) as pool:
-        list(pool.map(run, ends[:-1], ends[1:]))
+    # the calling thread works too: no pool, whose start takes as long as ten collisions
+    others = [threading.Thread(target=run) for _ in range(min(threads, count) - 1)]
+    for thread in others:
+        thread.start()
+    try:
+        run()
+    finally:
+        for thread in others:
+            thread.join()
+
+
+def _slices(count: int, threads: int) -> Iterator[tuple[int, int]]:
+    """Begins and ends, ever closer: collisions differ in length, and all threads are to end together."""
+    ends = [0]
+    while ends[-1] < count:
+        left = count - ends[-1]
+        ends.append(ends[-1] + (left if threads == 1 else -(-left // (2 * threads))))
+    return iter([*pairwise(ends)])
 
 
 def _one_by_one(function: Any, rows: list[Array], found: list[Array]) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 import small_robots
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_native import FRICTION, LAW, TARGET, sdc, situation
 
 from impactopt._compiler import find_compiler
@@ -21,6 +23,7 @@ from impactopt.errors import InputError
 from impactopt.plotting.pareto import front, pareto_picture
 from impactopt.plotting.scaling import scaling_picture
 from impactopt.plotting.skip import skip_picture
+from impactopt.plotting.style import STYLE
 from impactopt.presets import standin
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -291,23 +294,90 @@ def test_joints_that_are_locked_keep_their_places() -> None:
 
 @compiled
 def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -> None:
-    report = scaling.run(
+    numbers = scaling.run(
         quiet,
         chains=(2, 4),
         trees=(8,),
         humanoids=(),
         scene=scene,
         steps=(2.5e-4,),
+        tolerances=(1e-3, 1e-6),
         batches=(1, 20),
+        workers=1,
         repeats=3,
-    )
-    rows = report.numbers["rows"]
+    ).numbers
+    rows = numbers["rows"]
     assert {r["over"] for r in rows} == {"dof", "step", "batch"}
-    small, large = (r for r in rows if r.get("robot") == "chain")
-    assert large["paper_once"] > small["paper_once"] and large["n"] == 4
-    steps = [r for r in rows if r["over"] == "step" and r["method"] == "events"]
-    assert steps and all(r["integration_error"] < 1e-6 for r in steps if r["step_s"] <= 2.5e-4)
-    assert len(scaling_picture(rows).axes) == 3
+    dof = [r for r in rows if r["over"] == "dof"]
+    assert [(r["robot"], r["n"]) for r in dof] == [("chain", 2), ("chain", 4), ("tree", 8)]
+    for r in dof:
+        assert 0 < r["freeze_us"] < r["time_us"]
+    assert dof[0]["stage_us"] is None and 0 < dof[2]["stage_us"] < dof[2]["loop_us"]
+    assert dof[1]["paper_once"] > dof[0]["paper_once"]
+    errors = {(r["method"], r["tolerance"]): r["integration_error"] for r in rows if r["over"] == "step"}
+    assert errors["events", None] < 1e-6 and errors["rk4", None] < 1e-3
+    assert errors["implicit", 1e-6] < 1e-4 and [r["default"] for r in rows if "default" in r].count(True) == 1
+
+
+def test_a_hand_that_goes_away_is_frozen_and_no_more() -> None:
+    for one in (scaling.tip_scene("chain", 4), scaling.tip_scene("tree", 8)):
+        model = one.model(SDC)
+        case = scaling.parted(one.case)
+        away = model.collide(case.q, case.v, case.torque)
+        assert away.impulse == away.duration == 0.0
+        hit = model.collide(one.case.q, one.case.v, one.case.torque)
+        assert hit.impulse > 0.1 and hit.duration < 0.05
+
+
+def made_up(kind: str, n: int, power: float) -> dict[str, Any]:
+    time = 1e-3 * n**power
+    counts = {"paper_once": 15.0 * n**3, "paper_stage": 2.0 * n**2}
+    times = {
+        "time_us": 3 * time,
+        "freeze_us": time,
+        "loop_us": 2 * time,
+        "stage_us": time if n < 64 else None,
+    }
+    return {"over": "dof", "robot": kind, "n": n, **times, **counts}
+
+
+def test_exponents_are_those_of_the_upper_half() -> None:
+    # below 20 joints all costs the same
+    rows = [made_up("chain", n, 2.5 if n > 20 else 0.0) for n in (2, 4, 8, 32, 64, 100)]
+    found = {r["part"]: r for r in scaling.exponents(rows)}
+    assert found["a stage"]["from"] == 8 and found["a stage"]["to"] == 32  # it is not measured beyond
+    for part, paper in (("freeze", 3.0), ("time loop", 2.0)):
+        assert found[part]["exponent"] == pytest.approx(2.5) and found[part]["paper"] == pytest.approx(paper)
+        assert found[part]["from"] == 32 and found[part]["to"] == 100
+    assert scaling.exponents(rows[:1]) == []
+
+
+def test_legends_of_scaling_leave_the_data_free() -> None:
+    rows = [made_up("chain", n, 2.6) for n in (2, 8, 32, 100)] + [made_up("tree", n, 2.1) for n in (8, 100)]
+    rows += [made_up(name, n, 2.3) for name, n in (("standin", 28), ("talos", 30), ("g1", 29))]
+    powers = scaling.exponents(rows)
+    for method, time in (("events", 3.0), ("rk4", 2.0)):
+        for step in (1e-5, 1e-4, 5e-4):
+            row = {"over": "step", "robot": "standin", "method": method, "step_s": step, "tolerance": None}
+            row |= {"time_us": time / step / 100, "integration_error": 10 * step**2, "default": False}
+            rows.append(row | {"paper_operations": 1e3 / step})
+    for tolerance in (1e-4, 1e-6, 1e-10):
+        row = {"over": "step", "robot": "standin", "method": "implicit", "step_s": None, "time_us": 25.0}
+        row |= {"tolerance": tolerance, "default": tolerance == 1e-6, "integration_error": tolerance / 100}
+        rows.append(row)
+    for size in (1, 10, 100, 1000):
+        for threads in (1, 2):
+            rate = 4e4 * threads * size / (size + 10)
+            rows.append({"over": "batch", "batch": size, "threads": threads, "impacts_per_second": rate})
+    with matplotlib.rc_context(STYLE):
+        figure = scaling_picture(rows, powers)
+        FigureCanvasAgg(figure).draw()
+    assert len(figure.axes) == 6
+    for axes in figure.axes:
+        box = axes.get_legend().get_window_extent()
+        for line in axes.get_lines():
+            points = line.get_transform().transform(np.column_stack(line.get_data()))
+            assert not any(box.contains(x, y) for x, y in points), (axes.get_title("left"), line.get_label())
 
 
 @pytest.mark.parametrize("name", ["collision", "scaling", "skip"])

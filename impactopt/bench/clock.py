@@ -52,14 +52,25 @@ def medians(
     return {name: float(np.median(some)) for name, some in found.items()}
 
 
-def shortest(runs: Mapping[str, Callable[[], Any]], *, repeats: int = REPEATS) -> dict[str, float]:
-    """[s] of the fastest call of each: as on a machine that does nothing else."""
-    found = _samples(runs, repeats, np.inf, time.perf_counter)
+def shortest(
+    runs: Mapping[str, Callable[[], Any]], *, repeats: int = REPEATS, warm: bool = False
+) -> dict[str, float]:
+    """[s] of the fastest call of each: as on a machine that does nothing else.
+
+    warm : call once more before each measurement, of code so large that the others' drives it out of the
+        caches.
+    """
+    found = _samples(runs, repeats, np.inf, time.perf_counter, warm=warm)
     return {name: min(some) for name, some in found.items()}
 
 
 def _samples(
-    runs: Mapping[str, Callable[[], Any]], repeats: int, longest: float, clock: Callable[[], float]
+    runs: Mapping[str, Callable[[], Any]],
+    repeats: int,
+    longest: float,
+    clock: Callable[[], float],
+    *,
+    warm: bool = False,
 ) -> dict[str, list[float]]:
     counts = {}
     for name, run in runs.items():
@@ -73,6 +84,8 @@ def _samples(
             spent = sum(samples[name]) * counts[name]
             if spent > longest and len(samples[name]) >= _LEAST:
                 continue
+            if warm:
+                run()
             began = clock()
             for _ in range(counts[name]):
                 run()

@@ -137,13 +137,14 @@ def collision(
 
 @app.command()
 def scaling(
+    workers: Annotated[int, typer.Option(min=1, help="Processes that compile.")] = 2,
     few: Annotated[bool, typer.Option("--quick", help="Up to 32 joints, and one humanoid.")] = False,
     as_json: Json = False,
     out: Out = None,
     quiet: Quiet = False,
 ) -> None:
     """What a collision costs over degrees of freedom, over the step, and over the size of a batch."""
-    _run(["scaling"], {"scaling": {"quick": few}}, as_json, out, quiet)
+    _run(["scaling"], {"scaling": {"workers": workers, "quick": few}}, as_json, out, quiet)
 
 
 @app.command()
@@ -171,7 +172,7 @@ def run_all(
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
         "fidelity": {"workers": workers, "quick": True},
         "collision": {"quick": True},
-        "scaling": {"quick": True},
+        "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},
     }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)

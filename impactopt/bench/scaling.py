@@ -1,7 +1,8 @@
 """What a collision costs over degrees of freedom, over the step, and over the size of a batch.
 
-Over degrees of freedom, beside the paper's count of operations (its eq. 20), split as ours is: what is done
-once, and what is done at every iteration, of which a Runge-Kutta step has four and ours six.
+Over degrees of freedom, split as the paper's count of operations is (its eq. 20): the freeze, done once, and
+the time loop. Ours finds its own few steps where the paper's takes a thousand: so a stage of the paper's
+Runge-Kutta scheme, in our C, stands beside its count of one.
 """
 
 from __future__ import annotations
@@ -15,39 +16,53 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from impactopt._workers import map_on_workers
 from impactopt.bench.clock import medians, shortest
-from impactopt.bench.costs import Tree, cost_sdc, even_tree
+from impactopt.bench.costs import Tree, cost_sdc, even_tree, iterations
 from impactopt.bench.report import Report, Say, columns_table
+from impactopt.bench.scaling_robots import depth, humanoid_scenes, tip_scene
 from impactopt.bench.scene import Scene, compiled, inputs, run_of
-from impactopt.bench.trees import random_robot, tip_speed
 from impactopt.cases import Case
 from impactopt.collision import SDC
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
 from impactopt.plotting.scaling import scaling_picture
+from impactopt.presets import robot_names
 
-CHAINS = (2, 4, 8, 16, 24, 32)  # the longest chains take a minute to compile
+CHAINS = (2, 4, 8, 16, 24, 32, 48, 64, 100)
 TREES = (8, 16, 32, 48, 64, 80, 100)  # of four limbs
-HUMANOIDS = ("standin", "talos")
-STEPS = (1e-3, 5e-4, 2.5e-4, 1e-4, 5e-5, 2e-5, 1e-5)  # [s]
+QUICK_CHAINS, QUICK_TREES = (2, 8, 16, 24), (8, 16, 32)
+STEPS = (5e-4, 2.5e-4, 1e-4, 5e-5, 1e-5)  # [s] of Taylor's steps and the paper's
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # of the steps that find their own length
 BATCHES = (1, 10, 100, 1000)
-X = np.array([1.0, 0.0, 0.0])
-SPEED = 1.0  # [m/s] of the tip
+STAGES = 4  # of a Runge-Kutta step
+PAPER_STEP = 1e-4  # [s]
+WANTED = ("impulse", "duration")
 OVER_DOF = (
     ("robot", "robot", 0),
     ("joints", "n", 0),
-    ("freeze us", "freeze_us", 2),
-    ("step us", "step_us", 3),
-    ("steps", "steps", 0),
     ("collision us", "time_us", 1),
+    ("freeze us", "freeze_us", 2),
+    ("loop us", "loop_us", 1),
+    ("a stage us", "stage_us", 3),
     ("paper: once", "paper_once", 0),
-    ("a stage", "paper_iteration", 0),
+    ("a stage", "paper_stage", 0),
+)
+EXPONENTS = (
+    ("robot", "robot", 0),
+    ("time of", "part", 0),
+    ("joints from", "from", 0),
+    ("to", "to", 0),
+    ("exponent", "exponent", 2),
+    ("paper's formula", "paper", 2),
 )
 OVER_STEP = (
     ("method", "method", 0),
     ("step s", "step_s", "g"),
+    ("tolerance", "tolerance", "g"),
     ("collision us", "time_us", 1),
     ("integration error", "integration_error", ".1e"),
+    ("paper: operations", "paper_operations", 0),
 )
 OVER_BATCH = (
     ("batch", "batch", 0),
@@ -55,60 +70,68 @@ OVER_BATCH = (
     ("us each", "time_us", 1),
     ("a second", "impacts_per_second", 0),
 )
-WANTED = ("impulse", "duration")
 
 
 def run(
     say: Say,
     *,
-    chains: Sequence[int] = CHAINS,
-    trees: Sequence[int] = TREES,
-    humanoids: Sequence[str] = HUMANOIDS,
+    chains: Sequence[int] | None = None,
+    trees: Sequence[int] | None = None,
+    humanoids: Sequence[str] | None = None,
     scene: Scene | None = None,
     steps: Sequence[float] = STEPS,
+    tolerances: Sequence[float] = TOLERANCES,
     batches: Sequence[int] = BATCHES,
+    workers: int = 2,
     quick: bool = False,
     repeats: int = 25,
 ) -> Report:
-    """Rows over "dof", "step" and "batch"; quick: no more than 32 joints, and the stand-in only."""
+    """Rows over "dof", "step" and "batch", and the exponents of cost in the number of joints.
+
+    humanoids : presets; None: all that are installed.  scene : of steps and batches.
+    workers : processes that compile.
+    quick : no more than 32 joints, the stand-in only, and a few steps.
+    """
+    chains = chains or (QUICK_CHAINS if quick else CHAINS)
+    trees = trees or (QUICK_TREES if quick else TREES)
+    humanoids = robot_names() if humanoids is None else humanoids
     if quick:
-        chains, trees = ([n for n in sizes if n <= 32] for sizes in (chains, trees))
-        humanoids = humanoids[:1]
+        humanoids, steps, tolerances = humanoids[:1], steps[1:3], tolerances[:2]
     scene = scene or Scene.of("standin")
-    known = {scene.name: scene}
-    scenes = [("chain", n, tip_scene(n, 1)) for n in chains]
-    scenes += [("tree", n, tip_scene(n, 4)) for n in trees]
-    for name in humanoids:
-        one = known.get(name) or Scene.of(name)
-        scenes.append((name, one.case.robot.n, one))
-    rows = over_dof(scenes, say, repeats) + over_step(scene, steps, say, repeats)
-    say("batches")
-    rows += over_batch(scene, batches, repeats)
+    scenes = [tip_scene("chain", n) for n in chains] + [tip_scene("tree", n) for n in trees]
+    scenes += humanoid_scenes(humanoids, say)
+    stages = [stage_model(one) for one in scenes]
+    of_steps = step_models(scene, steps, tolerances)
+    whole = [one.model(SDC) for one in scenes]
+    compile_all([*whole, *(m for m in stages if m is not None), *of_steps], say, workers)
+    say("measuring")
+    rows = over_dof(scenes, stages, repeats)
+    powers = exponents(rows)
+    rows += over_step(scene, of_steps, repeats) + over_batch(scene, batches, repeats)
     return Report(
         name="scaling",
-        numbers={"rows": rows},
-        tables=tables_of(rows),
-        figures={"scaling": lambda: scaling_picture(rows)},
+        numbers={"rows": rows, "exponents": powers},
+        tables=tables_of(rows, powers),
+        figures={"scaling": lambda: scaling_picture(rows, powers)},
     )
 
 
-def tip_scene(n: int, limbs: int) -> Scene:
-    """A random chain or tree whose tip strikes at SPEED, with the least joint velocities that do."""
-    robot, q = random_robot(n, limbs=limbs), np.random.default_rng(1).uniform(-1, 1, size=n)
-    row = np.array([tip_speed(robot, q, e) for e in np.eye(n)])
-    v = SPEED * row / (row @ row)
-    case = Case(
-        robot=robot,
-        name=f"{n} joints",
-        striker="tip",
-        normal=X,
-        q=q,
-        v=v,
-        torque=np.zeros(n),
-        effective_mass=np.nan,
-        speed=SPEED,
+def compile_all(models: Sequence[SymbolicModel], say: Say, workers: int) -> None:
+    """Their functions into the cache on disk, what takes longest first."""
+    # the tree's code grows so
+    longest_first = sorted(models, key=lambda m: -m.robot.n * depth(m.robot) ** 2)
+    map_on_workers(
+        compile_one,
+        None,
+        longest_first,
+        workers=workers,
+        crashed=lambda _code: None,  # what needs the function says it better
+        progress=lambda done, of: say(f"functions compiled: {done} of {of}"),
     )
-    return Scene(name=robot.name, case=case)
+
+
+def compile_one(_shared: None, model: SymbolicModel) -> None:
+    compiled(model, WANTED)
 
 
 def numbers_of(model: SymbolicModel, case: Case) -> dict[str, float]:
@@ -118,63 +141,126 @@ def numbers_of(model: SymbolicModel, case: Case) -> dict[str, float]:
 
 
 # ---------------------------------------------------------------- degrees of freedom
-def over_dof(scenes: Sequence[tuple[str, int, Scene]], say: Say, repeats: int) -> list[dict[str, Any]]:
-    """Time of a freeze and of a step, from collisions of one step and of all."""
+def parted(case: Case) -> Case:
+    """With the hand going away: frozen, and over before the first step."""
+    return replace(case, v=-case.v)
+
+
+def stage_model(scene: Scene) -> SymbolicModel | None:
+    """The paper's scheme on the same frozen dynamics; None of chains: it does not know a tree's shape, and
+    those take long to compile."""
+    if scene.name == "chain":
+        return None
+    model = scene.model(SDC, method="rk4")
+    # a step that is stable on all of them, whatever has been drawn
+    step = min(PAPER_STEP, 0.5 * model.stable_step(scene.case.q))
+    staged: SymbolicModel = replace(model, step=step)
+    return staged
+
+
+def over_dof(
+    scenes: Sequence[Scene], stages: Sequence[SymbolicModel | None], repeats: int
+) -> list[dict[str, Any]]:
+    """Time of a collision, of its freeze and its time loop, and of a stage of the paper's scheme."""
     runs: dict[str, Callable[[], Any]] = {}
-    steps: dict[str, int] = {}
-    for kind, n, scene in scenes:
-        say(f"{kind} of {n} joints")
-        # a step that is stable on all of them, whatever has been drawn
-        model = scene.model(SDC)
-        step = min(model.step_length, 0.5 * model.stable_step(scene.case.q))
-        model = replace(model, step=step)
-        runs[f"{kind} {n}"] = run_of(model, scene.case, WANTED)
-        runs[f"{kind} {n} short"] = run_of(replace(model, horizon=step), scene.case, WANTED)
-        steps[f"{kind} {n}"] = round(numbers_of(model, scene.case)["duration"] / step)
-    times = medians(runs, repeats=repeats, clock=time.thread_time)
+    for k, (scene, staged) in enumerate(zip(scenes, stages, strict=True)):
+        for name, model in (("whole", scene.model(SDC)), ("staged", staged)):
+            if model is not None:
+                runs[f"{k} {name}"] = run_of(model, scene.case, WANTED)
+                runs[f"{k} {name} frozen"] = run_of(model, parted(scene.case), WANTED)
+    # the best: code of megabytes is thrown out of the caches by whatever else runs
+    found = shortest(runs, repeats=repeats, warm=True)
+    times = {name: 1e6 * seconds for name, seconds in found.items()}
     rows = []
-    for kind, n, scene in scenes:
-        name = f"{kind} {n}"
-        each = (times[name] - times[f"{name} short"]) / max(1, steps[name] - 1)
-        tree = even_tree(n) if kind != "chain" else Tree(n=n, arms=(n,), colliding=n)
+    for k, (scene, staged) in enumerate(zip(scenes, stages, strict=True)):
+        case, stage = scene.case, None
+        n = case.robot.n
+        if staged is not None:
+            steps = np.ceil(numbers_of(staged, case)["duration"] / staged.step_length)
+            stage = (times[f"{k} staged"] - times[f"{k} staged frozen"]) / (STAGES * max(1.0, steps))
+        tree = Tree(n=n, arms=(n,), colliding=n) if scene.name == "chain" else even_tree(n)
         once = cost_sdc(tree, 0)
         rows.append(
             {
                 "over": "dof",
-                "robot": kind,
+                "robot": scene.name,
                 "n": n,
-                "freeze_us": 1e6 * (times[f"{name} short"] - each),
-                "step_us": 1e6 * each,
-                "steps": steps[name],
-                "time_us": 1e6 * times[name],
+                "velocities": case.robot.nv,
+                "time_us": times[f"{k} whole"],
+                "freeze_us": times[f"{k} whole frozen"],
+                "loop_us": times[f"{k} whole"] - times[f"{k} whole frozen"],
+                "stage_us": stage,
                 "paper_once": once,
-                "paper_iteration": cost_sdc(tree, 1) - once,
-                "velocities": scene.case.robot.nv,
+                "paper_stage": cost_sdc(tree, 1) - once,
             }
         )
     return rows
 
 
+def exponents(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of time in n, and of the paper's count in the same n: least squares through the logarithms, over the
+    upper half of the sizes of chains and of trees."""
+    found = []
+    for kind in ("chain", "tree"):
+        for part, time_of, count in (
+            ("freeze", "freeze_us", "paper_once"),
+            ("time loop", "loop_us", "paper_stage"),
+            ("a stage", "stage_us", "paper_stage"),
+        ):
+            own = sorted(
+                (r for r in rows if r["robot"] == kind and r[time_of] is not None and r[time_of] > 0),
+                key=lambda r: float(r["n"]),
+            )
+            upper = own[len(own) // 2 :]
+            if len(upper) < 2:
+                continue
+            n, y, paper = (np.log([float(r[key]) for r in upper]) for key in ("n", time_of, count))
+            row = {"robot": kind, "part": part, "from": upper[0]["n"], "to": upper[-1]["n"]}
+            slopes = {"exponent": np.polyfit(n, y, 1)[0], "paper": np.polyfit(n, paper, 1)[0]}
+            found.append(row | {key: float(value) for key, value in slopes.items()})
+    return found
+
+
 # ---------------------------------------------------------------- step, batch
-def over_step(scene: Scene, steps: Sequence[float], say: Say, repeats: int) -> list[dict[str, Any]]:
-    """Time and error of the frozen collision, against its exact solution, of both methods."""
-    case = scene.case
-    exact = scene.model(SDC, method="exact").collide(case.q, case.v, case.torque)
-    rows, runs = [], {}
+def step_models(scene: Scene, steps: Sequence[float], tolerances: Sequence[float]) -> list[SymbolicModel]:
+    """Of all methods, as far as their steps are stable and not too many."""
+    models: list[SymbolicModel] = [scene.model(SDC, tolerance=tolerance) for tolerance in tolerances]
     for method in ("events", "rk4"):
         for step in steps:
             try:
                 model = scene.model(SDC, method=method, step=step)
             except InputError:
                 continue  # more steps than there may be
-            if step >= model.stable_step(case.q):
-                continue
-            say(f"{method}, {step:g} s")
-            runs[f"{method} {step}"] = run_of(model, case, WANTED)
-            error = abs(numbers_of(model, case)["impulse"] / exact.impulse - 1)
-            rows.append({"over": "step", "method": method, "step_s": step, "integration_error": error})
+            if step < model.stable_step(scene.case.q):
+                models.append(model)
+    return models
+
+
+def over_step(scene: Scene, models: Sequence[SymbolicModel], repeats: int) -> list[dict[str, Any]]:
+    """Time and error of the frozen collision, against its exact solution."""
+    case, default = scene.case, scene.model(SDC)
+    exact = scene.model(SDC, method="exact").collide(case.q, case.v, case.torque)
+    runs = {str(k): run_of(model, case, WANTED) for k, model in enumerate(models)}
     times = medians(runs, repeats=repeats, clock=time.thread_time)
-    return [{**row, "time_us": 1e6 * times[f"{row['method']} {row['step_s']}"]} for row in rows]
+    rows = []
+    for k, model in enumerate(models):
+        own = model.stepping == "implicit"
+        step = None if own else model.step_length
+        count = None if step is None else iterations(step, exact.duration)
+        rows.append(
+            {
+                "over": "step",
+                "robot": scene.name,
+                "method": model.stepping,
+                "step_s": step,
+                "tolerance": model.tolerance if own else None,
+                "default": own and model.tolerance == default.tolerance,
+                "time_us": 1e6 * times[str(k)],
+                "integration_error": abs(numbers_of(model, case)["impulse"] / exact.impulse - 1),
+                "paper_operations": None if count is None else cost_sdc(even_tree(case.robot.n), count),
+            }
+        )
+    return rows
 
 
 def over_batch(scene: Scene, sizes: Sequence[int], repeats: int) -> list[dict[str, Any]]:
@@ -200,11 +286,12 @@ def over_batch(scene: Scene, sizes: Sequence[int], repeats: int) -> list[dict[st
     ]
 
 
-def tables_of(rows: Sequence[dict[str, Any]]) -> tuple[Any, ...]:
-    """One a thing that it goes over."""
+def tables_of(rows: Sequence[dict[str, Any]], powers: Sequence[dict[str, Any]]) -> tuple[Any, ...]:
+    """One a thing that it goes over, and one of the exponents."""
     of = {over: [r for r in rows if r["over"] == over] for over in ("dof", "step", "batch")}
     return (
         columns_table("over degrees of freedom", OVER_DOF, of["dof"]),
+        columns_table("exponents in the number of joints", EXPONENTS, powers),
         columns_table(
             "over the step: the frozen collision against its exact solution", OVER_STEP, of["step"]
         ),

@@ -62,7 +62,7 @@ def test_fast_modes_are_damped_away_and_none_grows() -> None:
     frequencies = np.concatenate([-np.logspace(-3, 8, 5000), np.logspace(-3, 8, 5000)])
     assert np.abs(approximation(1j * frequencies, 1.0)).max() <= 1.0 + 1e-12
     for theta in np.linspace(0.0, 1.0, 21):  # a step that ends on an event
-        assert abs(approximation(-1e12, theta)) <= 1.26
+        assert abs(approximation(-1e12, theta)) <= 1.3
 
 
 # ------------------------------------------------------------ which laws and targets

@@ -9,7 +9,7 @@ solution is known by the exponential of J. With S = (I - gamma h J)^-1, which on
 
 has order eight for every theta. Where 1/gamma is a root of L_8 the fastest modes are damped away: R(infinity)
 = 0, and |R| <= 1 on the left half-plane, which of the roots only this one gives (steps that end on events, at
-theta < 1, let them grow by a quarter at most). What is left out, p_9(1) z^9, is smaller than what Taylor's
+theta < 1, let them grow by a third at most). What is left out, p_9(1) z^9, is smaller than what Taylor's
 polynomial of degree eight leaves out.
 
 Source: S. P. Norsett, "Restricted Pade approximations to the exponential function", SIAM J. Numer. Anal. 15

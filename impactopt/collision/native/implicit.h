@@ -486,7 +486,7 @@ static void look_at_joint(const vec (*w)[V], int i, double offset, double level,
   FOR(j, TERMS) mine[j] = ((const double *)w[j])[i];
   mine[0] += offset;
   hull(mine, b);
-  if (fabs(mine[0]) < level || (kind == OF_DEMAND && fabs(mine[0]) == level)) {
+  if (fabs(mine[0]) <= level) { /* as what is at its level counts elsewhere */
     look_at(b, 1.0, level, end, kind, i, e);
     look_at(b, -1.0, level, end, kind, i, e);
   } else {

@@ -200,15 +200,8 @@ static void freeze(const double *q, const double *v, const double *normal, doubl
 
 /* wrench of all that is held for a torque, a force at the hand and the drift's weight */
 static void wrench_of(const Frozen *F, const double *torque, double force, double weight, vec *out) {
-  vec a[VC], b[VC] = {0};
-  FOR(i, VC) a[i] = weight * F->L_0[i] - force * F->wrench[N][i];
-  int j = 0;
-  for (; j + 1 < N; j += 2) {
-    FOR(i, VC) a[i] += torque[j] * F->wrench[j][i];
-    FOR(i, VC) b[i] += torque[j + 1] * F->wrench[j + 1][i];
-  }
-  if (N % 2) FOR(i, VC) a[i] += torque[N - 1] * F->wrench[N - 1][i];
-  FOR(i, VC) out[i] = a[i] + b[i];
+  FOR(i, VC) out[i] = weight * F->L_0[i] - force * F->wrench[N][i];
+  FOR(j, N) FOR(i, VC) out[i] += torque[j] * F->wrench[j][i];
 }
 
 /* change of v (nv) from integrals of torque and force over a time; or of position, from second integrals */

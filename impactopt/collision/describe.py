@@ -82,7 +82,7 @@ def describe(
 def instructions(collision: SymbolicModel, outputs: tuple[str, ...]) -> dict[str, int]:
     """Scalar instructions of one freeze and one step of the graph, as CasADi counts them.
 
-    An implicit step, in C alone, has the freeze of the graph, and in place of its step one that costs some half
+    Implicit steps, in C alone, have the freeze of the graph, and in place of its step one that costs half
     as much again.
     """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)

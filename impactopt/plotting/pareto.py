@@ -16,6 +16,8 @@ _LEAST = 1e-6  # [%] drawn for what is exact
 _MARKS = {
     "virtual": (ORANGE, "s"),
     "paper": (VERMILION, "v"),
+    "sdc, Taylor": (BLUE, "s"),
+    "sdc, freezes": (BLUE, "*"),
     "sdc": (BLUE, "o"),
     "exact": (GREEN, "D"),
     "CVODES": (PURPLE, "P"),
@@ -44,10 +46,10 @@ def pareto_picture(rows: Sequence[Row]) -> Figure:
         best = front(own)
         times, errors = [r["time_us"] for r in best], [_size(r) for r in best]
         axes.step(times, errors, where="post", color="#999999", linewidth=1.0, zorder=1)
-        for method in dict.fromkeys(r["method"] for r in own):
-            mine = [r for r in own if r["method"] == method]
+        for method in dict.fromkeys(map(_kind, own)):
+            mine = [r for r in own if _kind(r) == method]
             colour, mark = next(x for key, x in _MARKS.items() if method.startswith(key))
-            hollow = "CasADi's C" in method
+            hollow = "CasADi's C" in method or "Taylor" in method
             axes.loglog(
                 [r["time_us"] for r in mine],
                 [_size(r) for r in mine],
@@ -61,6 +63,11 @@ def pareto_picture(rows: Sequence[Row]) -> Figure:
     panels[0].set_ylabel("impulse error against full dynamics [%]")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     return figure
+
+
+def _kind(row: Row) -> str:
+    """The method; several freezes are one."""
+    return "sdc, freezes" if row["method"].endswith(" freezes") else str(row["method"])
 
 
 def _size(row: Row) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from impactopt.bench.clock import medians, runner, shortest
 from impactopt.bench.methods import Entry, entries
 from impactopt.bench.peers import mujoco_rollouts, pinocchio_calls
-from impactopt.bench.report import Report, Say, cell, make_table
+from impactopt.bench.report import Report, Say, cell, columns_table, make_table
 from impactopt.bench.scene import (
     EVALUATION,
     MOTIONS,
@@ -36,7 +36,14 @@ from impactopt.reference import FullDynamics
 # time, where MuJoCo's threads are started before
 BATCH, ROLLOUTS = 2000, 2
 DEFAULT = ("sdc", "tolerance 1e-06")
-KEYS = ("impulse_error_pct", "peak_force_error_pct", "zmp_error_mm", "torque_error_pct")
+ERRORS = (
+    ("impulse %", "impulse_error_pct", 4),
+    ("peak %", "peak_force_error_pct", 4),
+    ("ZMP mm", "zmp_error_mm", 4),
+    ("torque %", "torque_error_pct", 4),
+)
+COLUMNS = (("method", "method", 0), ("setting", "setting", 0), ("time us", "time_us", 1), *ERRORS)
+KEYS = tuple(key for _, key, _ in ERRORS)
 
 
 def run(say: Say, *, scenes: Sequence[Scene] | None = None, quick: bool = False, repeats: int = 15) -> Report:
@@ -176,18 +183,12 @@ def profile(scene: Scene, repeats: int) -> dict[str, float]:
 def tables_of(numbers: dict[str, Any]) -> tuple[Any, ...]:
     """One a robot, and one of the default's ratios and stages."""
     tables = []
-    columns = ["method", "setting", "time us", "impulse %", "peak %", "ZMP mm", "torque %"]
     for robot in dict.fromkeys(r["robot"] for r in numbers["rows"]):
         own = [r for r in numbers["rows"] if r["robot"] == robot]
-        cells = [
-            [r["method"], r["setting"], cell(r["time_us"], 1), *(cell(r[key], 4) for key in KEYS)]
-            for r in own
-        ]
-        tables.append(
-            make_table(f"{robot}: time of a collision, error against full dynamics", columns, cells)
-        )
+        title = f"{robot}: time of a collision, error against full dynamics"
+        tables.append(columns_table(title, COLUMNS, own))
         rows = [
-            [key.replace("_", " "), "-" if x is None else f"{x:.4g}"]
+            [key.replace("_", " "), cell(x, ".4g")]
             for part in ("defaults", "profile")
             for key, x in numbers[part][robot].items()
         ]

@@ -35,7 +35,7 @@ from impactopt.reference import FullDynamics
 # calls of some 30 ms: of 200 collisions, checks of the inputs and a thread's start would be a tenth of the
 # time, where MuJoCo's threads are started before
 BATCH, ROLLOUTS = 2000, 2
-DEFAULT = ("sdc", "tolerance 1e-06")
+DEFAULT = ("sdc", "tolerance 1e-07")
 ERRORS = (
     ("impulse %", "impulse_error_pct", 4),
     ("peak %", "peak_force_error_pct", 4),

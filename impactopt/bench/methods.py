@@ -19,7 +19,7 @@ __all__ = ["Entry", "entries"]
 
 PAPER_STEPS = (1e-3, 1e-4, 1e-5, 2e-6)  # [s]; 1e-6 would be more steps than a model allows
 TAYLOR_STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)
-OUR_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10)
+OUR_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
 FREEZES = (1, 2, 4, 8)
 FULL_STEPS = (4e-4, 2e-4, 1e-4)
 MUJOCO_STEPS = (1e-3, 2e-4, 1e-4, 5e-5)
@@ -53,7 +53,7 @@ def entries(scene: Scene, true: Collision, say: Say, quick: bool) -> tuple[list[
     paper = partial(scene.model, SDC.paper)
     for step in (1e-4,) if quick else PAPER_STEPS:
         ours("paper, by hand", f"{step:g} s", partial(_stepped, paper, step))
-    for tolerance in (1e-6,) if quick else OUR_TOLERANCES:
+    for tolerance in (1e-7,) if quick else OUR_TOLERANCES:
         ours("sdc", f"tolerance {tolerance:g}", partial(scene.model, SDC, tolerance=tolerance))
     for step in (2.5e-4,) if quick else TAYLOR_STEPS:
         taylor = partial(scene.model, SDC, method="events", step=step)
@@ -129,7 +129,7 @@ def _by_graph(scene: Scene, paper: Callable[..., Any], say: Say) -> list[Entry]:
 
 def _peers(scene: Scene, true: Collision, frozen: Collision, say: Say, quick: bool) -> list[Entry]:
     case, made = scene.case, []
-    for tolerance in (1e-6,) if quick else TOLERANCES:
+    for tolerance in (1e-7,) if quick else TOLERANCES:
         run, impulse = cvodes(scene, frozen.duration, tolerance)
         note = "frozen; its end is given to it; the freeze is not in the time"
         made.append(

@@ -26,7 +26,7 @@ from impactopt._workers import map_on_workers
 from impactopt.bench.report import Report, Say, make_table
 from impactopt.bench.stability_cases import RIGS, Case, Rig, draw
 from impactopt.bench.stability_others import FREEZES, MASSES, freezes_of, masses_of, refusals
-from impactopt.bench.stability_reference import reference
+from impactopt.bench.stability_reference import TakesTooLong, reference
 from impactopt.collision import Collision
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
@@ -69,7 +69,10 @@ def judge(model: SymbolicModel, case: Case, name: str = "") -> Outcome:
         return Outcome(verdict="wrong", reason=type(crash).__name__, case=what)
     if not _finite(found):
         return Outcome(verdict="nan", reason="a result that is no number", case=what)
-    expected, scale, by = reference(model, case)
+    try:
+        expected, scale, by = reference(model, case)
+    except TakesTooLong:
+        return Outcome(verdict="refused", reason="nothing to judge it by in time")
     error = abs(found.impulse - expected.impulse) / max(abs(expected.impulse), scale, 1e-300)
     if error > TOLERANCES[model.stepping]:
         what += f": {found.impulse!r} N s in {found.duration:g} s, not {expected}"

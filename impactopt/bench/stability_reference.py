@@ -17,7 +17,7 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import Board, FreeMass
 from impactopt.errors import InputError
 
-__all__ = ["Expected", "reference"]
+__all__ = ["Expected", "TakesTooLong", "reference"]
 
 Array = NDArray[np.float64]
 
@@ -58,19 +58,23 @@ def reference(model: SymbolicModel, case: Case) -> tuple[Expected, float, str]:
         pass
     try:
         return by_lsoda(model, frozen, v, given, values), scale, "LSODA"
-    except _TakesTooLong:
+    except TakesTooLong:
         if model.stepping != "implicit":
             raise
     options: dict[str, Any] = {"require_separation": False, **case.overrides}
-    try:
-        found = _finer(model, 1e-6).collide(case.q, case.v, case.torque, **options)
-    except InputError:  # there are only so many steps
-        found = _finer(model, 1e-2).collide(case.q, case.v, case.torque, **options)
+    for factor in (1e-6, 1e-2):  # there are only so many steps
+        try:
+            found = _finer(model, factor).collide(case.q, case.v, case.torque, **options)
+        except InputError:
+            continue
+        break
+    else:
+        raise TakesTooLong
     made = Expected(impulse=found.impulse, duration=found.duration, separated=found.separated)
     return made, scale, "itself, finer"
 
 
-class _TakesTooLong(Exception):
+class TakesTooLong(Exception):
     """A reference is given up."""
 
 
@@ -124,7 +128,7 @@ def by_lsoda(
         nonlocal slopes
         slopes += 1
         if slopes > _MOST_SLOPES:
-            raise _TakesTooLong
+            raise TakesTooLong
         r, T = rate(t, y), y[2 + k : 2 + k + n]
         f = float(law.force(float(y[0]), r))
         u = A @ T - s * y[1] + d * t

@@ -63,7 +63,9 @@ class SymbolicModel(CollisionModel):
         for `collide` only.
     step : [s] of "events" and "rk4", their length, below `stable_step(q)`; None: 2.5e-4, and the paper's
         1e-4. Of "implicit" and "exact", which any step suits, the histories' spacing; None: 1e-3 and 2.5e-4.
-    tolerance : of "implicit", what a step may leave out of the hand's speed, relative to its changes.
+    tolerance : of "implicit", what a step may leave out of the hand's speed and of the impulse, relative to
+        their changes. The impulse is most often that exact; contacts that are pushed on and on by servos
+        that swing undamped, or saturate to and fro, gather more.
     report : told what is going on while functions are compiled, one line a call.
 
     Raises
@@ -75,7 +77,7 @@ class SymbolicModel(CollisionModel):
     terms: Terms = field(default_factory=Terms)
     method: str | None = None
     step: float | None = None
-    tolerance: float = 1e-6
+    tolerance: float = 1e-7
     report: Callable[[str], None] | None = None
     _functions: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
 

@@ -107,6 +107,8 @@ class SymbolicModel(CollisionModel):
                 f"step [s]: {self.step_length:g} takes {steps} steps to the horizon, {self.horizon:g} s, and "
                 f"{_MOST_STEPS} are the most: shorten the horizon, or lengthen the step"
             )
+        # checks the numbers now, and not when they are first used
+        _ = self.settings
         if self.method == "implicit" and (why := self._not_implicit()):
             raise InputError(f"method 'implicit': {why}; use 'events' or 'rk4'")
         if self.method == "exact":

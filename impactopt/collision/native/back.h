@@ -28,16 +28,9 @@ INLINE void put_speed(vec *u_, double speed_) { u_[N / LANES][N % LANES] = speed
 /* from velocity and hand speed back to the integral of the torque (added), and minus that of the force */
 INLINE double back_of_velocity(const Data *d, const vec *u_, vec *torque_) {
   const Frozen *F = d->frozen;
-  vec a[V], b[V];
-  FOR(i, V) a[i] = torque_[i], b[i] = (vec){0};
-  const double *x = (const double *)u_;
-#pragma GCC unroll 16
-  for (int j = 0; j < N; j += 2) {
-    FOR(i, V) a[i] += F->Q[j][i] * x[j];
-    FOR(i, V) b[i] += F->Q[j + 1][i] * x[j + 1];
-  }
-  if (N % 2 == 0) FOR(i, V) a[i] += F->Q[N][i] * x[N];
-  FOR(i, V) a[i] += b[i];
+  vec a[V];
+  FOR(i, V) a[i] = torque_[i];
+  add_columns(F->Q, N + 1, (const double *)u_, a);
   const double force = a[N / LANES][N % LANES];
   FOR(i, V) torque_[i] = a[i] * d->kept[i];
   return force;

@@ -44,7 +44,6 @@ enum { OF_NONE, OF_RATE, OF_FORCE, OF_DEMAND, OF_SLIDING, OF_SWITCH };
 typedef struct {
   double at;
   int kind, number;
-  double sign; /* of the series, which is above zero at the begin */
 } Event;
 
 /* of each step what those who go back need: the state at its begin, its length, the part of it that was gone, and the
@@ -326,12 +325,10 @@ static void prepare(const Data *d, const State *y, const Instant *now, double h,
     }
     sweep(r, i, more);
   }
+  memcpy(r->D, D, sizeof D);
   if (anew) {
     r->h = h, r->g = g;
-    memcpy(r->D, D, sizeof D);
     sweep_all((const vec(*)[V])d->frozen->Q, r);
-  } else {
-    memcpy(r->D, D, sizeof D);
   }
   memcpy(r->kp, kp, sizeof kp);
   contact_here(d, y, now, g, ((double *)r->X[N])[N], &r->contact);
@@ -351,13 +348,13 @@ typedef struct {
 /* S r, as far as it is needed */
 INLINE void solve(const Data *d, const Resolvent *r, const Right *b, Left *x) {
   const Contact *c = &r->contact;
-  vec rho[V], a[V], e[V];
+  vec rho[V], a[V];
   FOR(i, V) {
     rho[i] = b->torque[i];
 #if STIFFNESS
     rho[i] += r->g * r->kp[i] * b->deviation[i];
 #endif
-    a[i] = e[i] = (vec){0};
+    a[i] = (vec){0};
   }
 #if BIAS || JDOT
   if (b->time != 0.0) FOR(i, V) {
@@ -365,15 +362,7 @@ INLINE void solve(const Data *d, const Resolvent *r, const Right *b, Left *x) {
     rho[i] -= r->g * r->D[i] * a[i];
   }
 #endif
-  const double *w = (const double *)rho;
-  int j = 0;
-#pragma GCC unroll 16
-  for (; j + 1 < N; j += 2) {
-    FOR(i, V) a[i] += r->X[j][i] * w[j];
-    FOR(i, V) e[i] += r->X[j + 1][i] * w[j + 1];
-  }
-  if (N % 2) FOR(i, V) a[i] += r->X[N - 1][i] * w[N - 1];
-  FOR(i, V) a[i] += e[i];
+  add_columns(r->X, N, (const double *)rho, a);
   const double own = ((double *)r->X[N])[N];
   double rate = a[N / LANES][N % LANES] - own * b->impulse, held[NZ1];
   FOR(i, NZ) {
@@ -469,7 +458,8 @@ INLINE double error_of(const Data *d, const Series *s, double scale) {
 }
 
 /* ------------------------------------------------------------ events */
-static void look_at(const double *b, double sign, double level, double end, int kind, int number, Event *e) {
+/* what falls below zero before the first event so far takes its place */
+static void look_at(const double *b, double sign, double level, int kind, int number, Event *e) {
   double mine[TERMS], lowest = INFINITY;
   FOR(i, TERMS) {
     mine[i] = sign * b[i] + level;
@@ -477,20 +467,20 @@ static void look_at(const double *b, double sign, double level, double end, int 
   }
   if (lowest >= 0.0) return;
   const double at = first_below(mine);
-  if (at < fmin(end, e->at)) *e = (Event){.at = at, .kind = kind, .number = number, .sign = sign};
+  if (at < e->at) *e = (Event){.at = at, .kind = kind, .number = number};
 }
 
 /* a joint's series against a level: stays within it, or beyond */
-static void look_at_joint(const vec (*w)[V], int i, double offset, double level, double end, int kind, Event *e) {
+static void look_at_joint(const vec (*w)[V], int i, double offset, double level, int kind, Event *e) {
   double mine[TERMS], b[TERMS];
   FOR(j, TERMS) mine[j] = ((const double *)w[j])[i];
   mine[0] += offset;
   hull(mine, b);
   if (fabs(mine[0]) <= level) { /* as what is at its level counts elsewhere */
-    look_at(b, 1.0, level, end, kind, i, e);
-    look_at(b, -1.0, level, end, kind, i, e);
+    look_at(b, 1.0, level, kind, i, e);
+    look_at(b, -1.0, level, kind, i, e);
   } else {
-    look_at(b, mine[0] < 0.0 ? -1.0 : 1.0, -level, end, kind, i, e);
+    look_at(b, mine[0] < 0.0 ? -1.0 : 1.0, -level, kind, i, e);
   }
 }
 
@@ -517,20 +507,20 @@ static void find_event(const Data *d, const State *y, const Instant *now, const 
   double b[TERMS];
   *e = (Event){.at = end};
   hull(s->rate, b);
-  look_at(b, now->compressing ? 1.0 : -1.0, 0.0, end, OF_RATE, 0, e);
-  if (!now->compressing) hull(s->force, b), look_at(b, 1.0, 0.0, end, OF_FORCE, 0, e);
+  look_at(b, now->compressing ? 1.0 : -1.0, 0.0, OF_RATE, 0, e);
+  if (!now->compressing) hull(s->force, b), look_at(b, 1.0, 0.0, OF_FORCE, 0, e);
 #if SATURATION
   FOR(i, V) {
     const bits may = may_cross(s->demand, i, (vec){0}, d->limit[i]) & (bits)(d->kept[i] > 0.0);
     if (any(may)) FOR(l, LANES) if (may[l])
-      look_at_joint(s->demand, i * LANES + l, 0.0, d->limit[i][l], end, OF_DEMAND, e);
+      look_at_joint(s->demand, i * LANES + l, 0.0, d->limit[i][l], OF_DEMAND, e);
   }
 #endif
 #if FRICTION
   FOR(i, V) {
     const bits may = may_cross(s->speeds, i, d->joint_velocity[i], (vec){0} + TRANSITION) & (bits)(d->kept[i] > 0.0);
     if (any(may)) FOR(l, LANES) if (may[l])
-      look_at_joint(s->speeds, i * LANES + l, d->joint_velocity[i][l], TRANSITION, end, OF_SLIDING, e);
+      look_at_joint(s->speeds, i * LANES + l, d->joint_velocity[i][l], TRANSITION, OF_SLIDING, e);
   }
 #endif
 #if SWITCHES
@@ -546,7 +536,7 @@ static void find_event(const Data *d, const State *y, const Instant *now, const 
     }
     hull(w, b);
     const double side = b[0] != 0.0 ? b[0] : b[1];
-    look_at(b, side < 0.0 ? -1.0 : 1.0, 0.0, end, OF_SWITCH, k, e);
+    look_at(b, side < 0.0 ? -1.0 : 1.0, 0.0, OF_SWITCH, k, e);
   }
 #endif
 }

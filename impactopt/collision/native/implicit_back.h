@@ -103,21 +103,13 @@ static void form_back(const Data *d, const State *y, const Series *s, double h, 
 /* a becomes h J' b, b = S' a; v_ is that of h times the slope of state, torque_ is b's */
 INLINE void solve_back(const Data *d, const Resolvent *r, Right *a, vec *v_, vec *torque_) {
   const Contact *c = &r->contact;
-  vec s[V], x[V], e[V];
+  vec s[V], x[V];
   FOR(i, V) {
     s[i] = -r->D[i] * a->torque[i];
     if (STIFFNESS) s[i] -= a->deviation[i];
-    x[i] = e[i] = (vec){0};
+    x[i] = (vec){0};
   }
-  const double *w = (const double *)s;
-  int j = 0;
-#pragma GCC unroll 16
-  for (; j + 1 < N; j += 2) {
-    FOR(i, V) x[i] += r->X[j][i] * w[j];
-    FOR(i, V) e[i] += r->X[j + 1][i] * w[j + 1];
-  }
-  if (N % 2) FOR(i, V) x[i] += r->X[N - 1][i] * w[N - 1];
-  FOR(i, V) x[i] += e[i];
+  add_columns(r->X, N, (const double *)s, x);
   const double slope = c->k * r->g + c->d;
   double force_ = a->impulse - r->g * x[N / LANES][N % LANES], held[NZ1];
   FOR(i, NZ) force_ += c->moved[i] * a->target[i];

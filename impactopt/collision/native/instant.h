@@ -40,26 +40,31 @@ INLINE double call(int (*f)(const double **, double **, long long *, double *, i
   return out;
 }
 
+/* a plus the first columns of a matrix times x, in two chains of sums */
+INLINE void add_columns(const vec (*M)[V], int columns, const double *x, vec *a) {
+  vec b[V];
+  FOR(i, V) b[i] = (vec){0};
+#pragma GCC unroll 16
+  for (int j = 0; j + 1 < columns; j += 2) {
+    FOR(i, V) a[i] += M[j][i] * x[j];
+    FOR(i, V) b[i] += M[j + 1][i] * x[j + 1];
+  }
+  if (columns % 2) FOR(i, V) a[i] += M[columns - 1][i] * x[columns - 1];
+  FOR(i, V) a[i] += b[i];
+}
+
 /* u and the hand's speed, from integrals of torque and force, and time; or from derivatives of them */
 INLINE double velocity(const Data *d, const vec *torque, double impulse, double time, vec *u) {
   const Frozen *F = d->frozen;
   AFRESH(F);
-  const double *x = (const double *)torque;
-  vec a[V], b[V];
+  vec a[V];
 #if BIAS || JDOT
   FOR(i, V) a[i] = F->drift[i] * time;
 #else
   FOR(i, V) a[i] = (vec){0};
 #endif
-  FOR(i, V) b[i] = (vec){0};
-  int j = 0;
-#pragma GCC unroll 16
-  for (; j + 1 < N; j += 2) {
-    FOR(i, V) a[i] += F->Q[j][i] * x[j];
-    FOR(i, V) b[i] += F->Q[j + 1][i] * x[j + 1];
-  }
-  if (N % 2) FOR(i, V) a[i] += F->Q[N - 1][i] * x[N - 1];
-  FOR(i, V) u[i] = (a[i] + b[i]) - F->Q[N][i] * impulse;
+  add_columns(F->Q, N, (const double *)torque, a);
+  FOR(i, V) u[i] = a[i] - F->Q[N][i] * impulse;
   const double speed = u[N / LANES][N % LANES];
   u[V - 1] *= d->kept[V - 1];
   return speed;

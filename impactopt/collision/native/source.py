@@ -45,8 +45,8 @@ _LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GC
 def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
     """C code of the function that `collision_graph` gives, with the same inputs and outputs.
 
-    Its numbers agree with the graph's to rounding. It has no derivatives. Where there is no compiler, the
-    graph takes its place.
+    Its numbers agree with the graph's to rounding, but for implicit steps, which the graph has not. It has no
+    derivatives. Where there is no compiler, the graph takes its place.
     """
     code = _code(collision, "collision", outputs, every)
     return NativeCode(

@@ -69,6 +69,7 @@ def solve(
         build_seconds=built - began,
         solve_seconds=solved - built,
         violations=_violations(program, result),
+        objectives=transcription.achieved(result.x),
     )
 
 

@@ -13,6 +13,7 @@ from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.reach import reach
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
@@ -55,7 +56,7 @@ class Phase:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImpactProblem:
-    """Maximize the impulse that ``robot`` gives to ``target`` with ``striker``.
+    """Maximize what ``robot`` does to ``target`` with ``striker``: by default the impulse.
 
     Attributes
     ----------
@@ -78,6 +79,7 @@ class ImpactProblem:
         torque, ZMP and servo during the impact: they are what others plan with, to compare.
     scenarios : what else may be hit, or not, and has to be survived with the same swing.
     terms : what must hold; kinds that are not given take their defaults.
+    objectives : what is maximized, a weighted sum.
     smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
         return_price: of ending away from the start posture [N s per rad^2]. They only make the optimum
         unique, and its end natural.
@@ -105,6 +107,7 @@ class ImpactProblem:
     coefficient_of_restitution: float = 0.0
     scenarios: tuple[Scenario, ...] = ()
     terms: tuple[Term, ...] = ()
+    objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
     smoothness: float = 1e-5
     wrench_price: float = 1e-3
     return_price: float = 0.1
@@ -157,6 +160,8 @@ class ImpactProblem:
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError(f"two terms of kind {kind.__name__}: give one")
+        lasts, stands = self.collision == "dynamics", self.robot.floating
+        put(self, "objectives", check_objectives(self.objectives, contact=lasts, balance=stands))
         posture = self.start_posture
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
@@ -241,4 +246,6 @@ class ImpactProblem:
             out["collision"] = self.collision + (restitution if self.collision == "rigid" else "")
         if self.scenarios:
             out["scenarios"] = [str(s) for s in self.scenarios]
+        if self.objectives != DEFAULT_OBJECTIVES:
+            out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in self.objectives]
         return out

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any
@@ -27,6 +28,7 @@ class Solution:
     result : the solver's own record, its history included.
     build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver.
     violations : named rows that are not met, worst first, as (name, amount).
+    objectives : what each of the problem's objectives comes to, by name, in its own unit.
     """
 
     problem: ImpactProblem
@@ -36,6 +38,7 @@ class Solution:
     build_seconds: float
     solve_seconds: float
     violations: tuple[tuple[str, float], ...]
+    objectives: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def status(self) -> Status:
@@ -92,6 +95,7 @@ class Solution:
         out: dict[str, Any] = {
             **self.outcome(),
             "impulse_Ns": plan.impulse,
+            "objectives": dict(self.objectives),
             # a plan of an impact without duration knows no force
             "peak_force_N": float(plan.collision.force.max()) if len(plan.collision.ground) else None,
             "contact_ms": 1e3 * (plan.compression + plan.restitution),

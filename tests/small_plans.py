@@ -7,6 +7,7 @@ compiling them would take longer.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from small_robots import arm, biped, striking_point
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.blocks import builders
+from impactopt.nlp.blocks import BlockExpression, builders
+from impactopt.nlp.extra_blocks import extra_blocks
 from impactopt.nlp.start import first_iterate
 from impactopt.nlp.structured import derivative_functions
 from impactopt.nlp.transcription import Transcription
@@ -71,17 +73,25 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     found = {}
     for instant in (False, True):
         found |= builders(c, problem.striker, problem.law, edges, instant=instant)
-    functions: dict[str, Any] = {}
-    for name, build in found.items():
+    return Transcription(problem, c, _functions(found) | _extra_functions(problem))
+
+
+def _functions(builders: dict[str, Callable[[], BlockExpression]]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for name, build in builders.items():
         block = build()
-        functions |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out)}
-    return Transcription(problem, c, functions)
+        out |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out)}
+    return out
+
+
+def _extra_functions(problem: ImpactProblem) -> dict[str, Any]:
+    return _functions({name: b.build for name, b in extra_blocks(problem, problem.coordinates).items()})
 
 
 def changed(transcription: Transcription, **changes: Any) -> Transcription:
-    """The program of the same problem with changes, on the same functions."""
+    """The program of the same problem with changes, on the same functions but for the extra ones."""
     problem = dataclasses.replace(transcription.problem, **changes)
-    return Transcription(problem, problem.coordinates, transcription.functions)
+    return Transcription(problem, problem.coordinates, transcription.functions | _extra_functions(problem))
 
 
 @dataclasses.dataclass

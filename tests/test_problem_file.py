@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import impactopt.problem_file.sections as sections
-from impactopt import terms
+from impactopt import objectives, terms
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.problem import COLLISIONS, ImpactProblem, Phase
@@ -150,6 +150,16 @@ vertical_speed_m_s = 0.15
 angular_momentum_N_m_s = 6
 [terms.incidence]
 speed_m_s = 0.1
+[objectives.impulse]
+weight = 2.0
+[objectives.peak_force]
+weight = -0.02
+[objectives.target_energy]
+weight = 0.5
+[objectives.penetration]
+[objectives.angular_momentum]
+weight = 0.1
+[objectives.effort]
 [solver]
 name = "sqp"
 time_limit_s = 12
@@ -193,6 +203,14 @@ price = 50.0
         capture_margin=0.03, vertical_speed=0.15, angular_momentum=6
     )
     assert problem.term(terms.Incidence) == terms.Incidence(speed=0.1)
+    assert problem.objectives == (
+        objectives.Impulse(weight=2.0),
+        objectives.PeakForce(weight=-0.02),
+        objectives.TargetEnergy(weight=0.5),
+        objectives.Penetration(),
+        objectives.AngularMomentum(weight=0.1),
+        objectives.Effort(),
+    )
     assert (solver.name, solver.time_limit) == ("sqp", 12)
     assert solver.options == {"ipopt": {"max_iter": 77}, "sqp": {"hessian": "bfgs", "price": 50.0}}
 
@@ -210,7 +228,7 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
     for term in terms.DEFAULT_TERMS:
         assert type(term) in kinds
         assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
-    for kind in (Phase, FreeMass, SpringDamper, Scenario):
+    for kind in (Phase, FreeMass, SpringDamper, Scenario, *objectives.Objective.__subclasses__()):
         assert {f.name for f in dataclasses.fields(kind)} == set(kinds[kind].model_fields)
     keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
     keys |= {*sections.Collision.model_fields, "law", "collision_elements"}
@@ -263,6 +281,12 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
             "[terms.torque]\nfraction = 1\n[target]",
             ["[terms] torque", "did you mean 'torque_limit'"],
         ),
+        (
+            "[target]",
+            "[objectives.peak_farce]\n[target]",
+            ["line 7", "[objectives] peak_farce", "did you mean 'peak_force'"],
+        ),
+        ("[target]", "[objectives.effort]\nweight = -1\n[target]", ["[objectives.effort]", "> 0", "-1"]),
         ("[target]", "[collision]\ncompression = [0.5, 0.6]\n[target]", ["compression", "1.1", "sum to 1"]),
         (
             "[target]",

@@ -30,7 +30,8 @@ class BlockExpression:
     sizes: dict[str, int]
 
 
-def _block(z: list[Any], p: list[Any], out: dict[str, Any]) -> BlockExpression:
+def make_block(z: list[Any], p: list[Any], out: dict[str, Any]) -> BlockExpression:
+    """A block from parts of z and of p, and the named slices of its output."""
     return BlockExpression(
         ca.vertcat(*z), ca.vertcat(*p), ca.vertcat(*out.values()), {k: int(v.numel()) for k, v in out.items()}
     )
@@ -74,7 +75,7 @@ def node(c: StanceCoordinates) -> BlockExpression:
         "leg_rate": _leg_part(c, v) / rate_limit,
         "extension": c.leg_determinants(legs) / start,
     }
-    return _block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever, start], out)
+    return make_block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever, start], out)
 
 
 def _base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
@@ -96,7 +97,7 @@ def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
     axes = ca.SX.sym("axes", 9)
     q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
     point, twist, _ = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))
-    return _block(
+    return make_block(
         [y, y1, T], [axes], {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)}
     )
 
@@ -107,7 +108,7 @@ def approach(c: StanceCoordinates, striker: str) -> BlockExpression:
     zero = ca.SX.zeros(c.ny)
     q, v, _ = c.upper_motion(y, zero, zero)
     point = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
-    return _block([y], [normal], {"along": ca.dot(normal, point)})
+    return make_block([y], [normal], {"along": ca.dot(normal, point)})
 
 
 def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
@@ -133,7 +134,7 @@ def coasting(c: StanceCoordinates) -> BlockExpression:
     T1, T, s, after = (ca.SX.sym(name) for name in ("T1", "T", "s", "after"))
     y = y0 + u0 * (after * T1 + T * s)
     out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
-    return _block([y0, u0, T1, T, legs, rates], [s, after], out)
+    return make_block([y0, u0, T1, T, legs, rates], [s, after], out)
 
 
 def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
@@ -176,7 +177,7 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
         "torque": servo,
     }
     z = [y0, u0, ref_legs, ref_rates, ff, d1, T1, d, T, u, u1, legs, f, w]
-    return _block(z, [normal, s, after, kp, kd, limit, weight, lever], out)
+    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out)
 
 
 def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpression:
@@ -206,7 +207,9 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpressio
         "rate": rate,
         "penetration": penetration / DEPTH_SCALE,
     }
-    return _block([y0, d1, T1, d, T, u, f, v, v1, x, x1], [point, normal, after, inverse_mass, params], out)
+    return make_block(
+        [y0, d1, T1, d, T, u, f, v, v1, x, x1], [point, normal, after, inverse_mass, params], out
+    )
 
 
 def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
@@ -243,7 +246,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
         "blow": blow * inverse_mass + lost - (1 + e) * approach,
     }
     p = [normal, rigid, given, stiffness, damping, inverse_mass, limit, weight, lever]
-    return _block([y, legs, u0, du, w, blow], p, out)
+    return make_block([y, legs, u0, du, w, blow], p, out)
 
 
 def two_mass_restitution(ratio: Any) -> Any:
@@ -272,7 +275,7 @@ def link() -> BlockExpression:
     names = ("yf", "yf1", "Tf", "y", "y1", "Ts", "T1", "T2", "d1", "d2", "u0", "u")
     yf, yf1, Tf, y, y1, Ts, T1, T2, d1, d2, u0, u = z = [ca.SX.sym(s) for s in names]
     out = {"contact": y1 / Ts - u0, "position": yf - y - T1 * d1 - T2 * d2, "rate": yf1 / Tf - u}
-    return _block(list(z), [], out)
+    return make_block(list(z), [], out)
 
 
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
@@ -293,7 +296,7 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     polygon = ca.SX.sym("polygon", 3 * edges)
     e = ca.reshape(polygon, 3, edges).T
     out = {"capture": ca.mtimes(e[:, :2], capture) - e[:, 2], "vertical": velocity[2], "angular": h[3:]}
-    return _block([y, y1, legs, T], [polygon], out)
+    return make_block([y, y1, legs, T], [polygon], out)
 
 
 def builders(

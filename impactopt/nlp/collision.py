@@ -62,6 +62,11 @@ class Collision:
         """To the target [N s]."""
         return self.vt[self.end[1]] * self.mass
 
+    @property
+    def target_state(self) -> Affine:
+        """Of the target, at separation."""
+        return self.vt[self.end[1]]
+
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""
         t, p, r = self.t, self.t.problem, self.t.robot

@@ -35,6 +35,11 @@ class InstantImpact:
         """To the target [N s]."""
         return self.blow[0]
 
+    @property
+    def target_state(self) -> Affine:
+        """Of the target, after it."""
+        return self.blow[0] * (1 / self.mass)
+
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of the block ``impact``."""
         t, p = self.t, self.t.problem

@@ -56,6 +56,11 @@ def collision_mesh(elements: tuple[tuple[float, ...], tuple[float, ...]], radau:
     return stages
 
 
+def stage_count(elements: tuple[tuple[float, ...], tuple[float, ...]], stages: int) -> int:
+    """Number of collocation points of a mesh with so many stages an element."""
+    return stages * sum(len(lengths) for lengths in elements)
+
+
 def with_middles(breaks: Array) -> Array:
     """Breaks and the middles between them, in order."""
     return np.sort(np.concatenate([breaks, (breaks[1:] + breaks[:-1]) / 2]))

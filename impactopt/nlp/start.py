@@ -79,4 +79,4 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
     t.u0.write(x, rates)
     for collision in t.collisions:
         collision.guess(x, y_hit, rates, t.swing_legs.read(x)[-1] if c.legs else t.legs0)
-    return np.clip(x, t.layout.lower, t.layout.upper)
+    return np.clip(t.with_lifted(x), t.layout.lower, t.layout.upper)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from impactopt.codegen import cached, model_hash
 from impactopt.cone import contact_wrench_cone, inward_edges
@@ -21,11 +21,14 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.collision import DIRECTIONS, Collision
+from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
 from impactopt.nlp.mesh import collision_mesh, with_middles
-from impactopt.nlp.structured import Block, Rows, StructuredProgram, derivative_functions
+from impactopt.nlp.objective import assemble, quantities
+from impactopt.nlp.structured import Block, Index, Rows, StructuredProgram, derivative_functions
+from impactopt.objectives import AngularMomentum, Effort
 from impactopt.plan import Plan, PlannedScenario
 from impactopt.problem import ImpactProblem
 from impactopt.statics import static_wrenches
@@ -75,13 +78,14 @@ def block_functions(
     out: dict[str, Any] = {}
     instant = problem.collision != "dynamics"
     builders = symbolic.builders(coordinates, problem.striker, problem.law, edges, instant=instant)
-    for name, build in builders.items():
+    found = {name: ExtraBlock((), build) for name, build in builders.items()}
+    for name, block in {**found, **extra_blocks(problem, coordinates)}.items():
 
-        def functions(build: Callable[[], symbolic.BlockExpression] = build, name: str = name) -> list[Any]:
-            b = build()
+        def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
+            b = block.build()
             return derivative_functions(name, b.z, b.p, b.out)
 
-        out |= cached(f"{robot.name}-{name}", (name, *recipe), functions, report=report)
+        out |= cached(f"{robot.name}-{name}", (name, *recipe, *block.key), functions, report=report)
     return out
 
 
@@ -105,6 +109,9 @@ class Transcription:
         self.stages = collision_mesh(problem.collision_elements, Radau.of_stages(problem.collision_stages))
         self.layout, self.rows = Layout(), Rows()
         self.blocks: list[Block] = []
+        self._lifted: list[tuple[Group, Index]] = []
+        self.torques: list[Affine] = []  # over limit, at each node of the block "node", if `torques_lifted`
+        self.angular_momentum: Group | None = None  # after contact, if an objective asks for it
         self._limits()
         self._variables()
         self.contact_state = self.at(self.swing_control, self.swing_breaks, 1.0)
@@ -112,7 +119,8 @@ class Transcription:
         self._contact()
         self._collisions()
         self._after()
-        objective, quadratic, linear = self._objective()
+        self.objectives = quantities(self)
+        objective, quadratic, linear = assemble(self, self.objectives)
         self.program = StructuredProgram(
             self.layout, self.blocks, self.rows, objective=objective, quadratic=quadratic, linear=linear
         )
@@ -203,11 +211,50 @@ class Transcription:
         return out[0], out[1], out[2]
 
     # ------------------------------------------------------------------ rows
-    def _add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
+    def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
         """Append a block; the index of its first output."""
         at = sum(b.count * b.n_out for b in self.blocks)
         self.blocks.append(Block.make(name, self.functions, instances, parameters))
         return at
+
+    def lift(
+        self,
+        name: str,
+        outputs: Index,
+        *,
+        term: str = "",
+        place: str = "",
+        labels: Sequence[str] | None = None,
+        scale: float = 1.0,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+    ) -> Group:
+        """One vector of variables that equals outputs of blocks, so that rows and objective can take it.
+
+        term, place : of the rows that say so, the variables' name if not given; scale, bounds : of variables.
+        """
+        size = len(outputs)
+        labels = labels or ([name] if size == 1 else [f"{name} {k}" for k in range(size)])
+        group = self.layout.add(name, 1, size, lower=lower, upper=upper, scale=scale, labels=labels)
+        self.rows.add(
+            term=term or name,
+            place=place,
+            components=labels,
+            outputs=outputs,
+            affine=-group[0],
+            lower=0,
+            upper=0,
+        )
+        self._lifted.append((group, np.asarray(outputs, dtype=np.intp)))
+        return group
+
+    def with_lifted(self, x: Array) -> Array:
+        """The variables (n,) with those of :meth:`lift` made equal to what they stand for."""
+        x = x.copy()
+        for group, outputs in self._lifted:  # in order: a later one may be a function of an earlier one
+            found = np.concatenate([out.ravel() for out in self.program.outputs(x).values()])[outputs]
+            group.write(x, np.where(np.isfinite(found), found, 0.0))
+        return x
 
     def equal(self, term: str, place: str, components: Sequence[str], outputs: Any) -> None:
         """Rows: outputs of blocks are zero."""
@@ -236,7 +283,7 @@ class Transcription:
             instances.append(coasting)
             places.append(name)
             groups.append(self.coast_w)
-        self._add_block("node", instances, self._node_parameters())
+        self.add_block("node", instances, self._node_parameters())
         self._node_rows(places, self.blocks[-1].n_out)
         wrenches = [group[k] for group in groups for k in range(group.count)]
         for place, wrench in zip(places, wrenches, strict=True):
@@ -255,6 +302,11 @@ class Transcription:
         self.rate_rows("swing", self.swing_control, range(2, last), self.swing_breaks, self.swing_T)
         for follow in self.follows:
             follow.add_rate_rows()
+
+    @property
+    def torques_lifted(self) -> bool:
+        """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
+        return any(isinstance(o, Effort) for o in self.problem.objectives)
 
     def _node_rows(self, places: list[str], n_out: int) -> None:
         c, r = self.coordinates, self.robot
@@ -283,7 +335,20 @@ class Transcription:
                 outputs=at + part["extension"],
                 lower=self.extension.minimum,
             )
-            if i != last:  # at contact it is the variable `feedforward`, which has the limit as its bounds
+            if i == last:  # at contact it is the variable `feedforward`, which has the limit as its bounds
+                self.torques.append(self.feedforward[0])
+            elif self.torques_lifted:
+                torque = self.lift(
+                    f"torque, {place}",
+                    at + part["torque"],
+                    term=self.torque.name,
+                    place=place,
+                    labels=r.joint_names,
+                    lower=-self.torque.fraction,
+                    upper=self.torque.fraction,
+                )
+                self.torques.append(torque[0])
+            else:
                 self.rows.add(
                     term=self.torque.name,
                     place=place,
@@ -359,7 +424,7 @@ class Transcription:
     def _contact(self) -> None:
         p = self.problem
         y, y1, _ = self.contact_state
-        at = self._add_block("contact", [[y, y1, self.swing_T[0]]], rotation_rows(p.normal).ravel())
+        at = self.add_block("contact", [[y, y1, self.swing_T[0]]], rotation_rows(p.normal).ravel())
         self.rows.add(
             term="hit point",
             place="contact",
@@ -385,7 +450,7 @@ class Transcription:
         )
         nodes = self.swing_nodes[:-1]
         instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
-        at = self._add_block("approach", instances, p.normal)
+        at = self.add_block("approach", instances, p.normal)
         plane, ahead = float(p.normal @ p.point), float(np.mean(p.swing.duration))
         nearest = min(CLEARANCE, self._start_gap())
         for i, s in enumerate(nodes):
@@ -415,8 +480,11 @@ class Transcription:
             for name, (instances, numbers) in found.items():
                 slots.setdefault(name, []).extend(instances)
                 parameters.setdefault(name, []).extend(numbers)
-        at = {name: self._add_block(name, slots[name], np.array(parameters[name])) for name in slots}
+        at = {name: self.add_block(name, slots[name], np.array(parameters[name])) for name in slots}
         sizes = {block.name: block.n_out for block in self.blocks}
+        expected = self.collisions[0]
+        if isinstance(expected, Collision):
+            self.deepest = at["force"] + expected.end[0] * sizes["force"] + self.parts("force")["penetration"]
         for collision, index in zip(self.collisions, first, strict=True):
             collision.add_rows({name: (at[name] + k * sizes[name], sizes[name]) for name, k in index.items()})
 
@@ -435,7 +503,7 @@ class Transcription:
             instances += other.link((other.after[0], other.u[other.end[1]], one))
         if self.brake is not None and self.brake_after is not None:
             instances += self.brake.link_from_coasting(self.brake_after)
-        at = self._add_block("link", instances, np.zeros(0))
+        at = self.add_block("link", instances, np.zeros(0))
         labels, places = self.coordinates.labels, at + 3 * np.arange(self.ny)
         self.equal("collision starts from the swing's end", "rate", labels, places)
         self.equal("follow-through starts from the predicted state", "position", labels, places + 1)
@@ -464,9 +532,9 @@ class Transcription:
                 found.append((slots, s.capture_margin, f"contact, if {s.name}"))
         inward, offset = inward_edges(support_polygon(self.robot, self.coordinates))
         parameters = [np.column_stack([inward, offset + (m or 0.0)]).ravel() for _, m, _ in found]
-        at = self._add_block("balance", [slots for slots, _, _ in found], np.array(parameters))
+        at = self.add_block("balance", [slots for slots, _, _ in found], np.array(parameters))
         k = len(inward)
-        limits = np.array([self.balance.vertical_speed, *[self.balance.angular_momentum] * 3])
+        wanted = any(isinstance(o, AngularMomentum) for o in self.problem.objectives)
         for i, (_, margin, place) in enumerate(found):
             start = at + i * (k + 4)
             if margin is not None:
@@ -477,18 +545,34 @@ class Transcription:
                     outputs=start + np.arange(k),
                     lower=0,
                 )
-            for j, (term, component) in enumerate(
-                zip(("vertical speed", *["angular momentum"] * 3), ("z", "x", "y", "z"), strict=True)
-            ):
-                if np.isfinite(limits[j]):
-                    self.rows.add(
-                        term=term,
-                        place=place,
-                        components=[component],
-                        outputs=np.array([start + k + j]),
-                        lower=-limits[j],
-                        upper=limits[j],
-                    )
+            slow, still = self.balance.vertical_speed, self.balance.angular_momentum
+            self.rows.add(
+                term="vertical speed",
+                place=place,
+                components=["z"],
+                outputs=np.array([start + k]),
+                lower=-slow,
+                upper=slow,
+            )
+            outputs = start + k + 1 + np.arange(3)
+            if wanted and i == 0:
+                self.angular_momentum = self.lift(
+                    "angular momentum",
+                    outputs,
+                    place=place,
+                    labels=["x", "y", "z"],
+                    lower=-still,
+                    upper=still,
+                )
+                continue
+            self.rows.add(
+                term="angular momentum",
+                place=place,
+                components=["x", "y", "z"],
+                outputs=outputs,
+                lower=-still,
+                upper=still,
+            )
 
     def link_slots(
         self,
@@ -511,39 +595,6 @@ class Transcription:
             out.append([yk, rk, start[2], a, b, self.swing_T[0], *times, one, two, u0, u])
         return out
 
-    # ------------------------------------------------------------------ objective
-    def _objective(self) -> tuple[Affine, Any, Array]:
-        """- impulse [N s], plus a small price on accelerations and on sole wrenches.
-
-        The price makes the optimum unique.
-        """
-        p, n = self.problem, self.layout.n
-        impulse = self.collisions[0].impulse
-        quadratic = sp.csr_array((n, n))
-        linear = np.zeros(n)
-        for control, breaks, nodes, bounds in (
-            (self.swing_control, self.swing_breaks, self.swing_nodes, p.swing.duration),
-            *((f.control, self.follow_breaks, self.follow_nodes, p.follow.duration) for f in self.follows),
-        ):
-            typical = float(np.mean(bounds))
-            lengths = np.gradient(nodes)
-            for at, length in zip(nodes, lengths, strict=True):
-                acc = self.at(control, breaks, at)[2] * (1 / typical**2)
-                weight = p.smoothness * typical * length
-                m = acc.matrix(n)
-                quadratic = quadratic + 2 * weight * (m.T @ m)
-                linear += 2 * weight * (m.T @ acc.const)
-        diagonal = np.zeros(n)
-        for group in (self.swing_w, self.coast_w, *[part.w for part in (*self.follows, *self.collisions)]):
-            span = slice(group.offset, group.offset + group.count * group.size)
-            diagonal[span] = p.wrench_price / max(1, group.count)
-        for follow in self.follows:  # price (y_end - y_start)^2: rest near the start posture
-            end = follow.c.index(-1)
-            diagonal[end] += 2 * p.return_price
-            linear[end] -= 2 * p.return_price * self.y0
-        away = Affine.constant(len(self.follows) * p.return_price * float(self.y0 @ self.y0))
-        return away - impulse, quadratic + sp.diags_array(diagonal), linear
-
     # ------------------------------------------------------------------ solution
     def spline(
         self, x: Array, control: Callable[[int], Affine], breaks: Array, duration: Group
@@ -551,6 +602,10 @@ class Transcription:
         """The spline that solver variables (n,) stand for."""
         points = np.array([control(j).evaluate(x) for j in range(len(breaks) + 2)])
         return CubicSpline(control=points, breaks=breaks, duration=float(duration.read(x)[0, 0]))
+
+    def achieved(self, x: Array) -> dict[str, float]:
+        """What the objectives' quantities come to, by their names, for solver variables (n,)."""
+        return {o.name: quantity.evaluate(x) for o, quantity in self.objectives}
 
     def decode(self, x: Array) -> Plan:
         """The plan that solver variables (n,) stand for."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, cast, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
-from impactopt import terms
+from impactopt import objectives, terms
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.presets import load_robot
@@ -125,6 +125,47 @@ class Objective(Section):
     smoothness: NotNegative = _optional()
     wrench_price: NotNegative = _optional()
     return_price: NotNegative = _optional()
+
+
+class Impulse(Section):
+    kind = objectives.Impulse
+    weight: float = _optional()
+
+
+class PeakForce(Section):
+    kind = objectives.PeakForce
+    weight: float = _optional()
+
+
+class TargetEnergy(Section):
+    kind = objectives.TargetEnergy
+    weight: float = _optional()
+
+
+class Penetration(Section):
+    kind = objectives.Penetration
+    weight: float = _optional()
+
+
+class AngularMomentum(Section):
+    kind = objectives.AngularMomentum
+    weight: float = _optional()
+
+
+class Effort(Section):
+    kind = objectives.Effort
+    weight: float = _optional()
+
+
+class Objectives(Section):
+    """What is maximized; if there are any, only those that are given."""
+
+    impulse: Impulse = _optional()
+    peak_force: PeakForce = _optional()
+    target_energy: TargetEnergy = _optional()
+    penetration: Penetration = _optional()
+    angular_momentum: AngularMomentum = _optional()
+    effort: Effort = _optional()
 
 
 class TorqueLimit(Section):
@@ -266,6 +307,7 @@ class File(Section):
     collision: Collision = _optional()
     scenarios: list[ScenarioSection] = _optional()
     objective: Objective = _optional()
+    objectives: Objectives = _optional()
     terms: Terms = _optional()
     solver: Solver = _optional()
 
@@ -288,7 +330,8 @@ class File(Section):
             out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
         if self.scenarios is not None:
             out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
-        if self.terms is not None:
-            found = (getattr(self.terms, name) for name in Terms.model_fields)
-            out["terms"] = tuple(term.build() for term in found if term is not None)
+        for name, section in (("terms", self.terms), ("objectives", self.objectives)):
+            if section is not None:
+                found = (getattr(section, field) for field in type(section).model_fields)
+                out[name] = tuple(part.build() for part in found if part is not None)
         return out

@@ -1,0 +1,154 @@
+"""What a program minimizes: minus the weighted sum of the problem's objectives, plus small prices.
+
+Every objective is affine or quadratic in the variables. What is neither is an output of a block first, with a
+variable that equals it (:meth:`impactopt.nlp.transcription.Transcription.lift`); only what a problem asks for
+is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
+from impactopt.nlp.collision import Collision
+from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.objectives import (
+    AngularMomentum,
+    Effort,
+    Impulse,
+    Objective,
+    PeakForce,
+    Penetration,
+    TargetEnergy,
+)
+from impactopt.plan import complete_reference
+from impactopt.statics import static_wrenches
+
+if TYPE_CHECKING:
+    from impactopt.nlp.transcription import Transcription
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What an objective weighs: an affine expression plus the squares of a group of variables."""
+
+    affine: Affine
+    squares: Group | None = None
+
+    def evaluate(self, x: Array) -> float:
+        """Its value for solver variables (n,)."""
+        squared = float(np.sum(self.squares.read(x) ** 2)) if self.squares is not None else 0.0
+        return float(self.affine.evaluate(x)[0]) + squared
+
+
+def quantities(t: Transcription) -> list[tuple[Objective, Quantity]]:
+    """The objectives of a problem with their quantities; adds what they need to the program."""
+    return [(o, _QUANTITIES[type(o)](t)) for o in t.problem.objectives]
+
+
+def _impulse(t: Transcription) -> Quantity:
+    return Quantity(t.collisions[0].impulse)
+
+
+def _peak_force(t: Transcription) -> Quantity:
+    hit = t.collisions[0]
+    assert isinstance(hit, Collision)  # the problem is refused otherwise
+    forces = hit.f
+    at = t.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
+    return Quantity(t.lift("peak force", np.array([at]))[0] * FORCE_SCALE)
+
+
+def _target_energy(t: Transcription) -> Quantity:
+    numbers = np.array(list(t.problem.target.parameters.values()))
+    at = t.add_block("energy", [[t.collisions[0].target_state]], numbers)
+    return Quantity(t.lift("target energy", np.array([at]))[0])
+
+
+def _penetration(t: Transcription) -> Quantity:
+    return Quantity(t.lift("deepest penetration", t.deepest)[0] * DEPTH_SCALE)
+
+
+def _angular_momentum(t: Transcription) -> Quantity:
+    assert t.angular_momentum is not None
+    return Quantity(Affine.zeros(1), t.angular_momentum)
+
+
+def _effort(t: Transcription) -> Quantity:
+    """T sum(tau^2) at each node is a variable; their sum is the trapezoidal rule's."""
+    swing, follow = len(t.swing_nodes), len(t.follow_nodes)
+    durations = [t.swing_T] * swing + [t.follow.T] * follow
+    slots = [[tau, T[0]] for tau, T in zip(t.torques, durations, strict=False)]
+    at = t.add_block("effort", slots, np.zeros(0))
+    of_node = t.lift("effort of a node", at + np.arange(len(slots)))[0]
+    first, *of_swing = trapezoid(np.concatenate([[0.0], t.swing_nodes]))
+    weights = np.array([*of_swing, *trapezoid(t.follow_nodes)])
+    start = first * float(np.sum(start_torque(t) ** 2))
+    return Quantity(of_node.apply(weights[None]) + t.swing_T[0] * start)
+
+
+_QUANTITIES: dict[type[Objective], Callable[[Transcription], Quantity]] = {
+    Impulse: _impulse,
+    PeakForce: _peak_force,
+    TargetEnergy: _target_energy,
+    Penetration: _penetration,
+    AngularMomentum: _angular_momentum,
+    Effort: _effort,
+}
+
+
+def trapezoid(nodes: Array) -> Array:
+    """Weights (k,) of the trapezoidal rule on ascending nodes (k,)."""
+    half = np.diff(nodes) / 2
+    return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
+
+
+def start_torque(t: Transcription) -> Array:
+    """Torque over limit (n,) at rest in the start posture."""
+    c, rest = t.coordinates, np.zeros((1, t.ny))
+    wrench = static_wrenches(c, t.y0, t.legs0)[None]
+    torque = complete_reference(t.problem, t.y0[None], rest, rest, wrench, t.legs0)[3][0]
+    return np.asarray(torque / t.robot.torque_limit)
+
+
+def assemble(t: Transcription, wanted: list[tuple[Objective, Quantity]]) -> tuple[Affine, Any, Array]:
+    """Objective, Q and q of :class:`impactopt.nlp.structured.StructuredProgram` [N s].
+
+    Small prices on accelerations and on sole wrenches, and on ending away from the start posture, make the
+    optimum unique.
+    """
+    p, n = t.problem, t.layout.n
+    quadratic = sp.csr_array((n, n))
+    linear, diagonal = np.zeros(n), np.zeros(n)
+    objective = Affine.zeros(1)
+    for o, quantity in wanted:
+        worth = -o.weight if o.cost else o.weight
+        objective = objective - quantity.affine * worth
+        if (group := quantity.squares) is not None:
+            span = slice(group.offset, group.offset + group.count * group.size)
+            diagonal[span] -= 2 * worth * np.tile(group.scale**2, group.count)
+    for control, breaks, nodes, bounds in (
+        (t.swing_control, t.swing_breaks, t.swing_nodes, p.swing.duration),
+        *((f.control, t.follow_breaks, t.follow_nodes, p.follow.duration) for f in t.follows),
+    ):
+        typical = float(np.mean(bounds))
+        lengths = np.gradient(nodes)
+        for at, length in zip(nodes, lengths, strict=True):
+            acc = t.at(control, breaks, at)[2] * (1 / typical**2)
+            weight = p.smoothness * typical * length
+            m = acc.matrix(n)
+            quadratic = quadratic + 2 * weight * (m.T @ m)
+            linear += 2 * weight * (m.T @ acc.const)
+    for group in (t.swing_w, t.coast_w, *[part.w for part in (*t.follows, *t.collisions)]):
+        span = slice(group.offset, group.offset + group.count * group.size)
+        diagonal[span] = p.wrench_price / max(1, group.count)
+    for follow in t.follows:  # price (y_end - y_start)^2: rest near the start posture
+        end = follow.c.index(-1)
+        diagonal[end] += 2 * p.return_price
+        linear[end] -= 2 * p.return_price * t.y0
+    away = Affine.constant(len(t.follows) * p.return_price * float(t.y0 @ t.y0))
+    return away + objective, quadratic + sp.diags_array(diagonal), linear

@@ -1,0 +1,139 @@
+"""What a plan is to bring: a weighted sum of quantities, the impulse by default.
+
+A weight turns a quantity's unit into N s, so that weights compare: TargetEnergy(weight=0.5) beside Impulse()
+gives up half a newton second for a joule more in the target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from impactopt.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Objective:
+    """Base of all objectives: ``name`` is what reports call it, ``unit`` is that of its quantity.
+
+    weight [N s a unit] : what one unit of it is worth, or of a cost, what it takes off.
+
+    Raises
+    ------
+    InputError : a weight that is zero or not finite; a negative one of a cost.
+    """
+
+    name: ClassVar[str] = ""
+    unit: ClassVar[str] = ""
+    cost: ClassVar[bool] = False  # less of it is better
+    contact: ClassVar[bool] = False  # it is a quantity of a contact that lasts
+    weight: float
+
+    def __post_init__(self) -> None:
+        kind = type(self).__name__
+        if not np.isfinite(self.weight) or self.weight == 0:
+            raise InputError(f"{kind}.weight is {self.weight}; give a number, or leave {kind} out")
+        if self.cost and self.weight < 0:
+            raise InputError(
+                f"{kind}.weight is {self.weight:g}; give a number > 0, the price: {kind} is kept small"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Impulse(Objective):
+    """The impulse to the target [N s]."""
+
+    name: ClassVar[str] = "impulse"
+    unit: ClassVar[str] = "N s"
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakForce(Objective):
+    """The largest contact force [N], of the collocated ones; a weight below zero keeps it small.
+
+    Smooth: sum f^9 / sum f^8 (Lehmer's mean). It is the largest where the others are small beside it or as
+    large, and never above it; of a half sine it is some 2 % below. The force in the first instant of a law
+    with damping is not among the collocated ones.
+    """
+
+    name: ClassVar[str] = "peak force"
+    unit: ClassVar[str] = "N"
+    contact: ClassVar[bool] = True
+    weight: float = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetEnergy(Objective):
+    """What the target holds at separation, or has used up in what it was hit for [J]: ``Target.energy``."""
+
+    name: ClassVar[str] = "target energy"
+    unit: ClassVar[str] = "J"
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Penetration(Objective):
+    """The deepest penetration [m], at the end of compression; a weight below zero keeps it small."""
+
+    name: ClassVar[str] = "penetration"
+    unit: ClassVar[str] = "m"
+    contact: ClassVar[bool] = True
+    weight: float = 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngularMomentum(Objective):
+    """Cost: |angular momentum|^2 about the centre of mass after contact [(N m s)^2].
+
+    Not for a robot on a fixed base, whose balance nobody asks about.
+    """
+
+    name: ClassVar[str] = "angular momentum after contact, squared"
+    unit: ClassVar[str] = "(N m s)^2"
+    cost: ClassVar[bool] = True
+    weight: float = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort(Objective):
+    """Cost: integral of the sum over the joints of (torque / limit)^2 [s], in swing and follow-through.
+
+    By the trapezoidal rule on the nodes. To be kept small beside what is really wanted.
+    """
+
+    name: ClassVar[str] = "effort"
+    unit: ClassVar[str] = "s"
+    cost: ClassVar[bool] = True
+    weight: float = 0.01
+
+
+DEFAULT_OBJECTIVES: tuple[Objective, ...] = (Impulse(),)
+
+
+def check_objectives(objectives: object, *, contact: bool, balance: bool) -> tuple[Objective, ...]:
+    """The objectives as a tuple; ``contact``: the contact lasts; ``balance``: the robot has one to keep.
+
+    Raises
+    ------
+    InputError : none, something else, two of a kind, one that the problem has no quantity for.
+    """
+    if not isinstance(objectives, (list, tuple)) or not all(isinstance(o, Objective) for o in objectives):
+        raise InputError(
+            f"objectives must be a tuple of objectives, such as (Impulse(),), not {objectives!r}"
+        )
+    if not objectives:
+        raise InputError("objectives is empty: give what the plan is for, such as (Impulse(),)")
+    kinds = [type(o) for o in objectives]
+    for o, kind in zip(objectives, kinds, strict=True):
+        if kinds.count(kind) > 1:
+            raise InputError(f"two objectives of kind {kind.__name__}: give one")
+        if o.contact and not contact:
+            raise InputError(
+                f'{kind.__name__} is of a contact that lasts: give collision="dynamics", or leave it out'
+            )
+        if isinstance(o, AngularMomentum) and not balance:
+            raise InputError("AngularMomentum is of a robot that stands: leave it out on a fixed base")
+    return tuple(objectives)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -10,7 +12,9 @@ from hypothesis import strategies as st
 
 from impactopt.errors import InputError
 from impactopt.sqp import QP_SOLVERS, QPStatus, QuadraticProgram, make_qp_solver
+from impactopt.sqp.daqp_solver import DaqpSolver
 from impactopt.sqp.osqp_solver import OsqpSolver
+from impactopt.sqp.piqp_solver import PiqpSolver
 
 INF = np.inf
 SOLVERS = sorted(QP_SOLVERS)
@@ -72,16 +76,35 @@ def test_random_qps_are_solved(name, seed, n, rows, equalities):
     assert_solves(problem, solution)
 
 
+@pytest.mark.parametrize("name", SOLVERS)
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10**6), wrong=st.integers(0, 10**6))
-def test_the_guess_does_not_change_the_answer(seed, wrong):
+def test_the_guess_does_not_change_the_answer(name, seed, wrong):
     problem = random_qp(seed, 6, 8, 2)
     rng = np.random.default_rng(wrong)
     guess = tuple(rng.normal(size=k) * (rng.random(k) < 0.5) for k in (6, 8, 6))
-    solver = make_qp_solver("active_set")
+    solver = make_qp_solver(name)
     cold, warm = solver.solve(problem), solver.solve(problem, start=guess)
     assert warm.status is QPStatus.SOLVED
     np.testing.assert_allclose(warm.x, cold.x, atol=1e-6 * (1 + np.abs(cold.x).max()))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("seed", range(6))
+def test_small_qps_are_solved_to_rounding_and_told_what_holds(name, seed):
+    problem = random_qp(seed, 20, 30, 4)
+    exact, found = make_qp_solver("active_set").solve(problem), make_qp_solver(name).solve(problem)
+    assert problem.error(found.x, found.y, found.z) < 1e-9
+    np.testing.assert_array_equal(found.y != 0, exact.y != 0)
+    np.testing.assert_array_equal(found.z != 0, exact.z != 0)
+
+
+def test_daqp_starts_from_the_active_set_of_the_guess():
+    problem = random_qp(3, 20, 30, 0)
+    solver = DaqpSolver()
+    first = solver.solve(problem)
+    assert first.iterations > 5
+    assert solver.solve(problem, start=(first.x, first.y, first.z)).iterations <= 1
 
 
 def test_the_right_guess_needs_no_iteration():
@@ -120,8 +143,9 @@ def test_nonconvex_qps_fail_without_an_exception(name):
     assert not make_qp_solver(name).solve(qp(np.diag([1, -1]), [0, 0], [[1, 1]], [0], [0])).usable
 
 
-def test_osqp_is_updated_in_place_while_the_pattern_stays():
-    solver = OsqpSolver()
+@pytest.mark.parametrize("make", [OsqpSolver, PiqpSolver, lambda: PiqpSolver(dense_limit=0)])
+def test_solvers_are_updated_in_place_while_the_pattern_stays(make):
+    solver = make()
     for seed in range(4):
         problem = random_qp(seed, 6, 8, 0)
         assert_solves(problem, solver.solve(problem))
@@ -130,7 +154,8 @@ def test_osqp_is_updated_in_place_while_the_pattern_stays():
     assert solver.setups == 2
 
 
-def test_large_sparse_qps_are_refined_to_the_tolerance():
+@pytest.mark.parametrize("make", [OsqpSolver, PiqpSolver])
+def test_large_sparse_qps_are_solved_to_the_tolerance(make):
     n = 400  # beyond the dense method
     rng = np.random.default_rng(0)
     D = sp.diags_array([np.ones(n - 1), -np.ones(n - 1)], offsets=[1, 0], shape=(n - 1, n))
@@ -143,7 +168,7 @@ def test_large_sparse_qps_are_refined_to_the_tolerance():
         x_lower=np.full(n, -2.0),
         x_upper=np.full(n, 2.0),
     )
-    solution = OsqpSolver().solve(problem)
+    solution = make().solve(problem)
     assert solution.status is QPStatus.SOLVED
     assert np.count_nonzero(solution.y) > 20
     assert_solves(problem, solution, tolerance=1e-7)
@@ -161,3 +186,18 @@ def test_residuals_are_those_of_the_kkt_conditions():
 def test_unknown_solvers_are_named():
     with pytest.raises(InputError, match=r"'osqq' \(did you mean 'osqp'\?\)"):
         make_qp_solver("osqq")
+
+
+@pytest.mark.parametrize("name", ["daqp", "piqp"])
+def test_solvers_that_are_not_installed_are_said_so(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, f"impactopt.sqp.{name}_solver")
+    with pytest.raises(
+        InputError, match=rf"'{name}' is not installed: pip install {name}, or impactopt\[qp\]"
+    ):
+        make_qp_solver(name)
+
+
+@pytest.mark.parametrize("name", ["osqp", "daqp", "piqp"])
+def test_no_time_is_no_answer(name):
+    assert not make_qp_solver(name).solve(random_qp(0, 60, 90, 8), time_limit=0.0).usable

@@ -23,6 +23,8 @@ from impactopt.sqp.subproblem import normal_step
 WAYS = {
     "default": SQPOptions(),
     "osqp": SQPOptions(qp_solver="osqp"),
+    "daqp": SQPOptions(qp_solver="daqp"),
+    "piqp": SQPOptions(qp_solver="piqp"),
     "as if large": SQPOptions(dense_limit=0),
     "bfgs": SQPOptions(hessian="bfgs"),
 }

@@ -11,16 +11,13 @@ import scipy.sparse as sp
 
 from impactopt.program import Matrix, Vector
 from impactopt.sqp.active_set import ActiveSetSolver
+from impactopt.sqp.answers import HOPELESS, SMALL, answer, no_answer, split
 from impactopt.sqp.qp import QPSolution, QPStatus, QuadraticProgram
 from impactopt.sqp.refine import active_set, refine
 
 _USABLE = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 _INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE)
 _UNFINISHED = (osqp.SolverStatus.OSQP_MAX_ITER_REACHED, osqp.SolverStatus.OSQP_TIME_LIMIT_REACHED)
-
-
-SMALL = 300  # variables; up to here the dense active-set method finishes
-_HOPELESS = 1e-2  # largest error of an answer that is of any use
 
 
 class OsqpSolver:
@@ -61,14 +58,14 @@ class OsqpSolver:
         """Solve the QP from the guess (x, y, z); see `QPSolver`."""
         C, lower, upper = qp.stacked
         if (lower > upper).any():
-            return _nothing(qp, QPStatus.INFEASIBLE, 0)
+            return no_answer(qp, QPStatus.INFEASIBLE)
         if start is not None:
             # Near the end of an SQP the active set no longer changes: the last one gives the answer.
             guess = refine(qp, start[0], np.concatenate(start[1:]) / qp.row_scale, rounds=3)
             if guess is not None and guess.error <= self.tolerance:
-                return _solution(qp, guess.x, guess.y, QPStatus.SOLVED, 0)
+                return answer(qp, guess.x, guess.y, QPStatus.SOLVED, 0)
         if not self._load(qp, C, lower, upper):
-            return _nothing(qp, QPStatus.FAILED, 0)
+            return no_answer(qp, QPStatus.FAILED)
         assert self._solver is not None
         if start is not None:
             self._solver.warm_start(x=start[0], y=np.concatenate(start[1:]) / qp.row_scale)
@@ -78,32 +75,32 @@ class OsqpSolver:
     def _iterate(self, qp: QuadraticProgram, deadline: float) -> QPSolution:
         """Let OSQP run for longer and longer, and try to finish from its answer each time."""
         assert self._solver is not None
-        iterations, best = 0, _nothing(qp, QPStatus.FAILED, 0)
-        worst = _HOPELESS
+        iterations, best = 0, no_answer(qp, QPStatus.FAILED)
+        worst = HOPELESS
         for more in self._stages:
             left = deadline - time.perf_counter()
             if left <= 0.0:
                 break
             self._solver.update_settings(max_iter=more, time_limit=min(left, 1e10))
-            answer = self._solver.solve(raise_error=False)
-            status = answer.info.status_val
-            iterations += int(answer.info.iter)
+            found = self._solver.solve(raise_error=False)
+            status = found.info.status_val
+            iterations += int(found.info.iter)
             if status == osqp.SolverStatus.OSQP_SIGINT:
                 raise KeyboardInterrupt
             if status in _INFEASIBLE:
                 if qp.n <= SMALL:  # OSQP may be wrong about it; this is exact
                     return self._active_set.solve(qp, time_limit=None if left == np.inf else left)
-                return _nothing(qp, QPStatus.INFEASIBLE, iterations)
+                return no_answer(qp, QPStatus.INFEASIBLE, iterations)
             if status not in _USABLE + _UNFINISHED or not (
-                np.isfinite(answer.x).all() and np.isfinite(answer.y).all()
+                np.isfinite(found.x).all() and np.isfinite(found.y).all()
             ):
                 self._solver = None  # whatever went wrong stays in its state
                 break
-            x, unit, error = self._finish(qp, np.array(answer.x), np.array(answer.y), deadline)
+            x, unit, error = self._finish(qp, np.array(found.x), np.array(found.y), deadline)
             if error < worst:
                 worst = error
                 reached = QPStatus.SOLVED if worst <= self.tolerance else QPStatus.INACCURATE
-                best = _solution(qp, x, unit, reached, iterations)
+                best = answer(qp, x, unit, reached, iterations)
             if worst <= self.tolerance or status == osqp.SolverStatus.OSQP_SOLVED:
                 break
         return dataclasses.replace(best, iterations=iterations)
@@ -112,9 +109,9 @@ class OsqpSolver:
         self, qp: QuadraticProgram, x: Vector, unit: Vector, deadline: float
     ) -> tuple[Vector, Vector, float]:
         """The best of OSQP's answer and what can be made of it, with its error."""
-        worst = qp.error(x, *_split(qp, unit))
+        worst = qp.error(x, *split(qp, unit))
         if qp.n <= SMALL:
-            guess = (x, *_split(qp, active_set(qp, x, unit).astype(float)))
+            guess = (x, *split(qp, active_set(qp, x, unit).astype(float)))
             left = None if deadline == np.inf else deadline - time.perf_counter()
             exact = self._active_set.solve(qp, start=guess, time_limit=left)
             if exact.status is QPStatus.SOLVED:
@@ -148,19 +145,3 @@ class OsqpSolver:
         self._solver, self._pattern = solver, pattern
         self.setups += 1
         return True
-
-
-def _split(qp: QuadraticProgram, unit: Vector) -> tuple[Vector, Vector]:
-    y = unit * qp.row_scale
-    return y[: qp.m], y[qp.m :]
-
-
-def _solution(qp: QuadraticProgram, x: Vector, unit: Vector, status: QPStatus, iterations: int) -> QPSolution:
-    y, z = _split(qp, unit)
-    return QPSolution(x=x, y=y, z=z, status=status, iterations=iterations)
-
-
-def _nothing(qp: QuadraticProgram, status: QPStatus, iterations: int) -> QPSolution:
-    return QPSolution(
-        x=np.zeros(qp.n), y=np.zeros(qp.m), z=np.zeros(qp.n), status=status, iterations=iterations
-    )

@@ -14,12 +14,13 @@ from impactopt.ipopt import solve_ipopt
 from impactopt.nlp.start import first_iterate
 from impactopt.nlp.transcription import Transcription, block_functions
 from impactopt.problem import ImpactProblem
-from impactopt.program import Callback, NonlinearProgram, SolverResult
+from impactopt.program import Callback, NonlinearProgram, SolverResult, worst_rows
 from impactopt.solution import Solution
 from impactopt.sqp import SQPOptions, solve_sqp
 
 SOLVERS = ("ipopt", "sqp")
 VIOLATED = 1e-4  # rows beyond this are named
+NAMED = 20  # at most
 
 
 def solve(
@@ -61,6 +62,7 @@ def solve(
         report(f"program of {program.n} variables and {program.m} rows; {solver} starts")
     result = _run(program, x0, solver, options, time_limit, callback)
     solved = time.perf_counter()
+    found = program.constraints(result.x)
     return Solution(
         problem=problem,
         plan=transcription.decode(result.x),
@@ -68,7 +70,7 @@ def solve(
         solver=solver,
         build_seconds=built - began,
         solve_seconds=solved - built,
-        violations=_violations(program, result),
+        violations=tuple(worst_rows(program, result.x, found, tolerance=VIOLATED, count=NAMED)),
         objectives=transcription.achieved(result.x),
     )
 
@@ -87,10 +89,3 @@ def _run(
     if time_limit is not None:
         settings["time_limit"] = time_limit
     return solve_sqp(program, x0, options=SQPOptions(**settings), callback=callback)
-
-
-def _violations(program: NonlinearProgram, result: SolverResult) -> tuple[tuple[str, float], ...]:
-    g = program.constraints(result.x)
-    over = np.maximum(np.maximum(program.g_lower - g, g - program.g_upper), 0.0)
-    worst = np.argsort(-over)[:20]
-    return tuple((program.row_name(int(i)), float(over[i])) for i in worst if over[i] > VIOLATED)

@@ -6,7 +6,7 @@ The border between the symbolic and the numeric half of the package: everything 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -68,6 +68,31 @@ class NonlinearProgram(Protocol):
     def variable_name(self, j: int) -> str:
         """What entry j of x is to the reader."""
         ...
+
+
+@runtime_checkable
+class SpokenProgram(NonlinearProgram, Protocol):
+    """A program that tells its violated rows as a person reads them."""
+
+    def row_group(self, i: int) -> Hashable:
+        """What row i shares with the rows of which one message stands for all."""
+        ...
+
+    def describe_violation(self, i: int, x: Vector, amount: float) -> tuple[str, str]:
+        """Row i at x ("torque limit, swing at 0.61 s, elbow") and the amount ("12 % over its limit")."""
+        ...
+
+
+@dataclass(frozen=True)
+class Violation:
+    """What is not met: as a person reads it, how far it is off, and the amount in the row's own unit."""
+
+    what: str
+    by: str
+    amount: float
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.by}"
 
 
 class Status(enum.Enum):
@@ -249,30 +274,38 @@ def is_stationary_violation(
 
 def worst_rows(
     program: NonlinearProgram, x: Vector, g: Vector, *, tolerance: float, count: int = 5
-) -> list[tuple[str, float]]:
-    """Names and violations of what is violated by more than the tolerance, largest first."""
+) -> list[Violation]:
+    """What is violated by more than the tolerance, largest first; of rows that belong together the worst."""
     violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
     violations = np.where(np.isnan(violations), np.inf, violations)
-    order = [int(i) for i in np.argsort(-violations, kind="stable")[:count] if violations[i] > tolerance]
-    m = program.m
-    return [
-        (program.row_name(i) if i < m else f"bound of {program.variable_name(i - m)}", float(violations[i]))
-        for i in order
-    ]
+    m, out, seen = program.m, list[Violation](), set[Hashable]()
+    spoken = program if isinstance(program, SpokenProgram) else None
+    for i in np.argsort(-violations, kind="stable").tolist():
+        amount = float(violations[i])
+        if not amount > tolerance or len(out) == count:
+            break
+        what, by = f"bound of {program.variable_name(i - m)}" if i >= m else "", f"by {amount:.3g}"
+        if i < m and spoken is not None:
+            if (group := spoken.row_group(i)) in seen:
+                continue
+            seen.add(group)
+            what, by = spoken.describe_violation(i, x, amount)
+        out.append(Violation(what or program.row_name(i), by, amount))
+    return out
 
 
 def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
-    """The status as a sentence, followed by the violated rows by name."""
+    """The status as a sentence, followed by what is violated, in words."""
     rows = worst_rows(program, x, g, tolerance=tolerance)
     if not rows:
         return status.message
-    listed = "; ".join(f"{name} (by {violation:.3g})" for name, violation in rows)
+    listed = "; ".join(str(violation) for violation in rows)
     heading = "Rows that cannot be met" if status is Status.INFEASIBLE else "Rows not met"
     more = int(
         np.sum(~(row_violations(program, g) <= tolerance))
         + np.sum(~(bound_violations(program, x) <= tolerance))
     )
-    tail = f"; and {more - len(rows)} more" if more > len(rows) else ""
+    tail = f"; {more} rows in all" if more > len(rows) else ""
     return f"{status.message} {heading}: {listed}{tail}."
 
 

@@ -152,10 +152,10 @@ def _cell(value: float | None, digits: int, *, scale: float = 1.0, good: bool = 
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
-    """The named rows that are not met, worst first."""
-    table = Table(title="rows that are not met, worst first", title_justify="left")
+    """What is not met, worst first."""
+    table = Table(title="what is not met, worst first", title_justify="left")
     table.add_column("row", overflow="fold")
-    table.add_column("off by", justify="right")
+    table.add_column("by how much", overflow="fold")
     for violation in violations:
-        table.add_row(escape(str(violation["row"])), f"{violation['amount']:.2g}")
+        table.add_row(escape(str(violation["row"])), escape(str(violation["by"])))
     return table

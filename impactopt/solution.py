@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.plan import Plan, Trajectory
 from impactopt.problem import ImpactProblem
-from impactopt.program import SolverResult, Status
+from impactopt.program import SolverResult, Status, Violation
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class Solution:
     plan : the motion; for a status that is not usable, that of the best iterate.
     result : the solver's own record, its history included.
     build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver.
-    violations : named rows that are not met, worst first, as (name, amount).
+    violations : what is not met, worst first.
     objectives : what each of the problem's objectives comes to, by name, in its own unit.
     """
 
@@ -37,7 +37,7 @@ class Solution:
     solver: str
     build_seconds: float
     solve_seconds: float
-    violations: tuple[tuple[str, float], ...]
+    violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -85,7 +85,7 @@ class Solution:
             "solve_seconds": self.solve_seconds,
             "build_seconds": self.build_seconds,
             "max_violation": self.result.max_violation,
-            "violations": [{"row": name, "amount": amount} for name, amount in self.violations],
+            "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
             "problem": self.problem.describe(),
         }
 

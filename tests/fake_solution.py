@@ -13,7 +13,7 @@ from impactopt.contact import FreeMass, SpringDamper
 from impactopt.motion import CubicSpline
 from impactopt.plan import Plan, PlannedCollision
 from impactopt.problem import ImpactProblem, Phase
-from impactopt.program import IterationRecord, SolverResult, Status
+from impactopt.program import IterationRecord, SolverResult, Status, Violation
 from impactopt.solution import Solution
 from impactopt.statics import static_wrenches
 from impactopt.validation import Simulation
@@ -144,12 +144,12 @@ def still_solution(
     *,
     problem: ImpactProblem | None = None,
     status: Status = Status.SOLVED,
-    violations: tuple[tuple[str, float], ...] = (),
+    violations: tuple[Violation, ...] = (),
     kind: type[Solution] = FakeSolution,
     solver: str = "ipopt",
 ) -> Solution:
     problem = still_problem() if problem is None else problem
-    worst = violations[0][1] if violations else 1e-9
+    worst = violations[0].amount if violations else 1e-9
     history = tuple(
         IterationRecord(
             iteration=i, objective=-float(i), max_violation=1.0, kkt=np.nan, step=0.1, seconds=0.1 * i

@@ -20,7 +20,7 @@ from impactopt.cli import app
 from impactopt.output import Record, load_record
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile
-from impactopt.program import IterationRecord, Status
+from impactopt.program import IterationRecord, Status, Violation
 from impactopt.solution import Solution
 
 GOOD = """\
@@ -212,13 +212,16 @@ def test_options_go_over_the_file(planner: Planner, file: Path, tmp_path: Path) 
 def test_an_infeasible_problem_names_its_rows_and_exits_1(
     planner: Planner, file: Path, tmp_path: Path
 ) -> None:
-    row = "torque limit, swing, 12 %, arm_right_4_joint"
+    row = "torque limit, swing at 0.61 s, elbow"
     planner.solution = {
         "status": Status.INFEASIBLE,
-        "violations": ((row, 4.06), ("hit point, contact, x", 0.2)),
+        "violations": (
+            Violation(row, "406 % over its limit", 4.06),
+            Violation("hit point", "200 mm away", 0.2),
+        ),
     }
     out, err = run("solve", file, "--out", tmp_path / "out", code=1)
-    assert row in out and "4.1" in out and "infeasible" in out
+    assert row in out and "406 % over its limit" in out and "infeasible" in out
     assert "no replay" in err
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 

@@ -98,8 +98,8 @@ def test_infeasible_programs_name_the_rows():
     program, x0 = infeasible()
     result = solve_ipopt(program, x0)
     assert result.status is Status.INFEASIBLE
-    assert "row 1 (by" in result.message
-    assert "row 2 (by" in result.message
+    assert "row 1: by" in result.message
+    assert "row 2: by" in result.message
     assert "row 3" not in result.message
     assert result.max_violation <= min(record.max_violation for record in result.history) + 1e-6
 

@@ -12,6 +12,7 @@ from impactopt.program import (
     BestIterate,
     NonlinearProgram,
     Status,
+    Violation,
     check_program,
     complementarity,
     is_stationary_violation,
@@ -57,8 +58,8 @@ def test_violations_count_rows_and_bounds_and_nan():
     assert max_violation(program, np.array([0.5, -4]), np.array([0.5])) == 3
     assert max_violation(program, np.array([0.5, 0]), np.array([np.nan])) == np.inf
     assert worst_rows(program, np.array([3.0, -4]), np.array([3.0]), tolerance=1e-6) == [
-        ("bound of x2", 3.0),
-        ("row 1", 2.0),
+        Violation("bound of x2", "by 3", 3.0),
+        Violation("row 1", "by 2", 2.0),
     ]
 
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from impactopt.ipopt import solve_ipopt
 from impactopt.nlp.layout import Affine, Layout, select, stack
-from impactopt.nlp.structured import Block, Rows, StructuredProgram, derivative_functions, pattern
+from impactopt.nlp.rows import Rows
+from impactopt.nlp.structured import Block, StructuredProgram, derivative_functions, pattern
 from impactopt.program import NonlinearProgram, Status
 
 Array = NDArray[np.float64]

@@ -114,8 +114,8 @@ def test_infeasible_programs_name_the_rows():
     for options in WAYS.values():
         result = solve_sqp(program, x0, options=options)
         assert result.status is Status.INFEASIBLE
-        assert "row 1 (by" in result.message
-        assert "row 2 (by" in result.message
+        assert "row 1: by" in result.message
+        assert "row 2: by" in result.message
         assert "row 3" not in result.message
         assert result.max_violation == pytest.approx(min(record.max_violation for record in result.history))
 
@@ -124,7 +124,7 @@ def test_infeasible_against_bounds():
     program = Textbook(2, lambda x, y: x**2, lambda x, y: [(4, x * y, INF)], lower=0, upper=1)
     result = solve_sqp(program, [0.5, 0.5])
     assert result.status is Status.INFEASIBLE
-    assert "row 1 (by 3)" in result.message
+    assert "row 1: by 3" in result.message
     np.testing.assert_allclose(result.x, 1, atol=1e-6)
 
 

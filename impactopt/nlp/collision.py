@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impactopt.nlp.blocks import FORCE_SCALE
+from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
 from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.nlp.mesh import Stage
+from impactopt.nlp.rows import Measure, Place, along, millimetres, percent, rates
 from impactopt.plan import PlannedCollision, total_ground_wrench
 from impactopt.scenario import Scenario
 
@@ -110,41 +112,59 @@ class Collision:
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
         for i, s in enumerate(self.stages):
-            place = f"{s.name}{self.suffix}"
+            place = self._place(s)
             self._integral_rows(i, place)
             first = {name: start + i * size for name, (start, size) in at.items()}
             self._dynamics_rows(i, place, first)
         start, size = at["force"]
-        for term, component, k, part in (
-            ("end of compression", "approach speed", self.end[0], 2),
-            ("separation", "penetration", self.end[1], 3),
+        for term, component, k, part, measure in (
+            ("end of compression", "approach speed", self.end[0], 2, Measure("m/s", 1.0, "left")),
+            ("separation", "penetration", self.end[1], 3, millimetres("left", scale=DEPTH_SCALE)),
         ):
-            self.t.equal(term, self.suffix.lstrip(", "), [component], np.array([start + k * size + part]))
+            output = np.array([start + k * size + part])
+            self.t.equal(term, self.suffix.lstrip(", "), [component], output, measure)
 
-    def _integral_rows(self, i: int, place: str) -> None:
+    def _place(self, s: Stage) -> Place:
+        time = self.T[1][0] * s.place + self.T[0][0] if s.phase else self.T[0][0] * s.place
+        suffix = self.suffix.replace("{", "{{").replace("}", "}}")
+        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
+
+    def _integral_rows(self, i: int, place: Place) -> None:
         """d and the target's travel are the integrals of u and of the target's speed in the phase so far."""
         s = self.stages[i]
-        for term, integral, rate, labels in (
-            ("collision kinematics", self.d, self.u, self.t.coordinates.labels),
-            ("target kinematics", self.xt, self.vt, ("target",)),
+        names = self.t.coordinates.labels
+        for term, integral, rate, labels, measures in (
+            ("collision kinematics", self.d, self.u, names, rates(names)),
+            ("target kinematics", self.xt, self.vt, ("target",), [Measure("m/s", 1.0, "off")]),
         ):
             expression = integral[i]
             for m, w in zip(s.members, s.quadrature, strict=True):
                 expression = expression - rate[m] * w
             if not s.new_phase:
                 expression = expression - integral[s.previous]
-            self.t.rows.add(term=term, place=place, components=labels, affine=expression, lower=0, upper=0)
+            self.t.rows.add(
+                term=term,
+                place=place,
+                components=labels,
+                affine=expression,
+                lower=0,
+                upper=0,
+                measure=measures,
+            )
 
-    def _dynamics_rows(self, i: int, place: str, first: dict[str, int]) -> None:
+    def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         t, c, joints = self.t, self.t.coordinates, self.t.robot.joint_names
         closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
         if c.legs:
             names = [*closure, *[f"{n} rate" for n in closure]]
-            t.equal("legs of the coasting reference", place, names, first["coasting"] + np.arange(len(names)))
+            measures = [*along(closure, "off"), *rates(closure)]
+            outputs = first["coasting"] + np.arange(len(names))
+            t.equal("legs of the coasting reference", place, names, outputs, measures)
         part = t.parts("collision")
-        t.equal("closed legs", place, closure, first["collision"] + part["closure"])
-        t.equal("collision dynamics", place, DIRECTIONS[: c.base], first["collision"] + part["base"])
-        t.equal("collision dynamics", place, joints, first["collision"] + part["joints"])
+        t.equal("closed legs", place, closure, first["collision"] + part["closure"], along(closure, "open"))
+        base, joint = first["collision"] + part["base"], first["collision"] + part["joints"]
+        t.equal("collision dynamics", place, DIRECTIONS[: c.base], base, t.unbalanced)
+        t.equal("collision dynamics", place, joints, joint, percent("of the joint's limit off"))
         t.rows.add(
             term=f"{t.torque.name} in collision",
             place=place,
@@ -152,11 +172,13 @@ class Collision:
             outputs=first["collision"] + part["torque"],
             lower=-self.torque_fraction,
             upper=self.torque_fraction,
+            measure=percent("over its limit", of=self.torque_fraction),
         )
         minimum = t.cone.minimum_force if self.scenario is None else 0.0
-        t.cone_rows(self.w[i], f"collision, {place}", self.cone_margin, minimum)
-        t.equal("contact law", place, ["force"], np.array([first["force"]]))
-        t.equal("target's motion", place, ["speed"], np.array([first["force"] + 1]))
+        t.cone_rows(self.w[i], place, self.cone_margin, minimum)
+        law, motion = (np.array([first["force"] + k]) for k in (0, 1))
+        t.equal("contact law", place, ["force"], law, Measure("N", FORCE_SCALE, "off"))
+        t.equal("target's motion", place, ["speed"], motion, Measure("m/s", 1.0, "off"))
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
         """Slots of the block ``link``: this state after contact to a ``start`` (y, d y/ds, duration [s])."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from impactopt.motion import CubicSpline
 from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.nlp.rows import Place
 
 if TYPE_CHECKING:
     from impactopt.nlp.transcription import Transcription
@@ -41,21 +42,22 @@ class FollowThrough:
         y, y1, _ = self.t.at(self.control, self.t.follow_breaks, 0.0)
         return y, y1
 
-    def nodes(self) -> tuple[list[list[Affine]], list[str]]:
+    def nodes(self) -> tuple[list[list[Affine]], list[Place]]:
         """Slots of the block ``node`` and the places of its instances."""
         instances, places = [], []
         for k, at in enumerate(self.t.follow_nodes):
             y, y1, y2 = self.t.at(self.control, self.t.follow_breaks, at)
             instances.append([y, y1, y2, self.legs[k], self.w[k], self.T[0]])
-            places.append(f"{self.place}, {100 * at:.0f} %")
+            name, text = f"{self.place}, {100 * at:.0f} %", f"{self.place} at {{s}}"
+            places.append(Place(name, text, self.T[0] * at))
         return instances, places
 
-    def coasting_node(self, wrench: Group) -> tuple[list[Affine], str]:
+    def coasting_node(self, wrench: Group) -> tuple[list[Affine], Place]:
         """Slots of the block ``node`` where coasting ends and this begins: without acceleration, under a sole
         wrench of its own; and its place. Until then a robot that has hit nothing still coasts."""
         y, y1 = self.start
         slots = [y, y1, Affine.zeros(self.t.ny), self.legs[0], wrench[0], self.T[0]]
-        return slots, "end of coasting, if nothing is hit"
+        return slots, Place.plain("end of coasting, if nothing is hit")
 
     def add_rate_rows(self) -> None:
         # the last two velocity control points are zero by construction

@@ -13,6 +13,7 @@ import numpy as np
 
 from impactopt.nlp.collision import DIRECTIONS
 from impactopt.nlp.layout import Affine, Array
+from impactopt.nlp.rows import Measure, percent
 from impactopt.plan import PlannedCollision
 
 if TYPE_CHECKING:
@@ -53,9 +54,14 @@ class InstantImpact:
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         t, (start, _) = self.t, at["impact"]
         part = t.parts("impact")
-        t.equal("impulse balance", "impact", DIRECTIONS[: t.coordinates.base], start + part["base"])
-        t.equal("impulse balance", "impact", t.robot.joint_names, start + part["joints"])
-        t.equal("law of the impact", "impact", ["impulse"], start + part["blow"])
+        base, joints = start + part["base"], start + part["joints"]
+        units = {"N": "N s", "N m": "N m s"}  # rows are over a tenth of a second of the weight
+        unbalanced = [Measure(units[m.unit], 0.1 * m.factor, "off") for m in t.unbalanced]
+        share = percent("off, of its limit for 0.1 s")
+        t.equal("impulse balance", "impact", DIRECTIONS[: t.coordinates.base], base, unbalanced)
+        t.equal("impulse balance", "impact", t.robot.joint_names, joints, share)
+        off = Measure("m/s", 1.0, "off")
+        t.equal("law of the impact", "impact", ["impulse"], start + part["blow"], off)
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
         """As of :meth:`impactopt.nlp.collision.Collision.link`; no time passes."""

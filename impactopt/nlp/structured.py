@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from impactopt.nlp.layout import Affine, Array, Layout, stack
+from impactopt.nlp.rows import Index, Rows
 
-Index = NDArray[np.intp]
 THREADS = 2
 
 
@@ -106,60 +106,6 @@ class Block:
             jac_pattern=pattern(j.sparsity_out(0)),
             hess_pattern=pattern(h.sparsity_out(0)),
         )
-
-
-@dataclass(frozen=True)
-class Row:
-    """A constraint's origin: term, phase, place and component, and the time it belongs to."""
-
-    term: str
-    place: str
-    component: str
-
-    def __str__(self) -> str:
-        return ", ".join(p for p in (self.term, self.place, self.component) if p)
-
-
-@dataclass
-class Rows:
-    """Constraints under construction: each is at most one block output plus an affine expression of x."""
-
-    outputs: list[Index] = field(default_factory=list)
-    affine: list[Affine] = field(default_factory=list)
-    lower: list[Array] = field(default_factory=list)
-    upper: list[Array] = field(default_factory=list)
-    origins: list[Row] = field(default_factory=list)
-
-    def add(
-        self,
-        *,
-        term: str,
-        place: str = "",
-        components: Sequence[str],
-        outputs: Index | None = None,
-        affine: Affine | None = None,
-        lower: ArrayLike = -np.inf,
-        upper: ArrayLike = np.inf,
-    ) -> None:
-        """Append ``len(components)`` rows  lower <= out[outputs] + affine <= upper.
-
-        Rows that are unbounded on both sides are dropped.
-        """
-        n = len(components)
-        lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
-        hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
-        keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
-        if not keep.size:
-            return
-        out = np.full(n, -1, dtype=np.intp) if outputs is None else np.asarray(outputs, dtype=np.intp)
-        lin = Affine.zeros(n) if affine is None else affine
-        if keep.size < n:
-            out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
-        self.outputs.append(out)
-        self.affine.append(lin)
-        self.lower.append(lo)
-        self.upper.append(hi)
-        self.origins.extend(Row(term, place, components[int(k)]) for k in keep)
 
 
 class StructuredProgram:
@@ -332,6 +278,14 @@ class StructuredProgram:
     # ------------------------------------------------------------------ names
     def row_name(self, i: int) -> str:
         return str(self.origins[i])
+
+    def row_group(self, i: int) -> tuple[str, str]:
+        """Its term and place: the rows that one message stands for."""
+        return self.origins[i].term, self.origins[i].place.name
+
+    def describe_violation(self, i: int, x: Array, amount: float) -> tuple[str, str]:
+        """Row i at x, and how far it is from being met: as a person reads it."""
+        return self.origins[i].told(x, amount)
 
     def variable_name(self, j: int) -> str:
         return self.layout.name(j)

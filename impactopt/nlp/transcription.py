@@ -9,6 +9,7 @@ with their durations as variables.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike
 from impactopt.codegen import cached, model_hash
 from impactopt.cone import contact_wrench_cone, inward_edges
 from impactopt.coordinates import StanceCoordinates
-from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, rate_weights
+from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, knots, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.collision import DIRECTIONS, Collision
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
@@ -27,7 +28,18 @@ from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
 from impactopt.nlp.mesh import collision_mesh, with_middles
 from impactopt.nlp.objective import assemble, quantities
-from impactopt.nlp.structured import Block, Index, Rows, StructuredProgram, derivative_functions
+from impactopt.nlp.rows import (
+    Index,
+    Measure,
+    Place,
+    Rows,
+    along,
+    degrees,
+    millimetres,
+    percent,
+    rates,
+)
+from impactopt.nlp.structured import Block, StructuredProgram, derivative_functions
 from impactopt.objectives import AngularMomentum, Effort
 from impactopt.plan import Plan, PlannedScenario
 from impactopt.problem import ImpactProblem
@@ -139,6 +151,8 @@ class Transcription:
         self.legs_lower, self.legs_upper = lower[c.dependent], upper[c.dependent]
         self.rate_limit = self.velocity.fraction * r.velocity_limit
         self.units = np.array([self.weight, LEVER])
+        force, moment = Measure("N", self.weight, "off"), Measure("N m", self.weight * LEVER, "off")
+        self.unbalanced = [force if name in "xyz" else moment for name in DIRECTIONS[: c.base]]
         self.wrench_scale = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER] * len(c.legs))
 
     def _variables(self) -> None:
@@ -210,6 +224,9 @@ class Transcription:
             out.append(expression)
         return out[0], out[1], out[2]
 
+    def swing_place(self, s: float) -> Place:
+        return Place(f"swing, {100 * s:.0f} %", "swing at {s}", self.swing_T[0] * s)
+
     # ------------------------------------------------------------------ rows
     def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
         """Append a block; the index of its first output."""
@@ -223,15 +240,17 @@ class Transcription:
         outputs: Index,
         *,
         term: str = "",
-        place: str = "",
+        place: Place | str = "",
         labels: Sequence[str] | None = None,
+        measure: Measure | None = None,
         scale: float = 1.0,
         lower: ArrayLike = -np.inf,
         upper: ArrayLike = np.inf,
     ) -> Group:
         """One vector of variables that equals outputs of blocks, so that rows and objective can take it.
 
-        term, place : of the rows that say so, the variables' name if not given; scale, bounds : of variables.
+        term, place, measure : of the rows that say so; the term is the variables' name if not given.
+        scale, lower, upper : of the variables.
         """
         size = len(outputs)
         labels = labels or ([name] if size == 1 else [f"{name} {k}" for k in range(size)])
@@ -244,6 +263,7 @@ class Transcription:
             affine=-group[0],
             lower=0,
             upper=0,
+            measure=measure,
         )
         self._lifted.append((group, np.asarray(outputs, dtype=np.intp)))
         return group
@@ -256,9 +276,24 @@ class Transcription:
             group.write(x, np.where(np.isfinite(found), found, 0.0))
         return x
 
-    def equal(self, term: str, place: str, components: Sequence[str], outputs: Any) -> None:
+    def equal(
+        self,
+        term: str,
+        place: Place | str,
+        components: Sequence[str],
+        outputs: Any,
+        measure: Measure | Sequence[Measure] | None = None,
+    ) -> None:
         """Rows: outputs of blocks are zero."""
-        self.rows.add(term=term, place=place, components=components, outputs=outputs, lower=0, upper=0)
+        self.rows.add(
+            term=term,
+            place=place,
+            components=components,
+            outputs=outputs,
+            lower=0,
+            upper=0,
+            measure=measure,
+        )
 
     def _node_parameters(self) -> Array:
         c = self.coordinates
@@ -272,7 +307,7 @@ class Transcription:
         for k, at in enumerate(self.swing_nodes):
             y, y1, y2 = self.at(self.swing_control, self.swing_breaks, at)
             instances.append([y, y1, y2, self.swing_legs[k], self.swing_w[k], self.swing_T[0]])
-            places.append(f"swing, {100 * at:.0f} %")
+            places.append(self.swing_place(at))
         for follow in self.follows:
             slots, names = follow.nodes()
             instances += slots
@@ -296,6 +331,7 @@ class Transcription:
             affine=self.contact_state[0][joints],
             lower=self.y_lower[joints],
             upper=self.y_upper[joints],
+            measure=degrees("outside"),
         )
         # the first two velocity control points are zero by construction
         last = p.swing.intervals + 2
@@ -308,17 +344,19 @@ class Transcription:
         """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
         return any(isinstance(o, Effort) for o in self.problem.objectives)
 
-    def _node_rows(self, places: list[str], n_out: int) -> None:
+    def _node_rows(self, places: list[Place], n_out: int) -> None:
         c, r = self.coordinates, self.robot
         part = self.parts("node")
         closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
+        fast = percent("over its limit", of=self.velocity.fraction)
+        strong = percent("over its limit", of=self.torque.fraction)
         last = len(self.swing_nodes) - 1
         for i, place in enumerate(places):
             at = i * n_out
-            for term, name, components, bound in (
-                ("closed legs", "closure", closure, 0.0),
-                (self.velocity.name, "leg_rate", c.leg_labels, self.velocity.fraction),
-                ("equation of motion of the base", "base", DIRECTIONS[: c.base], 0.0),
+            for term, name, components, bound, measure in (
+                ("closed legs", "closure", closure, 0.0, along(closure, "open")),
+                (self.velocity.name, "leg_rate", c.leg_labels, self.velocity.fraction, fast),
+                ("equation of motion of the base", "base", DIRECTIONS[: c.base], 0.0, self.unbalanced),
             ):
                 self.rows.add(
                     term=term,
@@ -327,6 +365,7 @@ class Transcription:
                     outputs=at + part[name],
                     lower=-bound,
                     upper=bound,
+                    measure=measure,
                 )
             self.rows.add(
                 term=self.extension.name,
@@ -334,15 +373,17 @@ class Transcription:
                 components=[f"{leg.sole.name} leg" for leg in c.legs],
                 outputs=at + part["extension"],
                 lower=self.extension.minimum,
+                measure=percent("too near to straight", of=self.extension.minimum),
             )
             if i == last:  # at contact it is the variable `feedforward`, which has the limit as its bounds
                 self.torques.append(self.feedforward[0])
             elif self.torques_lifted:
                 torque = self.lift(
-                    f"torque, {place}",
+                    f"torque, {place.name}",
                     at + part["torque"],
                     term=self.torque.name,
                     place=place,
+                    measure=strong,
                     labels=r.joint_names,
                     lower=-self.torque.fraction,
                     upper=self.torque.fraction,
@@ -356,6 +397,7 @@ class Transcription:
                     outputs=at + part["torque"],
                     lower=-self.torque.fraction,
                     upper=self.torque.fraction,
+                    measure=strong,
                 )
         self.rows.add(
             term="feed-forward that makes the robot coast",
@@ -365,26 +407,40 @@ class Transcription:
             affine=-self.feedforward[0],
             lower=0,
             upper=0,
+            measure=percent("of the joint's limit off"),
         )
 
-    def cone_rows(self, wrench: Affine, place: str, margin: float, minimum_force: float) -> None:
+    def cone_rows(self, wrench: Affine, place: Place, margin: float, minimum_force: float) -> None:
         for k, leg in enumerate(self.coordinates.legs):
             w = wrench[6 * k : 6 * k + 6]
             rows = contact_wrench_cone(leg.sole.polygon, self.cone.friction, margin=margin) / self.weight
+            normal, sole = w[2:3] * (1 / self.weight), f"{leg.sole.name} sole"
             self.rows.add(
                 term=self.cone.name,
                 place=place,
-                components=[f"{leg.sole.name} sole, facet {i}" for i in range(len(rows))],
+                components=[f"{sole}, facet {i}" for i in range(len(rows))],
                 affine=w.apply(rows),
                 lower=0,
+                measure=[self._outside_cone(row * self.weight, normal) for row in rows],
+                whole=sole,
             )
             self.rows.add(
                 term="normal force",
                 place=place,
-                components=[f"{leg.sole.name} sole"],
-                affine=w[2:3] * (1 / self.weight),
+                components=[sole],
+                affine=normal,
                 lower=minimum_force / self.weight,
+                measure=Measure("N", self.weight, "too light"),
             )
+
+    def _outside_cone(self, facet: Array, normal: Affine) -> Measure:
+        """Of a facet (6,) of the cone of corners' forces; ``normal``: the normal force over the weight."""
+        along_sole, tilting = np.hypot(*facet[:2]), np.hypot(*facet[3:5])
+        if along_sole < 1e-9 and abs(facet[5]) < 1e-9:
+            return Measure("mm", 1e3 / tilting, "outside", normal, 0.05)  # moment over force: the CoP
+        if tilting < 1e-9 and abs(facet[5]) < 1e-9:
+            return Measure("%", 100 / along_sole / self.cone.friction, "beyond its friction", normal, 0.05)
+        return Measure("%", 100 / max(facet[2], 1e-3), "beyond its friction and torsion", normal, 0.05)
 
     def rate_rows(
         self, phase: str, control: Callable[[int], Affine], js: range, breaks: Array, duration: Group
@@ -399,7 +455,11 @@ class Transcription:
         fixed = shortest == longest
         for j in js:
             step = (control(j + 1) - control(j))[joints] * (factors[j] / limit)
-            place = f"{phase}, control point {j}"
+            # where the velocity's control point pulls most: the mean of its knots
+            s = float(knots(breaks)[j + 2 : j + 4].mean())
+            name = f"{phase}, control point {j}"
+            place = Place(name, f"{phase} at about {{s}}", duration[0] * s)
+            fast = Measure("%", 100.0, "over its limit", duration[0])
             if fixed:
                 bound = float(longest)
                 self.rows.add(
@@ -409,16 +469,18 @@ class Transcription:
                     affine=step,
                     lower=-bound,
                     upper=bound,
+                    measure=fast,
                 )
                 continue
             time = stack([duration[0]] * len(joints))
             for sign, way in ((1.0, "forward"), (-1.0, "backward")):
                 self.rows.add(
                     term=self.velocity.name,
-                    place=f"{place}, {way}",
+                    place=replace(place, name=f"{name}, {way}"),
                     components=names,
                     affine=step * sign - time,
                     upper=0,
+                    measure=fast,
                 )
 
     def _contact(self) -> None:
@@ -427,11 +489,12 @@ class Transcription:
         at = self.add_block("contact", [[y, y1, self.swing_T[0]]], rotation_rows(p.normal).ravel())
         self.rows.add(
             term="hit point",
-            place="contact",
+            place=Place("contact", ""),
             components=["x", "y", "z"],
             outputs=at + np.arange(3),
             lower=p.point,
             upper=p.point,
+            measure=millimetres("away"),
         )
         self.rows.add(
             term="approach speed",
@@ -439,6 +502,7 @@ class Transcription:
             components=["normal"],
             outputs=np.array([at + 3]),
             lower=0.05,
+            measure=Measure("m/s", 1.0, "too slow"),
         )
         self.rows.add(
             term=self.incidence.name,
@@ -447,6 +511,8 @@ class Transcription:
             outputs=at + np.array([4, 5]),
             lower=-self.incidence.speed,
             upper=self.incidence.speed,
+            measure=Measure("m/s", 1.0, "too fast across the normal"),
+            whole="",
         )
         nodes = self.swing_nodes[:-1]
         instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
@@ -456,10 +522,11 @@ class Transcription:
         for i, s in enumerate(nodes):
             self.rows.add(
                 term="no touch before contact",
-                place=f"swing, {100 * s:.0f} %",
+                place=self.swing_place(s),
                 components=[p.striker],
                 outputs=np.array([at + i]),
                 upper=plane - min(nearest, HASTE * (1 - s) * ahead),
+                measure=millimetres("too near"),
             )
 
     def _start_gap(self) -> float:
@@ -505,16 +572,17 @@ class Transcription:
             instances += self.brake.link_from_coasting(self.brake_after)
         at = self.add_block("link", instances, np.zeros(0))
         labels, places = self.coordinates.labels, at + 3 * np.arange(self.ny)
-        self.equal("collision starts from the swing's end", "rate", labels, places)
-        self.equal("follow-through starts from the predicted state", "position", labels, places + 1)
-        self.equal("follow-through starts from the predicted state", "rate", labels, places + 2)
+        far, fast = along(labels, "off"), rates(labels)
+        self.equal("collision starts from the swing's end", "rate", labels, places, fast)
+        self.equal("follow-through starts from the predicted state", "position", labels, places + 1, far)
+        self.equal("follow-through starts from the predicted state", "rate", labels, places + 2, fast)
         if self.brake is not None:
             after = places + 3 * self.ny * (1 + len(self.scenarios))
-            self.equal("brake starts where coasting ends", "position", labels, after + 1)
-            self.equal("brake starts where coasting ends", "rate", labels, after + 2)
+            self.equal("brake starts where coasting ends", "position", labels, after + 1, far)
+            self.equal("brake starts where coasting ends", "rate", labels, after + 2, fast)
         for k, other in enumerate(self.scenarios, start=1):
             place = f"position{other.suffix}"
-            self.equal("state after contact", place, labels, places + 1 + 3 * self.ny * k)
+            self.equal("state after contact", place, labels, places + 1 + 3 * self.ny * k, far)
         if self.coordinates.legs:
             self._balance_rows(yf, yf1)
 
@@ -544,6 +612,8 @@ class Transcription:
                     components=[f"edge {e}" for e in range(k)],
                     outputs=start + np.arange(k),
                     lower=0,
+                    measure=millimetres("outside"),
+                    whole="",
                 )
             slow, still = self.balance.vertical_speed, self.balance.angular_momentum
             self.rows.add(
@@ -553,14 +623,16 @@ class Transcription:
                 outputs=np.array([start + k]),
                 lower=-slow,
                 upper=slow,
+                measure=Measure("m/s", 1.0, "too fast"),
             )
-            outputs = start + k + 1 + np.arange(3)
+            outputs, turning = start + k + 1 + np.arange(3), Measure("N m s", 1.0, "too much")
             if wanted and i == 0:
                 self.angular_momentum = self.lift(
                     "angular momentum",
                     outputs,
                     place=place,
                     labels=["x", "y", "z"],
+                    measure=turning,
                     lower=-still,
                     upper=still,
                 )
@@ -572,6 +644,7 @@ class Transcription:
                 outputs=outputs,
                 lower=-still,
                 upper=still,
+                measure=turning,
             )
 
     def link_slots(

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt._robot_checks import check_frame
-from impactopt._robot_parts import Striker
+from impactopt._robot_parts import Striker, Tool
 from impactopt.errors import InputError, check_array, did_you_mean
 
 Array = NDArray[np.float64]
@@ -163,6 +163,18 @@ def add_striker(model: pin.Model, striker: Striker) -> None:
     frame.parentFrame = model.getFrameId(striker.frame)
 
 
+def add_tool(model: pin.Model, tool: Tool) -> None:
+    """Add the tool's mass to the link that holds it, and its striker's frame."""
+    frame = model.frames[check_frame(model, tool.frame, f"tool {tool.name!r}")]
+    if frame.parentJoint == 0:
+        raise InputError(
+            f"tool {tool.name!r}: no joint moves the frame {tool.frame!r}; give one of a link that moves"
+        )
+    body = pin.Inertia(tool.mass, tool.center, tool.inertia)
+    model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+    add_striker(model, tool.striker)
+
+
 def joint_positions(model: pin.Model, q: Array) -> Array:
     """(n,) joint angles of a configuration."""
     return np.array(
@@ -192,6 +204,14 @@ def reference_configurations(model: pin.Model) -> dict[str, Array]:
     }
 
 
+def lowest(model: pin.Model, q: Array, frames: Sequence[str], *, within: float = 0.01) -> list[str]:
+    """Those of the frames that are not higher than the lowest one by more than `within` [m]."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    heights = [float(data.oMf[check_frame(model, frame, "place")].translation[2]) for frame in frames]
+    return [frame for frame, z in zip(frames, heights, strict=True) if z <= min(heights) + within]
+
+
 def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
     """The configuration with the mean of some frames at the origin, at yaw 0, by moving the free-flyer."""
     data = model.createData()
@@ -204,6 +224,24 @@ def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
     q = q.copy()
     q[:7] = pin.SE3ToXYZQUAT(turn * pin.SE3(np.eye(3), -mean) * pin.XYZQUATToSE3(q[:7]))
     return q
+
+
+def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
+    """The things by their names; InputError if two have the same."""
+    named = {thing.name: thing for thing in things}
+    if len(named) != len(things):
+        raise InputError(f"two {kind}s have the same name in {[thing.name for thing in things]}; rename one")
+    return named
+
+
+def pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
+    """The thing of that name, or an InputError that says what there is."""
+    if name not in options:
+        known = ", ".join(map(repr, options)) or "none"
+        raise InputError(
+            f"robot {robot!r} has no {kind} {name!r}{did_you_mean(name, options)}; it has {known}"
+        )
+    return options[name]
 
 
 def _joints(model: pin.Model) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Soles and strikers: the parts of a robot that touch the world."""
+"""Soles, strikers and tools: the parts of a robot that touch the world."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt import _robot_checks as checks
@@ -73,6 +74,97 @@ class Striker:
     def model_frame(self) -> str:
         """Name of the frame that the robot's model has at this point."""
         return f"striker:{self.name}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tool:
+    """A rigid body that a link holds firmly, and the point of it that hits. All in the model's frame `frame`.
+
+    Attributes
+    ----------
+    name : of the tool, and of the striker that it makes.
+    frame : frame of the model at the link that holds it.
+    mass [kg], center (3,) [m] : its centre of mass; inertia (3, 3) [kg m2] : about that, in the axes of
+        `frame`; three numbers are its diagonal.
+    head (3,) [m] : the point that hits.
+
+    Raises
+    ------
+    InputError : a mass that is not positive, an inertia that is not symmetric. Whether it is one of matter is
+        checked with the link, by `Robot.with_tool`.
+    """
+
+    name: str
+    frame: str
+    mass: float
+    center: Array
+    inertia: Array
+    head: Array
+
+    def __post_init__(self) -> None:
+        what = f"tool {self.name!r}"
+        if not check_array(f"{what}: mass [kg]", self.mass, ()) > 0:
+            raise InputError(f"{what}: mass is {self.mass:g} kg; give a number > 0")
+        inertia = np.asarray(self.inertia, dtype=float)
+        inertia = check_array(
+            f"{what}: inertia [kg m2]", np.diag(inertia) if inertia.shape == (3,) else inertia, (3, 3)
+        )
+        if not np.allclose(inertia, inertia.T, rtol=0, atol=1e-12):
+            raise InputError(f"{what}: its inertia is not symmetric; give the same number on both sides")
+        object.__setattr__(self, "inertia", read_only(inertia))
+        for part in ("center", "head"):
+            point = check_array(f"{what}: {part} [m]", getattr(self, part), (3,))
+            object.__setattr__(self, part, read_only(point))
+
+    @classmethod
+    def hammer(
+        cls,
+        *,
+        frame: str,
+        name: str = "hammer",
+        grip: ArrayLike = (0.0, 0.0, 0.0),
+        handle: ArrayLike = (0.0, 0.0, 1.0),
+        face: ArrayLike = (1.0, 0.0, 0.0),
+        length: float = 0.25,
+        handle_mass: float = 0.15,
+        head_mass: float = 0.5,
+        head_length: float = 0.1,
+        head_width: float = 0.03,
+    ) -> Tool:
+        """A thin rod with a square bar across its end; it hits with one end of the bar.
+
+        grip (3,) [m] : where the rod begins.  handle, face : the ways that the rod points and that the bar's
+        striking end looks, unit vectors at right angles.  length, head_length, head_width [m]; masses [kg].
+        """
+        rod = check_array("hammer: handle", handle, (3,))
+        bar = check_array("hammer: face", face, (3,))
+        if not np.allclose([rod @ rod, bar @ bar, rod @ bar], [1, 1, 0], rtol=0, atol=1e-9):
+            raise InputError(f"hammer: handle {rod} and face {bar} are no unit vectors at right angles")
+        along, across = np.outer(rod, rod), np.outer(bar, bar)
+        start = check_array("hammer: grip [m]", grip, (3,))
+        end = start + length * rod
+        parts = (
+            (handle_mass, start + length / 2 * rod, length**2 / 12 * (np.eye(3) - along)),
+            (
+                head_mass,
+                end,
+                head_length**2 / 12 * (np.eye(3) - across) + head_width**2 / 12 * (np.eye(3) + across),
+            ),
+        )
+        whole = sum((pin.Inertia(m, at, m * gyration) for m, at, gyration in parts), pin.Inertia.Zero())
+        return cls(
+            name=name,
+            frame=frame,
+            mass=float(whole.mass),
+            center=np.array(whole.lever),
+            inertia=np.array(whole.inertia),
+            head=end + head_length / 2 * bar,
+        )
+
+    @property
+    def striker(self) -> Striker:
+        """The striker that the tool makes of the link which holds it."""
+        return Striker(name=self.name, frame=self.frame, point=self.head)
 
 
 def read_only(array: ArrayLike) -> Array:

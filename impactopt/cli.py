@@ -1,4 +1,4 @@
-"""The command line: `impactopt solve`, `impactopt validate`, `impactopt check`, `impactopt robots`.
+"""The command line: `impactopt solve`, `validate`, `check`, `problems`, `robots`, and what it gathers.
 
 What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
 Exit codes: 0 solved, 1 not solved, or fallen in a replay, 2 bad input.
@@ -42,7 +42,7 @@ app = typer.Typer(
 app.add_typer(bench_app)
 
 ProblemPath = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Problem file, such as problems/punch.toml.")
+    Path, typer.Argument(metavar="PROBLEM", help="Its name, as `impactopt problems` lists them, or its file.")
 ]
 
 
@@ -72,7 +72,7 @@ def solve(
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
     ] = None,
-    solver: Annotated[Solver | None, typer.Option(help="Instead of the one that FILE names.")] = None,
+    solver: Annotated[Solver | None, typer.Option(help="Instead of the one that the file names.")] = None,
     time_limit: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Stop the solver then; keep its best iterate.")
     ] = None,
@@ -83,7 +83,7 @@ def solve(
         bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach in the same limits.")
     ] = False,
 ) -> None:
-    """Plan the motion that a problem file asks for, replay it in full dynamics, write numbers and pictures.
+    """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
 
     Ctrl-C stops the solver; its best iterate is kept. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
@@ -98,7 +98,7 @@ def solve(
         read = read_problem_file(file)
         chosen = solver.value if solver is not None else read.solver.name
         with Progress(console, quiet=quiet) as progress:
-            progress.say(f"{file} is read; building the robot")
+            progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
             progress.say("building the program (compiles for a minute or two the first time)")
@@ -138,6 +138,17 @@ def check(file: ProblemPath) -> None:
 
 
 @app.command()
+def problems() -> None:
+    """List the problems that come with the package: `impactopt solve NAME`."""
+    with plain_errors("interrupted"):
+        from impactopt.problem_file.names import problem_names, problem_summary
+
+        names = problem_names()
+        for name in names:
+            typer.echo(f"{name:<{max(map(len, names))}}  {problem_summary(name)}")
+
+
+@app.command()
 def robots() -> None:
     """List the robots that problem files can name."""
     with plain_errors("interrupted"):
@@ -157,7 +168,8 @@ def robots() -> None:
                 ("soles", [sole.name for sole in robot.soles]),
                 ("postures", robot.postures),
             ):
-                typer.echo(f"  {kind:<9} {', '.join(names)}")
+                if names:
+                    typer.echo(f"  {kind:<9} {', '.join(names)}")
 
 
 def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Progress) -> Record:

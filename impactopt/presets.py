@@ -1,6 +1,7 @@
-"""Robots ready to use: the stand-in for HRP-2, and those on the URDFs of the package example-robot-data.
+"""Robots ready to use: humanoids, and arms on a fixed base.
 
-The stand-in needs no files; the others need `pip install 'impactopt[robots]'`.
+The stand-in for HRP-2 and the arms need no files; TALOS and G1 are on the URDFs of the package
+example-robot-data, which `pip install 'impactopt[robots]'` brings.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impactopt._arms import arm7, planar_arm
 from impactopt._robot_build import joint_names, lock_joints
 from impactopt._standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, standin_model
 from impactopt.errors import InputError, did_you_mean
 from impactopt.robot import Robot, Sole, Striker
 
-__all__ = ["g1", "load_robot", "robot_names", "standin", "talos"]
+__all__ = ["arm7", "g1", "load_robot", "planar_arm", "robot_names", "standin", "talos"]
 
 
 def talos(**overrides: Any) -> Robot:
@@ -145,6 +147,17 @@ _HALF_SITTING = {  # of the left side; the right one is its mirror image
 }
 
 
+_ON_LEFT_FOOT = {  # half sitting, but leaning to the left, with the right foot in the air
+    "left_hip_roll": -0.2,
+    "left_ankle_roll": 0.2,
+    "right_hip_roll": -0.05,
+    "right_ankle_roll": 0.05,
+    "right_hip_pitch": -0.7,
+    "right_knee": 1.4,
+    "right_ankle_pitch": -0.7,
+}
+
+
 def standin(
     *, floating: bool = True, locked: Iterable[str] | Mapping[str, float] = (), **overrides: Any
 ) -> Robot:
@@ -162,7 +175,8 @@ def standin(
       s/rad in all of them; the neck, which is not in it, has the defaults of `Robot.from_model`.
     * Soles: 0.230 x 0.131 m, 0.105 m below the ankle.
     * Strikers `right_hand`, `left_hand`: front of the closed gripper, on the forearm's axis.
-    * Posture `half_sitting`: knees bent by 0.7 rad, soles flat, elbows bent, hands in front.
+    * Postures: `half_sitting`, knees bent by 0.7 rad, soles flat, elbows bent, hands in front;
+      `on_left_foot`, the same with the weight on the left sole and the right foot 9 cm up.
 
     `floating` and `locked` are as of `Robot.from_urdf`; `overrides` go to `Robot.from_model`.
     """
@@ -195,16 +209,25 @@ def standin(
             )
             for side in ("right", "left")
         ),
-        "postures": {"half_sitting": {joint: x for joint, x in posture.items() if joint in joints}},
+        "postures": {
+            name: {joint: x for joint, x in angles.items() if joint in joints}
+            for name, angles in (("half_sitting", posture), ("on_left_foot", {**posture, **_ON_LEFT_FOOT}))
+        },
     }
     return Robot.from_model(model, **{**options, **overrides})
 
 
-_PRESETS: dict[str, Callable[..., Robot]] = {"standin": standin, "talos": talos, "g1": g1}
+_PRESETS: dict[str, Callable[..., Robot]] = {
+    "standin": standin,
+    "talos": talos,
+    "g1": g1,
+    "planar_arm": planar_arm,
+    "arm7": arm7,
+}
 
 
 def load_robot(name: str, **overrides: Any) -> Robot:
-    """The preset of that name; `overrides` go to `Robot.from_urdf` (`standin`: to `standin`)."""
+    """The preset of that name; `overrides` go to its function, such as `standin`."""
     if name not in _PRESETS:
         raise InputError(
             f"no robot {name!r}{did_you_mean(name, _PRESETS)}; presets are {', '.join(_PRESETS)}"

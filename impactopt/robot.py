@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt import _robot_build as build
 from impactopt import _robot_checks as checks
-from impactopt._robot_parts import Sole, Striker, read_only
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt._robot_parts import Sole, Striker, Tool, read_only
+from impactopt.errors import InputError, check_array
 
-__all__ = ["Robot", "Sole", "Striker"]
+__all__ = ["Robot", "Sole", "Striker", "Tool"]
 
 Array = NDArray[np.float64]
 PerJoint = float | Mapping[str, float] | ArrayLike | None
@@ -41,7 +41,7 @@ class Robot:
     soles : flat feet, in a fixed order.
     strikers : by name.
     postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
-        the mean of its soles is at the origin of the ground, at yaw 0.
+        the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
 
     Raises
     ------
@@ -169,9 +169,9 @@ class Robot:
             lower=lower,
             upper=upper,
             soles=tuple(soles),
-            strikers=_by_name("striker", strikers),
+            strikers=build.by_name("striker", strikers),
         )
-        _by_name("sole", soles)
+        build.by_name("sole", soles)
         return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))
 
     @property
@@ -215,20 +215,28 @@ class Robot:
         )
 
     def striker(self, name: str) -> Striker:
-        return _pick("striker", name, self.strikers, self.name)
+        return build.pick("striker", name, self.strikers, self.name)
 
     def sole(self, name: str) -> Sole:
-        return _pick("sole", name, {sole.name: sole for sole in self.soles}, self.name)
+        return build.pick("sole", name, {sole.name: sole for sole in self.soles}, self.name)
 
     def posture(self, name: str) -> Array:
         """A named configuration, (nq,), as a copy."""
-        return _pick("posture", name, self.postures, self.name).copy()
+        return build.pick("posture", name, self.postures, self.name).copy()
 
     def with_striker(self, striker: Striker) -> Robot:
         """A copy of the robot that has `striker` too (or instead of its own one of that name)."""
         model = self.model.copy()
         build.add_striker(model, striker)
         return dataclasses.replace(self, model=model, strikers={**self.strikers, striker.name: striker})
+
+    def with_tool(self, tool: Tool) -> Robot:
+        """A copy of the robot that holds `tool`: its mass on the link, and a striker of its name."""
+        if tool.name in self.strikers:
+            raise InputError(f"robot {self.name!r} has a striker {tool.name!r} already; rename the tool")
+        model = self.model.copy()
+        build.add_tool(model, tool)
+        return dataclasses.replace(self, model=model, strikers={**self.strikers, tool.name: tool.striker})
 
     def joint_positions(self, q: ArrayLike) -> Array:
         """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""
@@ -237,11 +245,14 @@ class Robot:
     def place(self, q: ArrayLike, soles: Sequence[Sole] | None = None) -> Array:
         """The configuration with the base moved: mean of the soles at the origin of the ground, at yaw 0.
 
-        Roll and pitch of the base stay as they are. `soles` are the robot's own when left out.
+        Roll and pitch of the base stay as they are. `soles` are those that it stands on; when left out, those
+        of the robot's own that are not higher than its lowest one by more than a centimetre.
         """
         q = self.check_configuration(q)
-        soles = self.soles if soles is None else soles
-        return build.place(self.model, q, [sole.frame for sole in soles]) if self.floating and soles else q
+        frames = [sole.frame for sole in (self.soles if soles is None else soles)]
+        if not self.floating or not frames:
+            return q
+        return build.place(self.model, q, build.lowest(self.model, q, frames) if soles is None else frames)
 
     def check_configuration(self, q: ArrayLike, *, name: str = "q") -> Array:
         """`q` as a float64 copy (nq,); InputError for another shape, NaN, or a quaternion not of norm 1."""
@@ -282,19 +293,3 @@ class Robot:
             else:
                 postures[name] = checks.check_configuration(self.model, value, what)
         return {name: self.place(q) for name, q in postures.items()}
-
-
-def _by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
-    named = {thing.name: thing for thing in things}
-    if len(named) != len(things):
-        raise InputError(f"two {kind}s have the same name in {[thing.name for thing in things]}; rename one")
-    return named
-
-
-def _pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
-    if name not in options:
-        known = ", ".join(map(repr, options)) or "none"
-        raise InputError(
-            f"robot {robot!r} has no {kind} {name!r}{did_you_mean(name, options)}; it has {known}"
-        )
-    return options[name]

@@ -146,6 +146,19 @@ def test_results_go_beside_each_other_by_default(
     assert {path.name for path in (tmp_path / "results" / "punch").iterdir()} == FILES
 
 
+def test_problems_are_listed_and_solved_by_name(
+    planner: Planner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    listed, _ = run("problems")
+    assert [line.split()[0] for line in listed.splitlines()] == list(impactopt.problem_names())
+    assert all(len(line.split()) > 3 for line in listed.splitlines())
+    run("solve", "punch_left")
+    text = load_record(tmp_path / "results" / "punch_left").problem
+    assert 'striker = "left_hand"' in text
+    assert "did you mean 'punch_left'" in run("solve", "punch_lefd", code=2)[1]
+
+
 def test_json_is_the_summary_and_nothing_else(planner: Planner, file: Path, tmp_path: Path) -> None:
     out, _ = run("solve", file, "--out", tmp_path / "out", "--json")
     assert json.loads(out) == json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -16,7 +16,7 @@ PACKAGE = Path(impactopt.__file__).parent
 LAYERS = (
     ("__init__", "errors"),
     ("private_files", "_compiler", "_hashing", "codegen", "_workers"),
-    ("_robot_checks", "_robot_parts", "_robot_build", "robot", "_standin", "presets"),
+    ("_robot_checks", "_robot_parts", "_robot_build", "robot", "_links", "_standin", "_arms", "presets"),
     ("rigid_body",),
     ("stance", "contact"),
     ("collision",),

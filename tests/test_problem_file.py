@@ -18,6 +18,7 @@ from impactopt.errors import InputError
 from impactopt.problem import COLLISIONS, ImpactProblem, Phase
 from impactopt.problem_file import load_problem, read_problem_file
 from impactopt.problem_file.mistakes import key_lines
+from impactopt.robot import Tool
 from impactopt.scenario import Scenario
 from impactopt.stance import FixedBase, OneSole
 
@@ -228,7 +229,7 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
     for term in terms.DEFAULT_TERMS:
         assert type(term) in kinds
         assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
-    for kind in (Phase, FreeMass, SpringDamper, Scenario, *objectives.Objective.__subclasses__()):
+    for kind in (Phase, FreeMass, SpringDamper, Scenario, Tool, *objectives.Objective.__subclasses__()):
         assert {f.name for f in dataclasses.fields(kind)} == set(kinds[kind].model_fields)
     keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
     keys |= {*sections.Collision.model_fields, "law", "collision_elements"}

@@ -4,8 +4,10 @@
 * values.py     ranges of the keys' values
 * mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
 * reading.py    from file to problem
+* names.py      the files that come with the package, by name
 """
 
+from impactopt.problem_file.names import problem_names
 from impactopt.problem_file.reading import (
     ProblemFile,
     SolverSettings,
@@ -14,4 +16,11 @@ from impactopt.problem_file.reading import (
     read_problem_file,
 )
 
-__all__ = ["ProblemFile", "SolverSettings", "load_problem", "parse_problem_file", "read_problem_file"]
+__all__ = [
+    "ProblemFile",
+    "SolverSettings",
+    "load_problem",
+    "parse_problem_file",
+    "problem_names",
+    "read_problem_file",
+]

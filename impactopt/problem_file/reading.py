@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file.mistakes import Mistake, mistakes_of, report_mistakes
+from impactopt.problem_file.names import problem_file
 from impactopt.problem_file.sections import File
 from impactopt.robot import Robot
 from impactopt.stance import BothSoles, FixedBase, OneSole, Stance
@@ -72,7 +73,7 @@ class ProblemFile:
 
 
 def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
-    """The problem that a TOML file describes.
+    """The problem that a TOML file describes: its path, or the name of one that comes with the package.
 
     Raises
     ------
@@ -82,13 +83,13 @@ def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
 
 
 def read_problem_file(path: str | os.PathLike[str]) -> ProblemFile:
-    """A problem file, checked as far as that is possible without its robot.
+    """A problem file, by path or name, checked as far as that is possible without its robot.
 
     Raises
     ------
     InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
     """
-    path = Path(path)
+    path = problem_file(path)
     return parse_problem_file(_read(path), path)
 
 

@@ -32,7 +32,7 @@ from impactopt.problem_file.values import (
     UnitVector,
     Vector,
 )
-from impactopt.robot import Robot, Sole, Striker
+from impactopt.robot import Robot, Sole, Striker, Tool
 from impactopt.scenario import Scenario
 from impactopt.sqp import SQPOptions
 
@@ -247,10 +247,20 @@ class StrikerSection(Section):
     point: Vector = Field(alias="point_m")
 
 
+class ToolSection(Section):
+    kind = Tool
+    name: str
+    frame: str
+    mass: Positive = Field(alias="mass_kg")
+    center: Vector = Field(alias="center_m")
+    inertia: Vector = Field(alias="inertia_kg_m2")
+    head: Vector = Field(alias="head_m")
+
+
 class RobotSection(Section):
     """A preset with changes, or a URDF; files are relative to the problem file.
 
-    A preset keeps its own strikers beside the section's.
+    A preset keeps its own strikers beside the section's. A tool's inertia is its diagonal.
     """
 
     preset: Preset = _optional()
@@ -267,6 +277,7 @@ class RobotSection(Section):
     position_limit: dict[str, Range] = _optional("position_limit_rad")
     soles: list[SoleSection] = _optional()
     strikers: list[StrikerSection] = _optional()
+    tools: list[ToolSection] = _optional()
     postures: dict[str, dict[str, float]] = _optional("postures_rad")
 
     @model_validator(mode="after")
@@ -286,11 +297,15 @@ class RobotSection(Section):
         if "position_limit" in options:
             options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
         strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
+        tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
         if "urdf" in options:
-            return Robot.from_urdf(options.pop("urdf"), strikers=strikers, **options)
-        robot = load_robot(options.pop("preset"), **options)
+            robot = Robot.from_urdf(options.pop("urdf"), **options)
+        else:
+            robot = load_robot(options.pop("preset"), **options)
         for striker in strikers:
             robot = robot.with_striker(striker)
+        for tool in tools:
+            robot = robot.with_tool(tool)
         return robot
 
 

@@ -153,6 +153,39 @@ def skip(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
     _run(["skip"], {}, as_json, out, quiet)
 
 
+@app.command()
+def solve(
+    problem: Annotated[
+        str | None, typer.Option("--problem", metavar="NAME", help="One problem of problems/ (default: all).")
+    ] = None,
+    starts: Annotated[int, typer.Option(min=1, help="Starts: the plain one, and perturbed ones.")] = 3,
+    time_limit: Annotated[float, typer.Option(min=0.1, help="Of one solve [s].")] = 60.0,
+    solver: Annotated[
+        list[str] | None,
+        typer.Option("--solver", metavar="NAME", help="One solver, as ipopt or sqp:piqp; may be repeated."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Take up what results/bench/solve.jsonl has.")
+    ] = False,
+    few: Annotated[bool, typer.Option("--quick", help="One start, our default solver and IPOPT.")] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Which solver solves which problem, how reliably and how fast: ours, IPOPT, CasADi's, SciPy's."""
+    options = {
+        "problem": problem,
+        "starts": starts,
+        "time_limit": time_limit,
+        "solvers": tuple(solver or ()),
+        "resume": resume,
+        "quick": few,
+        "seed": seed,
+    }
+    _run(["solve"], {"solve": options}, as_json, out, quiet)
+
+
 @app.command("all")
 def run_all(
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
@@ -174,6 +207,7 @@ def run_all(
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},
+        "solve": {"quick": True, "seed": seed},
     }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)
 

@@ -25,6 +25,7 @@ BENCHES = {
     "scaling": "scaling",
     "skip": "skip",
     "stability": "stability",
+    "solve": "solve",
 }
 
 

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.contact.laws import ContactLaw, SpringDamper
@@ -18,6 +19,7 @@ from impactopt.reach import reach
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
 from impactopt.stance import BothSoles, Stance
+from impactopt.support import margin, support_polygon
 from impactopt.terms import DEFAULT_TERMS, Term
 
 Array = NDArray[np.float64]
@@ -165,7 +167,23 @@ class ImpactProblem:
         posture = self.start_posture
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
+        self._check_at_rest(posture)
         _ = self.contact_posture
+
+    def _check_at_rest(self, posture: Array) -> None:
+        """Where the start's centre of mass is not above the held soles, the motion would begin with a fall."""
+        polygon = support_polygon(self.robot, self.coordinates)
+        if not len(polygon):
+            return
+        model = self.robot.model
+        centre = np.array(pin.centerOfMass(model, model.createData(), posture))[:2]
+        inside = float(margin(polygon, centre[None])[0])
+        if inside < 0:
+            raise InputError(
+                f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm outside "
+                f"the support polygon of {', '.join(self.stance.sole_names(self.robot))}; start from a posture "
+                "with the weight on what is held, or hold more"
+            )
 
     def _check_collision(self) -> None:
         if self.collision not in COLLISIONS:

@@ -93,7 +93,10 @@ def test_the_posture_on_one_foot_is_at_rest_on_it() -> None:
     low, high = left.polygon.min(axis=0), left.polygon.max(axis=0)
     assert np.minimum(inside - low, high - inside).min() > 0.05  # [m] from every edge
     assert data.oMf[model.getFrameId("right_sole")].translation[2] > 0.08
-    assert load_problem("punch_one_foot").stance == OneSole("left")
+    problem = load_problem("punch_one_foot")
+    assert problem.stance == OneSole("left")
+    with pytest.raises(InputError, match=r"centre of mass is 39 mm outside the support polygon of left;"):
+        dataclasses.replace(problem, start="half_sitting")
 
 
 # ---- arms

@@ -171,18 +171,18 @@ class ImpactProblem:
         _ = self.contact_posture
 
     def _check_at_rest(self, posture: Array) -> None:
-        """Where the start's centre of mass is not above the held soles, the motion would begin with a fall."""
+        """InputError if the start's centre of mass is not above the held soles: it would fall at once."""
         polygon = support_polygon(self.robot, self.coordinates)
         if not len(polygon):
             return
-        model = self.robot.model
+        model, names = self.robot.model, ", ".join(self.stance.sole_names(self.robot))
         centre = np.array(pin.centerOfMass(model, model.createData(), posture))[:2]
         inside = float(margin(polygon, centre[None])[0])
         if inside < 0:
             raise InputError(
-                f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm outside "
-                f"the support polygon of {', '.join(self.stance.sole_names(self.robot))}; start from a posture "
-                "with the weight on what is held, or hold more"
+                f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm "
+                f"outside the support polygon of {names}; start from a posture with its weight on what is "
+                "held, or hold more"
             )
 
     def _check_collision(self) -> None:

@@ -81,6 +81,13 @@ def posture(robot: Robot, **angles: float) -> Array:
     return q
 
 
+def on_left(robot: Robot) -> Array:
+    """A posture with the weight on the left sole, and the right foot in the air."""
+    lean = {"left_hip_roll": -0.2, "left_ankle_roll": 0.2}
+    q = posture(robot, right_hip_pitch=-0.8, right_knee=1.6, right_ankle_pitch=-0.8, **lean)
+    return robot.place(q)
+
+
 # ---- what a good one holds
 
 
@@ -112,10 +119,16 @@ def test_inputs_are_copied(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stance", "legs"), [(BothSoles(), ["left", "right"]), (OneSole("right"), ["right"])], ids=["both", "one"]
+    ("stance", "legs"), [(BothSoles(), ["left", "right"]), (OneSole("left"), ["left"])], ids=["both", "one"]
 )
 def test_the_stance_decides_which_soles_are_held(robot: Robot, stance: Any, legs: list[str]) -> None:
-    assert [leg.sole.name for leg in problem(robot, stance=stance).coordinates.legs] == legs
+    start = on_left(robot) if len(legs) == 1 else "half_sitting"
+    assert [leg.sole.name for leg in problem(robot, start=start, stance=stance).coordinates.legs] == legs
+
+
+def test_a_start_that_cannot_be_held_at_rest_is_named(robot: Robot) -> None:
+    with pytest.raises(InputError, match=r"centre of mass is \d+ mm outside the support polygon of left;"):
+        problem(robot, stance=OneSole("left"))
 
 
 def test_a_fixed_base_holds_no_soles() -> None:
@@ -207,7 +220,7 @@ def test_a_start_with_soles_off_the_ground_is_named(robot: Robot) -> None:
         problem(robot, start=high)
     with pytest.raises(InputError, match=r"sole 'right' is tilted by 0\.1 rad"):
         problem(robot, start=posture(robot, right_ankle_roll=0.1))
-    lifted = posture(robot, right_hip_pitch=-0.8, right_knee=1.6, right_ankle_pitch=-0.8)
+    lifted = on_left(robot)
     with pytest.raises(InputError, match="sole 'right'"):
         problem(robot, start=lifted)
     # a foot that is not held may be in the air

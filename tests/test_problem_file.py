@@ -170,7 +170,8 @@ max_iter = 77
 hessian = "bfgs"
 price = 50.0
 """
-    path = write(tmp_path, GOOD.replace('robot = "talos"', 'robot = "talos"\nname = "all of it"') + more)
+    named = GOOD.replace('"talos"', '"standin"\nstart = "on_left_foot"\nname = "all of it"')
+    path = write(tmp_path, named.replace("[0.6, -0.25, 1.1]", "[0.5, -0.1, 1.0]") + more)
     problem, solver = load_problem(path), read_problem_file(path).solver
     default = ImpactProblem.collision_elements[0]
     assert problem.name == "all of it"

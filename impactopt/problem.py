@@ -14,13 +14,14 @@ from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.extra_terms import HitCone
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.reach import reach
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
 from impactopt.stance import BothSoles, Stance
 from impactopt.support import margin, support_polygon
-from impactopt.terms import DEFAULT_TERMS, Term
+from impactopt.terms import DEFAULT_TERMS, Incidence, Term
 
 Array = NDArray[np.float64]
 AnyTerm = TypeVar("AnyTerm", bound=Term)
@@ -80,7 +81,7 @@ class ImpactProblem:
         the same with the restitution of two masses under the contact law. The last two know nothing of
         torque, ZMP and servo during the impact: they are what others plan with, to compare.
     scenarios : what else may be hit, or not, and has to be survived with the same swing.
-    terms : what must hold; kinds that are not given take their defaults.
+    terms : what must hold; those of DEFAULT_TERMS that are not given take their defaults.
     objectives : what is maximized, a weighted sum.
     smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
         return_price: of ending away from the start posture [N s per rad^2]. They only make the optimum
@@ -162,6 +163,9 @@ class ImpactProblem:
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError(f"two terms of kind {kind.__name__}: give one")
+        if HitCone in kinds and Incidence in kinds:
+            raise InputError("HitCone takes the place of Incidence: give one of them")
+        self._check_names()
         lasts, stands = self.collision == "dynamics", self.robot.floating
         put(self, "objectives", check_objectives(self.objectives, contact=lasts, balance=stands))
         posture = self.start_posture
@@ -184,6 +188,21 @@ class ImpactProblem:
                 f"outside the support polygon of {names}; start from a posture with its weight on what is "
                 "held, or hold more"
             )
+
+    def _check_names(self) -> None:
+        """That the robot has what the terms name."""
+        frames = [f.name for f in self.robot.model.frames]
+        for term in self.terms:
+            for kind, names, known in (
+                ("frame", term.frames, frames),
+                ("joint", term.joints, self.robot.joint_names),
+            ):
+                for name in names:
+                    if name not in known:
+                        near = did_you_mean(name, known)
+                        raise InputError(
+                            f"{type(term).__name__}: {self.robot.name} has no {kind} {name!r}{near}"
+                        )
 
     def _check_collision(self) -> None:
         if self.collision not in COLLISIONS:
@@ -227,6 +246,10 @@ class ImpactProblem:
             if isinstance(t, kind):
                 return t
         raise InputError(f"unknown kind of term {kind.__name__}")
+
+    def extra(self, kind: type[AnyTerm]) -> AnyTerm | None:
+        """The problem's own term of a kind that has no default; None if it has none."""
+        return next((t for t in self.terms if isinstance(t, kind)), None)
 
     @cached_property
     def start_posture(self) -> Array:

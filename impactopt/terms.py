@@ -1,11 +1,17 @@
-"""What a plan must respect, as named terms with units.  A problem holds one of each kind at most."""
+"""What a plan must respect, as named terms with units.  A problem holds one of each kind at most.
+
+These hold in every problem; those in :mod:`impactopt.extra_terms` only where they are given.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+import numpy as np
+
 from impactopt.errors import InputError
+from impactopt.shapes import vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +26,31 @@ class Term:
             value = getattr(self, f.name)
             if isinstance(value, (int, float)) and not value >= 0:
                 raise InputError(f"{type(self).__name__}.{f.name} must not be negative, it is {value}")
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Frames that the robot must have."""
+        return ()
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints that the robot must have."""
+        return ()
+
+    def check_angle(self, value: float) -> None:
+        """InputError if an angle [rad] is none between 0 and a right one."""
+        if not 0 < value < np.pi / 2:
+            raise InputError(f"{type(self).__name__}.angle is {value:g} rad; give one between 0 and pi/2")
+
+    def make_axis(self, name: str) -> None:
+        """Keep field ``name`` as a unit vector; InputError if it is none."""
+        axis = vector(f"{type(self).__name__}.{name}", getattr(self, name))
+        length = float(np.linalg.norm(axis))
+        if abs(length - 1) > 1e-6:
+            raise InputError(
+                f"{type(self).__name__}.{name} must be a unit vector, its length is {length:.6g}"
+            )
+        object.__setattr__(self, name, axis)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +97,8 @@ class ContactWrenchCone(Term):
     Source: Caron et al. 2015, see :mod:`impactopt.cone`.
 
     friction: coefficient that the plan may use; margin [m]: distance of the CoP from the sole's edges;
-    minimum_force [N] a sole.
+    minimum_force [N] a sole. There are no terms for friction or the centre of pressure alone: this cone
+    bounds them foot by foot, and yaw torsion with them, which shrinks where they are used up.
     """
 
     name: ClassVar[str] = "contact wrench cone"
@@ -100,7 +132,10 @@ class Balance(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class Incidence(Term):
-    """The striking point's speed across the normal at contact is at most ``speed`` [m/s]."""
+    """The striking point's speed across the normal at contact is at most ``speed`` [m/s].
+
+    Along each of two tangents; inf: any, the direction is free. :class:`HitCone` takes its place.
+    """
 
     name: ClassVar[str] = "incidence"
     unit: ClassVar[str] = "m/s"

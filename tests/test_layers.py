@@ -22,7 +22,7 @@ LAYERS = (
     ("collision",),
     ("motion", "cone"),
     ("coordinates", "support", "statics", "reach"),
-    ("terms", "objectives", "scenario", "problem", "plan"),
+    ("shapes", "terms", "extra_terms", "objectives", "scenario", "problem", "plan"),
     ("nlp",),
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),

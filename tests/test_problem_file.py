@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import impactopt.problem_file.sections as sections
-from impactopt import objectives, terms
+from impactopt import extra_terms, objectives, terms
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.problem import COLLISIONS, ImpactProblem, Phase
@@ -20,6 +20,7 @@ from impactopt.problem_file import load_problem, read_problem_file
 from impactopt.problem_file.mistakes import key_lines
 from impactopt.robot import Tool
 from impactopt.scenario import Scenario
+from impactopt.shapes import Capsule
 from impactopt.stance import FixedBase, OneSole
 
 PUNCH = Path(__file__).parents[1] / "problems" / "punch.toml"
@@ -217,6 +218,87 @@ price = 50.0
     assert solver.options == {"ipopt": {"max_iter": 77}, "sqp": {"hessian": "bfgs", "price": 50.0}}
 
 
+EXTRA = """
+[terms.torque_rate]
+limit_N_m_s = {arm_right_4_joint = 300}
+[terms.self_collision]
+margin_m = 0.03
+[[terms.self_collision.pairs]]
+first = {frame = "arm_right_7_link", radius_m = 0.05}
+second = {frame = "torso_2_link", radius_m = 0.2, start_m = [0.0, 0.0, 0.0], end_m = [0.0, 0.0, 0.3]}
+[terms.keep_out]
+size_m = [0.3, 0.4, 0.2]
+[[terms.keep_out.shapes]]
+frame = "arm_right_4_link"
+radius_m = 0.06
+start_m = [0.0, 0.0, -0.1]
+[terms.hand_orientation]
+axis = [0.0, 0.0, 1.0]
+direction = [0.0, 0.0, -1.0]
+angle_rad = 0.3
+[terms.gaze]
+frame = "head_2_link"
+axis = [1.0, 0.0, 0.0]
+angle_rad = 0.4
+since = 0.2
+[terms.hit_region]
+size_m = [0.1, 0.2]
+[terms.hit_cone]
+angle_rad = 0.15
+"""
+
+
+def test_extra_terms_reach_the_problem(tmp_path: Path) -> None:
+    problem = load_problem(write(tmp_path, GOOD + EXTRA))
+    chest = Capsule(frame="torso_2_link", radius=0.2, end=(0.0, 0.0, 0.3))
+    elbow = Capsule(frame="arm_right_4_link", radius=0.06, start=(0.0, 0.0, -0.1))
+    assert problem.terms == (
+        extra_terms.TorqueRate(limit={"arm_right_4_joint": 300}),
+        extra_terms.SelfCollision(
+            pairs=((Capsule(frame="arm_right_7_link", radius=0.05), chest),), margin=0.03
+        ),
+        extra_terms.KeepOut(shapes=(elbow,), size=(0.3, 0.4, 0.2)),
+        extra_terms.HandOrientation(axis=(0, 0, 1), direction=(0, 0, -1), angle=0.3),
+        extra_terms.Gaze(frame="head_2_link", axis=(1, 0, 0), angle=0.4, since=0.2),
+        extra_terms.HitRegion(size=(0.1, 0.2)),
+        extra_terms.HitCone(angle=0.15),
+    )
+    disc = load_problem(write(tmp_path, GOOD + "[terms.hit_region]\nradius_m = 0.05\n"))
+    assert disc.terms == (extra_terms.HitRegion(radius=0.05),)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("limit_N_m_s = {arm_right_4_joint = 300}", "limit_N_m_s = 0", ["TorqueRate.limit", "> 0"]),
+        ('"arm_right_7_link", radius_m = 0.05', '"arm_right_7_link"', ["pairs.first", "radius_m", "missing"]),
+        ("end_m = [0.0, 0.0, 0.3]", "end_m = [0.0, 0.0, 0.0]", ["coincide", "sphere"]),
+        ("angle_rad = 0.15", "angle_rad = 1.6", ["[terms.hit_cone]", "between 0 and pi/2"]),
+        ("size_m = [0.1, 0.2]", "size_m = [0.1, 0.6]", ["[terms.hit_region]", "0.2 m"]),
+        ("size_m = [0.1, 0.2]", "radius_m = 0.1\nsize_m = [0.1, 0.2]", ["either radius", "or size"]),
+        ("since = 0.2", "since = 1.2", ["Gaze.since", "0 to 1"]),
+        ("axis = [1.0, 0.0, 0.0]", "axis = [1.0, 1.0, 0.0]", ["[terms.gaze] axis", "unit vector"]),
+        (
+            "[terms.hit_cone]\nangle_rad",
+            "[terms.hit_cone]\nangle_deg",
+            ["angle_deg", "did you mean 'angle_rad'"],
+        ),
+        ("[terms.keep_out]", "[terms.keepout]", ["[terms] keepout", "did you mean 'keep_out'"]),
+        ("[terms.hit_cone]", "[terms.incidence]\n[terms.hit_cone]", ["HitCone takes the place of Incidence"]),
+        ("head_2_link", "head_3_link", ["Gaze", "no frame 'head_3_link'", "did you mean"]),
+        (
+            "{arm_right_4_joint",
+            "{arm_right_4_link",
+            ["TorqueRate", "no joint", "did you mean 'arm_right_4_joint'"],
+        ),
+    ],
+)
+def test_mistakes_in_extra_terms_are_named(tmp_path: Path, old: str, new: str, parts: list[str]) -> None:
+    assert old in EXTRA
+    text = message(write(tmp_path, GOOD + EXTRA.replace(old, new)))
+    assert [part for part in parts if part not in text] == []
+
+
 def test_what_a_file_leaves_out_is_the_problems_own_default(tmp_path: Path) -> None:
     given = read_problem_file(write(tmp_path, GOOD)).content.arguments()
     assert given.keys() == {"striker", "point", "normal", "law", "target"}
@@ -230,7 +312,10 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
     for term in terms.DEFAULT_TERMS:
         assert type(term) in kinds
         assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
-    for kind in (Phase, FreeMass, SpringDamper, Scenario, Tool, *objectives.Objective.__subclasses__()):
+    extra = [kind for kind in terms.Term.__subclasses__() if kind.__module__ == extra_terms.__name__]
+    assert len(extra) == 7
+    described = (*objectives.Objective.__subclasses__(), *extra, Capsule)
+    for kind in (Phase, FreeMass, SpringDamper, Scenario, Tool, *described):
         assert {f.name for f in dataclasses.fields(kind)} == set(kinds[kind].model_fields)
     keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
     keys |= {*sections.Collision.model_fields, "law", "collision_elements"}
@@ -280,8 +365,8 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         ("[target]", "[terms.torque_limit]\nfraction = 85\n[target]", ["fraction", "85", "> 0 and <= 1"]),
         (
             "[target]",
-            "[terms.torque]\nfraction = 1\n[target]",
-            ["[terms] torque", "did you mean 'torque_limit'"],
+            "[terms.torque_limits]\nfraction = 1\n[target]",
+            ["[terms] torque_limits", "did you mean 'torque_limit'"],
         ),
         (
             "[target]",

@@ -12,10 +12,12 @@ from typing import Any
 import casadi as ca
 
 from impactopt.coordinates import StanceCoordinates
-from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, make_block
+from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion, KeepOut, SelfCollision
+from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, make_block, striker_kinematics
 from impactopt.nlp.mesh import stage_count
 from impactopt.objectives import Effort, PeakForce, TargetEnergy
 from impactopt.problem import ImpactProblem
+from impactopt.shapes import Capsule
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,26 @@ def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, Extr
         out["energy"] = ExtraBlock(problem.target.formula(), lambda: energy(problem.target))
     if Effort in kinds:
         out["effort"] = ExtraBlock((), lambda: effort(c.robot.n))
+    return out | _of_terms(problem, c)
+
+
+def _of_terms(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:
+    out: dict[str, ExtraBlock] = {}
+    if (apart := problem.extra(SelfCollision)) is not None:
+        key = tuple((s.frame, s.end is None) for pair in apart.pairs for s in pair)
+        out["self_collision"] = ExtraBlock(key, lambda: self_collision(c, apart))
+    if (out_of := problem.extra(KeepOut)) is not None:
+        key = tuple((s.frame, s.end is None) for s in out_of.shapes)
+        out["keep_out"] = ExtraBlock((out_of.size is None, *key), lambda: keep_out(c, out_of))
+    if problem.extra(HandOrientation) is not None:
+        out["hand_orientation"] = ExtraBlock((), lambda: hand_orientation(c, problem.striker))
+    if (gazing := problem.extra(Gaze)) is not None:
+        out["gaze"] = ExtraBlock((gazing.frame,), lambda: gaze(c, gazing.frame))
+    if (region := problem.extra(HitRegion)) is not None:
+        disc = region.size is None
+        out["hit_region"] = ExtraBlock((disc,), lambda: hit_region(c, problem.striker, disc))
+    if problem.extra(HitCone) is not None:
+        out["hit_cone"] = ExtraBlock((), lambda: hit_cone(c, problem.striker))
     return out
 
 
@@ -62,3 +84,146 @@ def effort(n: int) -> BlockExpression:
     """z = torques over limits (n), T [s];  out = T x the sum of their squares [s]."""
     torque, T = ca.SX.sym("torque", n), ca.SX.sym("T")
     return make_block([torque, T], [], {"effort": T * ca.sumsqr(torque)})
+
+
+# ---- terms
+
+
+def corners(shape: Capsule) -> list[float]:
+    """What a block takes as a shape's points: start, and end if there is one."""
+    return [*shape.start, *(shape.end or ())]
+
+
+class _Points:
+    """Points of shapes in the world, and the symbols of their numbers."""
+
+    def __init__(self, c: StanceCoordinates) -> None:
+        self.y, self.legs = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl)
+        self._c, self._q = c, c.configuration(self.y, self.legs)
+        self.numbers: list[Any] = []
+
+    def of(self, shape: Capsule) -> list[Any]:
+        rotation, origin = self._c.rb_frame(shape.frame, self._q)
+        out = []
+        for _ in range(1 if shape.end is None else 2):
+            local = ca.SX.sym("p", 3)
+            self.numbers.append(local)
+            out.append(origin + ca.mtimes(rotation, local))
+        return out
+
+
+def self_collision(c: StanceCoordinates, term: SelfCollision) -> BlockExpression:
+    """z = y, legs;  p = of each pair the points of both shapes and R, radii and margin.
+
+    out = (d^2 - R^2) / 2R [m] with the distance d of the lines: smooth, and d - R where that is small.
+    """
+    points, out = _Points(c), []
+    for first, second in term.pairs:
+        a, b, reach = points.of(first), points.of(second), ca.SX.sym("R")
+        points.numbers.append(reach)
+        out.append((squared_distance(a, b) - reach**2) / (2 * reach))
+    return make_block([points.y, points.legs], points.numbers, {"gap": ca.vertcat(*out)})
+
+
+def squared_distance(a: list[Any], b: list[Any]) -> Any:
+    """Of two points or lines, given by their ends, SX. Once differentiable, unless two lines are parallel.
+
+    Source: Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
+    """
+    if len(a) == len(b) == 1:
+        return ca.sumsqr(a[0] - b[0])
+    if len(a) == 1:
+        return squared_distance(b, a)
+    u = a[1] - a[0]
+    r = a[0] - b[0]
+    if len(b) == 1:
+        return ca.sumsqr(r + _within(-ca.dot(u, r) / ca.sumsqr(u)) * u)
+    v = b[1] - b[0]
+    uu, vv, uv, ur, vr = ca.sumsqr(u), ca.sumsqr(v), ca.dot(u, v), ca.dot(u, r), ca.dot(v, r)
+    s = _within((uv * vr - ur * vv) / (uu * vv - uv**2 + 1e-12 * uu * vv))
+    t = (uv * s + vr) / vv
+    # where that leaves the second line, its end counts
+    s = ca.if_else(t < 0, _within(-ur / uu), ca.if_else(t > 1, _within((uv - ur) / uu), s))
+    return ca.sumsqr(r + s * u - _within(t) * v)
+
+
+def _within(x: Any) -> Any:
+    return ca.fmin(ca.fmax(x, 0.0), 1.0)
+
+
+def keep_out(c: StanceCoordinates, term: KeepOut) -> BlockExpression:
+    """z = y, legs;  p = point (3), axes of the face (9, by rows), half of the box's size (3) if it is one; of
+    each shape its points and its radius with the margin.
+
+    out [m], not negative outside = of each point the distance before the face; or as :func:`self_collision`,
+    to the box.
+    """
+    points, gaps = _Points(c), []
+    point, rows = ca.SX.sym("point", 3), ca.SX.sym("axes", 9)
+    axes = ca.reshape(rows, 3, 3).T  # CasADi is column-major
+    half = ca.SX.sym("half", 0 if term.size is None else 3)
+    for shape in term.shapes:
+        ends, reach = points.of(shape), ca.SX.sym("R")
+        points.numbers.append(reach)
+        for end in ends:
+            way = ca.mtimes(axes, end - point)
+            if term.size is None:
+                gaps.append(-way[0] - reach)
+                continue
+            middle = ca.vertcat(way[0] - half[2], way[1], way[2])
+            beyond = ca.fmax(ca.fabs(middle) - ca.vertcat(half[2], half[0], half[1]), 0.0)
+            gaps.append((ca.sumsqr(beyond) - reach**2) / (2 * reach))
+    numbers = [point, rows, half, *points.numbers]
+    return make_block([points.y, points.legs], numbers, {"gap": ca.vertcat(*gaps)})
+
+
+def hand_orientation(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """z = y;  p = axis (3), direction (3), sine of the angle;  out = cosine between them over that sine."""
+    y, axis, direction, sine = ca.SX.sym("y", c.ny), *(ca.SX.sym(s, 3) for s in "ad"), ca.SX.sym("sin")
+    still = ca.SX.zeros(c.ny)
+    rotation, _ = c.rb_frame(f"striker:{striker}", c.upper_motion(y, still, still)[0])
+    out = ca.dot(direction, ca.mtimes(rotation, axis)) / sine
+    return make_block([y], [axis, direction, sine], {"cosine": out})
+
+
+def gaze(c: StanceCoordinates, frame: str) -> BlockExpression:
+    """z = y, legs;  p = axis (3), point (3), sine of the angle;  out = as :func:`hand_orientation`."""
+    y, legs, sine = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("sin")
+    axis, point = ca.SX.sym("axis", 3), ca.SX.sym("point", 3)
+    rotation, origin = c.rb_frame(frame, c.configuration(y, legs))
+    way = point - origin
+    out = ca.dot(way, ca.mtimes(rotation, axis)) / ca.sqrt(ca.sumsqr(way) + 1e-8) / sine
+    return make_block([y, legs], [axis, point, sine], {"cosine": out})
+
+
+def hit_region(c: StanceCoordinates, striker: str, disc: bool) -> BlockExpression:
+    """z = y;  p = point (3), axes of the face (9, by rows), radius if it is a disc.
+
+    out = of the striking point, distance before the face [m]; and across and up [m], or for a disc
+    (r^2 - radius^2) / (2 radius) [m].
+    """
+    y, point, rows = ca.SX.sym("y", c.ny), ca.SX.sym("point", 3), ca.SX.sym("axes", 9)
+    radius, still = ca.SX.sym("radius", int(disc)), ca.SX.zeros(c.ny)
+    q, v, _ = c.upper_motion(y, still, still)
+    at = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
+    way = ca.mtimes(ca.reshape(rows, 3, 3).T, at - point)
+    side = (ca.sumsqr(way[1:]) - radius**2) / (2 * radius) if disc else way[1:]
+    return make_block([y], [point, rows, radius], {"depth": way[0], "side": side})
+
+
+TYPICAL = 1.0  # [m/s] of a strike
+
+
+def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """z = y, y', T;  p = axes of the face (9, by rows), tangent of the angle.
+
+    out = ((tangent x speed along the normal)^2 - (speed across it)^2) / (2 tangent x 1 m/s) [m/s]: smooth,
+    also where there is no speed across. That the speed along the normal is one of approach is a row anyway.
+    """
+    y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
+    rows, tangent = ca.SX.sym("axes", 9), ca.SX.sym("tan")
+    q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
+    speed = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
+    along, *across = ca.vertsplit(ca.mtimes(ca.reshape(rows, 3, 3).T, speed))
+    room = ((tangent * along) ** 2 - ca.sumsqr(ca.vertcat(*across))) / (2 * tangent * TYPICAL)
+    return make_block([y, y1, T], [rows, tangent], {"room": room})

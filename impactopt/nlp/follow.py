@@ -42,14 +42,16 @@ class FollowThrough:
         y, y1, _ = self.t.at(self.control, self.t.follow_breaks, 0.0)
         return y, y1
 
+    def place_at(self, s: float) -> Place:
+        return Place(f"{self.place}, {100 * s:.0f} %", f"{self.place} at {{s}}", self.T[0] * s)
+
     def nodes(self) -> tuple[list[list[Affine]], list[Place]]:
         """Slots of the block ``node`` and the places of its instances."""
         instances, places = [], []
         for k, at in enumerate(self.t.follow_nodes):
             y, y1, y2 = self.t.at(self.control, self.t.follow_breaks, at)
             instances.append([y, y1, y2, self.legs[k], self.w[k], self.T[0]])
-            name, text = f"{self.place}, {100 * at:.0f} %", f"{self.place} at {{s}}"
-            places.append(Place(name, text, self.T[0] * at))
+            places.append(self.place_at(at))
         return instances, places
 
     def coasting_node(self, wrench: Group) -> tuple[list[Affine], Place]:

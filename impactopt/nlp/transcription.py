@@ -19,10 +19,12 @@ from numpy.typing import ArrayLike
 from impactopt.codegen import cached, model_hash
 from impactopt.cone import contact_wrench_cone, inward_edges
 from impactopt.coordinates import StanceCoordinates
+from impactopt.extra_terms import HitCone, HitRegion, TorqueRate
 from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, knots, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.collision import DIRECTIONS, Collision
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
+from impactopt.nlp.extra_terms import add_extra_terms
 from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
@@ -131,6 +133,7 @@ class Transcription:
         self._contact()
         self._collisions()
         self._after()
+        add_extra_terms(self)
         self.objectives = quantities(self)
         objective, quadratic, linear = assemble(self, self.objectives)
         self.program = StructuredProgram(
@@ -342,7 +345,8 @@ class Transcription:
     @property
     def torques_lifted(self) -> bool:
         """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
-        return any(isinstance(o, Effort) for o in self.problem.objectives)
+        p = self.problem
+        return p.extra(TorqueRate) is not None or any(isinstance(o, Effort) for o in p.objectives)
 
     def _node_rows(self, places: list[Place], n_out: int) -> None:
         c, r = self.coordinates, self.robot
@@ -487,15 +491,16 @@ class Transcription:
         p = self.problem
         y, y1, _ = self.contact_state
         at = self.add_block("contact", [[y, y1, self.swing_T[0]]], rotation_rows(p.normal).ravel())
-        self.rows.add(
-            term="hit point",
-            place=Place("contact", ""),
-            components=["x", "y", "z"],
-            outputs=at + np.arange(3),
-            lower=p.point,
-            upper=p.point,
-            measure=millimetres("away"),
-        )
+        if p.extra(HitRegion) is None:
+            self.rows.add(
+                term="hit point",
+                place=Place("contact", ""),
+                components=["x", "y", "z"],
+                outputs=at + np.arange(3),
+                lower=p.point,
+                upper=p.point,
+                measure=millimetres("away"),
+            )
         self.rows.add(
             term="approach speed",
             place="contact",
@@ -504,16 +509,17 @@ class Transcription:
             lower=0.05,
             measure=Measure("m/s", 1.0, "too slow"),
         )
-        self.rows.add(
-            term=self.incidence.name,
-            place="contact",
-            components=["tangent 1", "tangent 2"],
-            outputs=at + np.array([4, 5]),
-            lower=-self.incidence.speed,
-            upper=self.incidence.speed,
-            measure=Measure("m/s", 1.0, "too fast across the normal"),
-            whole="",
-        )
+        if p.extra(HitCone) is None:
+            self.rows.add(
+                term=self.incidence.name,
+                place="contact",
+                components=["tangent 1", "tangent 2"],
+                outputs=at + np.array([4, 5]),
+                lower=-self.incidence.speed,
+                upper=self.incidence.speed,
+                measure=Measure("m/s", 1.0, "too fast across the normal"),
+                whole="",
+            )
         nodes = self.swing_nodes[:-1]
         instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
         at = self.add_block("approach", instances, p.normal)

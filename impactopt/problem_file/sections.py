@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, cast, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
-from impactopt import objectives, terms
+from impactopt import extra_terms, objectives, terms
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.presets import load_robot
@@ -34,6 +34,7 @@ from impactopt.problem_file.values import (
 )
 from impactopt.robot import Robot, Sole, Striker, Tool
 from impactopt.scenario import Scenario
+from impactopt.shapes import Capsule
 from impactopt.sqp import SQPOptions
 
 
@@ -209,6 +210,72 @@ class LegExtension(Section):
     minimum: Fraction = _optional()
 
 
+class Shape(Section):
+    kind = Capsule
+    frame: str
+    radius: NotNegative = Field(alias="radius_m")
+    start: Vector = _optional("start_m")
+    end: Vector = _optional("end_m")
+
+
+class Pair(Section):
+    first: Shape
+    second: Shape
+
+    def build(self) -> tuple[Any, Any]:
+        return self.first.build(), self.second.build()
+
+
+class TorqueRate(Section):
+    kind = extra_terms.TorqueRate
+    limit: PerJoint = Field(alias="limit_N_m_s")
+
+
+class SelfCollision(Section):
+    kind = extra_terms.SelfCollision
+    pairs: list[Pair]
+    margin: NotNegative = _optional("margin_m")
+
+    def build(self) -> Any:
+        return self.kind(**{**self.given(), "pairs": tuple(pair.build() for pair in self.pairs)})
+
+
+class KeepOut(Section):
+    kind = extra_terms.KeepOut
+    shapes: list[Shape]
+    size: Vector = _optional("size_m")
+    margin: NotNegative = _optional("margin_m")
+
+    def build(self) -> Any:
+        return self.kind(**{**self.given(), "shapes": tuple(shape.build() for shape in self.shapes)})
+
+
+class HandOrientation(Section):
+    kind = extra_terms.HandOrientation
+    axis: UnitVector
+    direction: UnitVector = _optional()
+    angle: Positive = _optional("angle_rad")
+
+
+class Gaze(Section):
+    kind = extra_terms.Gaze
+    frame: str
+    axis: UnitVector
+    angle: Positive = _optional("angle_rad")
+    since: NotNegative = _optional()
+
+
+class HitRegion(Section):
+    kind = extra_terms.HitRegion
+    radius: Positive = _optional("radius_m")
+    size: Point2 = _optional("size_m")
+
+
+class HitCone(Section):
+    kind = extra_terms.HitCone
+    angle: Positive = _optional("angle_rad")
+
+
 class Terms(Section):
     torque_limit: TorqueLimit = _optional()
     velocity_limit: VelocityLimit = _optional()
@@ -217,6 +284,13 @@ class Terms(Section):
     balance: Balance = _optional()
     incidence: Incidence = _optional()
     leg_extension: LegExtension = _optional()
+    torque_rate: TorqueRate = _optional()
+    self_collision: SelfCollision = _optional()
+    keep_out: KeepOut = _optional()
+    hand_orientation: HandOrientation = _optional()
+    gaze: Gaze = _optional()
+    hit_region: HitRegion = _optional()
+    hit_cone: HitCone = _optional()
 
 
 _SQP_KEYS: dict[str, Any] = {

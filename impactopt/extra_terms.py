@@ -1,0 +1,183 @@
+"""Terms that only hold in a problem that gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from impactopt.errors import InputError, check_array
+from impactopt.shapes import Capsule, Vector, vector
+from impactopt.terms import Term
+
+REACH = 0.2  # [m] of a hit region: further off the replays' target has ended
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueRate(Term):
+    """|d torque/dt| <= ``limit`` [N m/s], from node to node of swing and follow-through.
+
+    limit : of all joints, or by joint; those that are not named have none.
+    """
+
+    name: ClassVar[str] = "torque rate"
+    unit: ClassVar[str] = "of limit"
+    limit: float | Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        limits = self.limit.values() if isinstance(self.limit, Mapping) else (self.limit,)
+        for value in limits:
+            if not 0 < value < np.inf:
+                raise InputError(f"TorqueRate.limit is {value:g} N m/s; give a number > 0")
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(self.limit) if isinstance(self.limit, Mapping) else ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfCollision(Term):
+    """Each pair of shapes stays ``margin`` [m] apart, at the nodes of swing and follow-through."""
+
+    name: ClassVar[str] = "self-collision"
+    unit: ClassVar[str] = "m"
+    pairs: tuple[tuple[Capsule, Capsule], ...]
+    margin: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "pairs", tuple((first, second) for first, second in self.pairs))
+        for first, second in self.pairs:
+            if not first.radius + second.radius + self.margin > 0:
+                raise InputError(
+                    f"SelfCollision: {first.frame!r} and {second.frame!r} have no size; give a radius"
+                )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        return tuple(shape.frame for pair in self.pairs for shape in pair)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeepOut(Term):
+    """Shapes stay ``margin`` [m] out of the target before contact, at the nodes of the swing.
+
+    The target is the half-space behind the plane of its face; or with ``size`` (across, up, deep) [m] a box
+    whose face is centred on the problem's point, from which spheres only are kept. The striking point has its
+    rule anyway.
+    """
+
+    name: ClassVar[str] = "keep out"
+    unit: ClassVar[str] = "m"
+    shapes: tuple[Capsule, ...]
+    size: Vector | None = None
+    margin: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "shapes", tuple(self.shapes))
+        if self.size is None:
+            return
+        size = vector("KeepOut.size [m]", self.size)
+        if min(size) <= 0:
+            raise InputError(f"KeepOut.size is {size}; give three lengths > 0 m")
+        object.__setattr__(self, "size", size)
+        for shape in self.shapes:
+            if shape.end is not None or not shape.radius + self.margin > 0:
+                raise InputError(
+                    f"KeepOut: {shape.frame!r} is kept from a box as a sphere; give a radius and no end"
+                )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        return tuple(shape.frame for shape in self.shapes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandOrientation(Term):
+    """``axis`` of the striker's frame is within ``angle`` [rad] of ``direction`` (world) at contact.
+
+    direction None: the problem's normal. Unit vectors.
+    """
+
+    name: ClassVar[str] = "hand orientation"
+    unit: ClassVar[str] = "rad"
+    axis: Vector
+    direction: Vector | None = None
+    angle: float = 0.2
+
+    def __post_init__(self) -> None:
+        self.check_angle(self.angle)
+        self.make_axis("axis")
+        if self.direction is not None:
+            self.make_axis("direction")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaze(Term):
+    """``axis`` (unit) of ``frame`` looks from its origin at the problem's point within ``angle`` [rad].
+
+    At the nodes of the swing from its fraction ``since`` on, and at contact.
+    """
+
+    name: ClassVar[str] = "gaze"
+    unit: ClassVar[str] = "rad"
+    frame: str
+    axis: Vector
+    angle: float = 0.5
+    since: float = 0.5
+
+    def __post_init__(self) -> None:
+        self.check_angle(self.angle)
+        self.make_axis("axis")
+        if not 0 <= self.since <= 1:
+            raise InputError(f"Gaze.since is {self.since:g}; give a fraction of the swing, from 0 to 1")
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        return (self.frame,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitRegion(Term):
+    """The hit point is anywhere in a region about the problem's point, in the plane of the normal.
+
+    A disc of ``radius`` [m], or a rectangle of ``size`` (across, up) [m]: see
+    :func:`impactopt.shapes.face_axes`. It reaches no further than 0.2 m, where the replays' target ends.
+    """
+
+    name: ClassVar[str] = "hit region"
+    unit: ClassVar[str] = "m"
+    radius: float | None = None
+    size: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.radius is None) == (self.size is None):
+            raise InputError("HitRegion: give either radius, of a disc, or size, of a rectangle [m]")
+        given: list[Any] = [self.radius] if self.size is None else list(self.size)
+        lengths = check_array("HitRegion [m]", given, (None,))
+        reach = float(lengths[0]) if self.size is None else float(np.linalg.norm(lengths)) / 2
+        if len(lengths) != (1 if self.size is None else 2) or min(lengths) <= 0 or reach > REACH:
+            raise InputError(
+                f"HitRegion of {lengths.tolist()} m: give lengths > 0 that reach no further than {REACH} m "
+                "from the point"
+            )
+        if self.size is not None:
+            object.__setattr__(self, "size", (float(self.size[0]), float(self.size[1])))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitCone(Term):
+    """The striking point's velocity at contact is within ``angle`` [rad] of the normal.
+
+    In place of :class:`Incidence`.
+    """
+
+    name: ClassVar[str] = "hit cone"
+    unit: ClassVar[str] = "m/s"
+    angle: float = 0.1
+
+    def __post_init__(self) -> None:
+        self.check_angle(self.angle)

@@ -1,0 +1,199 @@
+"""Rows of the terms that only some problems have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impactopt.extra_terms import (
+    Gaze,
+    HandOrientation,
+    HitCone,
+    HitRegion,
+    KeepOut,
+    SelfCollision,
+    TorqueRate,
+)
+from impactopt.nlp.extra_blocks import corners
+from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.nlp.objective import start_torque
+from impactopt.nlp.rows import Measure, Place, degrees, millimetres
+from impactopt.shapes import face_axes
+from impactopt.terms import Term
+
+if TYPE_CHECKING:
+    from impactopt.nlp.transcription import Transcription
+
+CONTACT = "contact"
+
+
+def add_extra_terms(t: Transcription) -> None:
+    """Blocks and rows of each extra term that the problem has."""
+    for term in t.problem.terms:
+        if (add := _ADD.get(type(term))) is not None:
+            add(t, term)
+
+
+def _torque_rate(t: Transcription, term: TorqueRate) -> None:
+    """The torques are variables, so these rows are linear, of a duration that is one too."""
+    names = t.robot.joint_names
+    limit = [
+        term.limit.get(name, np.inf) if isinstance(term.limit, Mapping) else term.limit for name in names
+    ]
+    joints = np.flatnonzero(np.isfinite(limit))
+    rate = np.array(limit)[joints] / t.robot.torque_limit[joints]
+    labels = [names[j] for j in joints]
+    swing, follow = len(t.swing_nodes), len(t.follow_nodes)
+    start = Affine.constant(start_torque(t))
+    phases = [(t.swing_place, np.append(0.0, t.swing_nodes), [start, *t.torques[:swing]], t.swing_T)]
+    for k, part in enumerate(t.follows):
+        first = swing + k * follow
+        phases.append((part.place_at, t.follow_nodes, t.torques[first : first + follow], part.T))
+    for place_at, nodes, torques, duration in phases:
+        for a, b, one, two in zip(nodes, nodes[1:], torques, torques[1:], strict=False):
+            step, most = (two - one)[joints], _repeated(duration, len(joints)) * (rate * (b - a))
+            place = place_at((a + b) / 2)
+            place = replace(place, name=f"{place.name}, from {100 * a:.1f} %")
+            for way, sign in (("rising", 1.0), ("falling", -1.0)):
+                t.rows.add(
+                    term=term.name,
+                    place=place,
+                    components=[f"{label} {way}" for label in labels],
+                    affine=step * sign - most,
+                    upper=0,
+                    measure=[Measure("%", 100 / r, "over its limit", duration[0] * (b - a)) for r in rate],
+                )
+
+
+def _repeated(duration: Group, count: int) -> Affine:
+    return duration[0].apply(np.ones((count, 1)))
+
+
+def _self_collision(t: Transcription, term: SelfCollision) -> None:
+    names = [f"{first.frame} and {second.frame}" for first, second in term.pairs]
+    numbers = [[*corners(a), *corners(b), a.radius + b.radius + term.margin] for a, b in term.pairs]
+    spots = _swing_nodes(t)
+    for part in t.follows:
+        for k, s in enumerate(t.follow_nodes):
+            y = t.at(part.control, t.follow_breaks, s)[0]
+            spots.append((part.place_at(s), [y, part.legs[k]]))
+    _each(t, "self_collision", term.name, spots, np.concatenate(numbers), _distinct(names))
+
+
+def _keep_out(t: Transcription, term: KeepOut) -> None:
+    numbers = [*t.problem.point, *face_axes(t.problem.normal).ravel(), *(a / 2 for a in term.size or ())]
+    names = []
+    for shape in term.shapes:
+        numbers += [*corners(shape), shape.radius + term.margin]
+        names += [shape.frame] if shape.end is None else [f"{shape.frame} start", f"{shape.frame} end"]
+    _each(t, "keep_out", term.name, _swing_nodes(t)[:-1], np.array(numbers), _distinct(names))
+
+
+def _swing_nodes(t: Transcription) -> list[tuple[Place, list[Affine]]]:
+    """Places of the swing's nodes with coordinates and legs."""
+    return [
+        (t.swing_place(s), [t.at(t.swing_control, t.swing_breaks, s)[0], t.swing_legs[k]])
+        for k, s in enumerate(t.swing_nodes)
+    ]
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Names with a number where one comes again."""
+    return [f"{n} {names[:k].count(n) + 1}" if names.count(n) > 1 else n for k, n in enumerate(names)]
+
+
+def _each(
+    t: Transcription,
+    block: str,
+    term: str,
+    spots: list[tuple[Place, list[Affine]]],
+    numbers: Array,
+    names: list[str],
+) -> None:
+    """At each place, all outputs of a block [m] are not negative."""
+    at = t.add_block(block, [slots for _, slots in spots], numbers)
+    for i, (place, _) in enumerate(spots):
+        t.rows.add(
+            term=term,
+            place=place,
+            components=names,
+            outputs=at + i * len(names) + np.arange(len(names)),
+            lower=0,
+            measure=millimetres("too near"),
+        )
+
+
+def _hand_orientation(t: Transcription, term: HandOrientation) -> None:
+    direction = t.problem.normal if term.direction is None else term.direction
+    numbers = np.array([*term.axis, *direction, np.sin(term.angle)])
+    at = t.add_block("hand_orientation", [[t.contact_state[0]]], numbers)
+    t.rows.add(
+        term=term.name,
+        place=CONTACT,
+        components=[t.problem.striker],
+        outputs=np.array([at]),
+        lower=1 / np.tan(term.angle),
+        measure=degrees("too far off"),
+    )
+
+
+def _gaze(t: Transcription, term: Gaze) -> None:
+    nodes = [spot for spot, s in zip(_swing_nodes(t), t.swing_nodes, strict=True) if s >= term.since]
+    numbers = np.array([*term.axis, *t.problem.point, np.sin(term.angle)])
+    at = t.add_block("gaze", [slots for _, slots in nodes], numbers)
+    for i, (place, _) in enumerate(nodes):
+        t.rows.add(
+            term=term.name,
+            place=place,
+            components=[term.frame],
+            outputs=np.array([at + i]),
+            lower=1 / np.tan(term.angle),
+            measure=degrees("too far off"),
+        )
+
+
+def _hit_region(t: Transcription, term: HitRegion) -> None:
+    numbers = [*t.problem.point, *face_axes(t.problem.normal).ravel()]
+    numbers += [] if term.radius is None else [term.radius]
+    at = t.add_block("hit_region", [[t.contact_state[0]]], np.array(numbers))
+    away = millimetres("away")
+    t.equal("hit point", Place(CONTACT, ""), ["along the normal"], np.array([at]), away)
+    names = ["disc"] if term.size is None else ["across", "up"]
+    most = np.zeros(1) if term.size is None else np.array(term.size) / 2
+    t.rows.add(
+        term=term.name,
+        place=CONTACT,
+        components=names,
+        outputs=at + 1 + np.arange(len(names)),
+        lower=-np.inf if term.size is None else -most,
+        upper=most,
+        measure=millimetres("outside"),
+    )
+
+
+def _hit_cone(t: Transcription, term: HitCone) -> None:
+    y, y1, _ = t.contact_state
+    numbers = np.append(face_axes(t.problem.normal).ravel(), np.tan(term.angle))
+    at = t.add_block("hit_cone", [[y, y1, t.swing_T[0]]], numbers)
+    t.rows.add(
+        term=term.name,
+        place=CONTACT,
+        components=["across the normal"],
+        outputs=np.array([at]),
+        lower=0,
+        measure=Measure("m/s", 1.0, "too fast"),
+    )
+
+
+_ADD: dict[type[Term], Callable[[Transcription, Any], None]] = {
+    TorqueRate: _torque_rate,
+    SelfCollision: _self_collision,
+    KeepOut: _keep_out,
+    HandOrientation: _hand_orientation,
+    Gaze: _gaze,
+    HitRegion: _hit_region,
+    HitCone: _hit_cone,
+}

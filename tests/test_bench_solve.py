@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_solution import PROBLEM_FILE
 from small_plans import arm_problem
 from textbook import CASES, Textbook, assert_optimal, infeasible, textbook_program
 from typer.testing import CliRunner
@@ -201,9 +202,9 @@ def textbook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Textbook programs in place of problem files."""
     monkeypatch.setattr(solve, "planning_program", textbook_program)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "problems").mkdir()
     for name in ("HS71", "infeasible"):
-        (tmp_path / "problems" / f"{name}.toml").write_text("", encoding="utf-8")
+        (tmp_path / f"{name}.toml").write_text(PROBLEM_FILE, encoding="utf-8")
+    monkeypatch.setattr("impactopt.problem_file.names.FOLDERS", (tmp_path,))
     return tmp_path
 
 
@@ -249,11 +250,12 @@ def test_unknown_names_are_refused_at_once(textbook: Path) -> None:
         solve.run(quiet, problem="HS70")
     with pytest.raises(InputError, match=r"no solver 'ipop' \(did you mean 'ipopt'\?\)"):
         solve.run(quiet, solvers=["ipop"])
-    with pytest.raises(InputError, match="no problem files in nowhere"):
-        solve.run(quiet, folder=Path("nowhere"))
     Path("bad.jsonl").write_text("not json\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"bad\.jsonl cannot be used"):
         solve.run(quiet, attempts=Path("bad.jsonl"), resume=True)
+    Path("wrong.toml").write_text("[problem]\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"wrong\.toml"):
+        solve.run(quiet)
 
 
 def test_starts_are_plain_first_and_drawn_by_the_seed(

@@ -156,7 +156,7 @@ def skip(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
 @app.command()
 def solve(
     problem: Annotated[
-        str | None, typer.Option("--problem", metavar="NAME", help="One problem of problems/ (default: all).")
+        str | None, typer.Option("--problem", metavar="NAME", help="One problem, or its file (default: all).")
     ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Starts: the plain one, and perturbed ones.")] = 3,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Of one solve [s].")] = 60.0,

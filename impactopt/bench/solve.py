@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from impactopt.bench.attempts import Attempt, Make, attempt
-from impactopt.bench.planning import DEMO
 from impactopt.bench.report import Report, Say, columns_table
 from impactopt.bench.solvers import SOLVERS
 from impactopt.errors import InputError, did_you_mean
 from impactopt.output import make_directory, plain
+from impactopt.problem_file import read_problem_file
+from impactopt.problem_file.names import problem_file, problem_names
 from impactopt.program import NonlinearProgram, Status, Vector
 
 __all__ = ["ATTEMPTS", "planning_program", "run", "summary"]
@@ -33,24 +34,20 @@ QUICK = ("sqp:auto", "ipopt")
 
 COLUMNS = (
     ("problem", "problem", 0),
-    ("solver", "solver", 0),
-    ("QP", "qp", 0),
+    ("solver", "label", 0),
     ("success", "success", 2),
-    ("s", "median_seconds", 2),
+    ("s", "median_seconds", 1),
+    ("QP s", "seconds_qp", 1),
     ("steps", "median_iterations", 0),
-    ("objective", "objective", 4),
-    ("best", "best_known", 4),
+    ("objective", "objective", 3),
     ("violation", "max_violation", ".0e"),
     ("KKT", "kkt", ".0e"),
-    ("functions s", "seconds_functions", 2),
-    ("QP s", "seconds_qp", 2),
 )
 
 
 def run(
     say: Say,
     *,
-    folder: Path = DEMO.parent,
     problem: str | None = None,
     starts: int = 3,
     time_limit: float = 60.0,
@@ -62,7 +59,7 @@ def run(
 ) -> Report:
     """One row a problem and solver.
 
-    problem : name of a file in the folder, without .toml; default: all.  starts : the plain first iterate,
+    problem : one of `problem_names()`, or a file; default: all.  starts : the plain first iterate,
     and perturbed ones.  time_limit [s] : of one solve.  solvers : labels in `SOLVERS`; default: all.
     quick : one start, our default and IPOPT.  attempts : file that keeps every solve, a JSON object a line.
     resume : do not repeat solves that it has.
@@ -71,9 +68,7 @@ def run(
     ------
     InputError : an unknown problem or solver; the file cannot be written or read.
     """
-    makes: dict[str, Make] = {
-        path.stem: partial(planning_program, path, seed) for path in _files(folder, problem)
-    }
+    makes: dict[str, Make] = {path.stem: partial(planning_program, path, seed) for path in _files(problem)}
     chosen = _chosen(solvers or (QUICK if quick else tuple(SOLVERS)))
     number = 1 if quick else starts
     kept = _Kept(attempts, resume=resume)
@@ -84,7 +79,8 @@ def run(
             for label in chosen
         }
         rows += summary(name, found)
-    table = columns_table(f"{number} starts, at most {time_limit:g} s each", COLUMNS, rows)
+    shown = [{**row, "label": f"{row['solver']}:{row['qp']}".rstrip(":")} for row in rows]
+    table = columns_table(f"starts: {number}, of at most {time_limit:g} s each", COLUMNS, shown)
     settings = {"starts": number, "time_limit": time_limit, "seed": seed}
     return Report(name="solve", numbers={"rows": rows, **settings}, tables=(table,))
 
@@ -204,17 +200,11 @@ class _Kept:
             file.write(line + "\n")
 
 
-def _files(folder: Path, problem: str | None) -> list[Path]:
-    files = {path.stem: path for path in sorted(folder.glob("*.toml"))}
-    if not files:
-        raise InputError(f"there are no problem files in {folder}/; run it where that folder is")
-    if problem is None:
-        return list(files.values())
-    if problem not in files:
-        raise InputError(
-            f"there is no problem {problem!r}{did_you_mean(problem, files)}: there are {', '.join(files)}"
-        )
-    return [files[problem]]
+def _files(problem: str | None) -> list[Path]:
+    files = [problem_file(name) for name in (problem_names() if problem is None else (problem,))]
+    for file in files:
+        read_problem_file(file)  # what is wrong in it is said before hours are spent on others
+    return files
 
 
 def _chosen(labels: Sequence[str]) -> list[str]:

@@ -39,15 +39,21 @@ class TorqueRate(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCollision(Term):
-    """Each pair of shapes stays ``margin`` [m] apart, at the nodes of swing and follow-through."""
+    """Each pair of shapes stays ``margin`` [m] apart, at the nodes of swing and follow-through.
+
+    pairs None: the hand that strikes against torso and thighs, by
+    :func:`impactopt.skeleton.skeleton_pairs`.
+    """
 
     name: ClassVar[str] = "self-collision"
     unit: ClassVar[str] = "m"
-    pairs: tuple[tuple[Capsule, Capsule], ...]
+    pairs: tuple[tuple[Capsule, Capsule], ...] | None = None
     margin: float = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.pairs is None:
+            return
         object.__setattr__(self, "pairs", tuple((first, second) for first, second in self.pairs))
         for first, second in self.pairs:
             if not first.radius + second.radius + self.margin > 0:
@@ -57,7 +63,7 @@ class SelfCollision(Term):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        return tuple(shape.frame for pair in self.pairs for shape in pair)
+        return tuple(shape.frame for pair in self.pairs or () for shape in pair)
 
 
 @dataclass(frozen=True, kw_only=True)

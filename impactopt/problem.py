@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -14,11 +14,12 @@ from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.extra_terms import HitCone
+from impactopt.extra_terms import HitCone, SelfCollision
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.reach import reach
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
+from impactopt.skeleton import skeleton_pairs
 from impactopt.stance import BothSoles, Stance
 from impactopt.support import margin, support_polygon
 from impactopt.terms import DEFAULT_TERMS, Incidence, Term
@@ -159,6 +160,7 @@ class ImpactProblem:
                 f"a plan stands on soles only: give {type(self.stance).__name__} without hands, which are "
                 "for collision models"
             )
+        put(self, "terms", tuple(self._with_pairs(t) for t in self.terms))
         kinds = [type(t) for t in self.terms]
         for kind in kinds:
             if kinds.count(kind) > 1:
@@ -188,6 +190,11 @@ class ImpactProblem:
                 f"outside the support polygon of {names}; start from a posture with its weight on what is "
                 "held, or hold more"
             )
+
+    def _with_pairs(self, term: Term) -> Term:
+        if isinstance(term, SelfCollision) and term.pairs is None:
+            return replace(term, pairs=skeleton_pairs(self.robot, self.striker))
+        return term
 
     def _check_names(self) -> None:
         """That the robot has what the terms name."""

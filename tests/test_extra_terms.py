@@ -32,9 +32,11 @@ from impactopt.nlp.extra_blocks import squared_distance
 from impactopt.nlp.start import first_iterate
 from impactopt.nlp.transcription import Transcription
 from impactopt.plan import Plan
+from impactopt.presets import g1, standin, talos
 from impactopt.problem import Phase
 from impactopt.program import SolverResult, Status
 from impactopt.shapes import Capsule, face_axes
+from impactopt.skeleton import skeleton_pairs
 from impactopt.terms import Incidence, Term
 
 Array = NDArray[np.float64]
@@ -402,3 +404,39 @@ def test_the_faces_axes_are_level_and_at_right_angles(normal: list[float]) -> No
     np.testing.assert_array_equal(axes[0], normal)
     assert axes[1, 2] == 0 and axes[2, 2] >= 0
     assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("make", [talos, g1, standin])
+def test_bones_tell_of_torso_and_thighs(make: Any) -> None:
+    """One of each thigh and a torso between hips and shoulders; in half-sitting the hand is clear of all."""
+    robot = make()
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, robot.posture("half_sitting"))
+    for striker in robot.strikers:
+        pairs = skeleton_pairs(robot, striker)
+        assert len(pairs) == 1 + len(robot.soles)
+        hand = data.oMf[model.getFrameId(robot.striker(striker).frame)].translation
+        assert {first.frame for first, _ in pairs} == {robot.striker(striker).frame}
+        for first, second in pairs:
+            placement = data.oMf[model.getFrameId(second.frame)]
+            a, b = (placement.act(np.array(end)) for end in (second.start, second.end))
+            assert 0.15 < np.linalg.norm(b - a) < 0.5
+            along = np.clip((hand - a) @ (b - a) / np.sum((b - a) ** 2), 0, 1)
+            assert np.linalg.norm(hand - a - along * (b - a)) > first.radius + second.radius + 0.01
+        torso, *thighs = (second for _, second in pairs)
+        low = max(data.oMf[model.getFrameId(thigh.frame)].translation[2] for thigh in thighs)
+        assert data.oMf[model.getFrameId(torso.frame)].translation[2] > low
+        assert abs(data.oMf[model.getFrameId(torso.frame)].translation[1]) < 0.01
+
+
+def test_a_problem_finds_the_pairs_of_its_robot_itself(biped_transcription: Transcription) -> None:
+    problem = changed(biped_transcription, terms=(SelfCollision(margin=0.02),)).problem
+    term = problem.extra(SelfCollision)
+    assert term is not None and term.margin == 0.02
+    assert term.pairs == skeleton_pairs(problem.robot, "fist")
+    assert {second.frame for _, second in term.pairs} == {"root", "left hip pitch", "right hip pitch"}
+
+
+def test_a_robot_without_a_body_needs_pairs(arm_transcription: Transcription) -> None:
+    with pytest.raises(InputError, match="give SelfCollision its pairs"):
+        changed(arm_transcription, terms=(SelfCollision(),))

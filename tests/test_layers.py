@@ -22,7 +22,7 @@ LAYERS = (
     ("collision",),
     ("motion", "cone"),
     ("coordinates", "support", "statics", "reach"),
-    ("shapes", "terms", "extra_terms", "objectives", "scenario", "problem", "plan"),
+    ("shapes", "skeleton", "terms", "extra_terms", "objectives", "scenario", "problem", "plan"),
     ("nlp",),
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),

@@ -265,6 +265,9 @@ def test_extra_terms_reach_the_problem(tmp_path: Path) -> None:
     )
     disc = load_problem(write(tmp_path, GOOD + "[terms.hit_region]\nradius_m = 0.05\n"))
     assert disc.terms == (extra_terms.HitRegion(radius=0.05),)
+    (own,) = load_problem(write(tmp_path, GOOD + "[terms.self_collision]\nmargin_m = 0.03\n")).terms
+    assert isinstance(own, extra_terms.SelfCollision) and own.pairs is not None
+    assert (len(own.pairs), own.margin) == (3, 0.03)
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, Extr
 def _of_terms(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:
     out: dict[str, ExtraBlock] = {}
     if (apart := problem.extra(SelfCollision)) is not None:
-        key = tuple((s.frame, s.end is None) for pair in apart.pairs for s in pair)
+        key = tuple((s.frame, s.end is None) for pair in apart.pairs or () for s in pair)
         out["self_collision"] = ExtraBlock(key, lambda: self_collision(c, apart))
     if (out_of := problem.extra(KeepOut)) is not None:
         key = tuple((s.frame, s.end is None) for s in out_of.shapes)
@@ -118,7 +118,7 @@ def self_collision(c: StanceCoordinates, term: SelfCollision) -> BlockExpression
     out = (d^2 - R^2) / 2R [m] with the distance d of the lines: smooth, and d - R where that is small.
     """
     points, out = _Points(c), []
-    for first, second in term.pairs:
+    for first, second in term.pairs or ():
         a, b, reach = points.of(first), points.of(second), ca.SX.sym("R")
         points.numbers.append(reach)
         out.append((squared_distance(a, b) - reach**2) / (2 * reach))

@@ -73,8 +73,8 @@ def _repeated(duration: Group, count: int) -> Affine:
 
 
 def _self_collision(t: Transcription, term: SelfCollision) -> None:
-    names = [f"{first.frame} and {second.frame}" for first, second in term.pairs]
-    numbers = [[*corners(a), *corners(b), a.radius + b.radius + term.margin] for a, b in term.pairs]
+    names = [f"{first.frame} and {second.frame}" for first, second in term.pairs or ()]
+    numbers = [[*corners(a), *corners(b), a.radius + b.radius + term.margin] for a, b in term.pairs or ()]
     spots = _swing_nodes(t)
     for part in t.follows:
         for k, s in enumerate(t.follow_nodes):

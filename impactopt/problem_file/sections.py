@@ -233,11 +233,12 @@ class TorqueRate(Section):
 
 class SelfCollision(Section):
     kind = extra_terms.SelfCollision
-    pairs: list[Pair]
+    pairs: list[Pair] = _optional()
     margin: NotNegative = _optional("margin_m")
 
     def build(self) -> Any:
-        return self.kind(**{**self.given(), "pairs": tuple(pair.build() for pair in self.pairs)})
+        pairs = None if self.pairs is None else tuple(pair.build() for pair in self.pairs)
+        return self.kind(**{**self.given(), "pairs": pairs})
 
 
 class KeepOut(Section):

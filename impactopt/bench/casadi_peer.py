@@ -72,7 +72,7 @@ def solve_sqpmethod(
         seconds_qp=seconds_qp,
         max_violation=max_violation(program, x, g),
         kkt=stationarity(gradient, jacobian, y, z),
-        message=outcome,
+        message="out of time" if functions.out_of_time else outcome,
     )
 
 

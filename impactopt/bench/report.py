@@ -67,8 +67,9 @@ def _versions() -> dict[str, str]:
     from impactopt.solution import versions
 
     found = versions()
-    with contextlib.suppress(PackageNotFoundError):
-        found["mujoco"] = version("mujoco")
+    for name in ("mujoco", "daqp", "piqp"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
     return found
 
 

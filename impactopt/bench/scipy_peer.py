@@ -152,7 +152,9 @@ def _solved(
     if not status.usable and watched.best.x is not None:
         x = watched.best.x
     g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
-    y, z = least_multipliers(program, x, g, gradient, jacobian)
+    y, z = np.zeros(program.m), np.zeros(program.n)
+    if status.usable:
+        y, z = least_multipliers(program, x, g, gradient, jacobian)
     return SolverResult(
         x=x,
         multipliers=y,

@@ -6,7 +6,7 @@ The border between the symbolic and the numeric half of the package: everything 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -74,8 +74,8 @@ class NonlinearProgram(Protocol):
 class SpokenProgram(NonlinearProgram, Protocol):
     """A program that tells its violated rows as a person reads them."""
 
-    def row_group(self, i: int) -> Hashable:
-        """What row i shares with the rows of which one message stands for all."""
+    def row_group(self, i: int) -> tuple[str, str]:
+        """Term and place of row i: of the rows of a term at a place one message stands for all."""
         ...
 
     def describe_violation(self, i: int, x: Vector, amount: float) -> tuple[str, str]:
@@ -93,6 +93,9 @@ class Violation:
 
     def __str__(self) -> str:
         return f"{self.what}: {self.by}"
+
+
+MINOR = 0.01  # of the worst row's violation: what a message leaves out
 
 
 class Status(enum.Enum):
@@ -273,12 +276,21 @@ def is_stationary_violation(
 
 
 def worst_rows(
-    program: NonlinearProgram, x: Vector, g: Vector, *, tolerance: float, count: int = 5
+    program: NonlinearProgram,
+    x: Vector,
+    g: Vector,
+    *,
+    tolerance: float,
+    count: int = 5,
+    once_a_term: bool = False,
 ) -> list[Violation]:
-    """What is violated by more than the tolerance, largest first; of rows that belong together the worst."""
+    """What is violated by more than the tolerance, largest first.
+
+    Of a term's rows at a place the worst one only; ``once_a_term``: of all its rows.
+    """
     violations = np.concatenate([row_violations(program, g), bound_violations(program, x)])
     violations = np.where(np.isnan(violations), np.inf, violations)
-    m, out, seen = program.m, list[Violation](), set[Hashable]()
+    m, out, seen = program.m, list[Violation](), set[tuple[str, str]]()
     spoken = program if isinstance(program, SpokenProgram) else None
     for i in np.argsort(-violations, kind="stable").tolist():
         amount = float(violations[i])
@@ -286,7 +298,8 @@ def worst_rows(
             break
         what, by = f"bound of {program.variable_name(i - m)}" if i >= m else "", f"by {amount:.3g}"
         if i < m and spoken is not None:
-            if (group := spoken.row_group(i)) in seen:
+            term, place = spoken.row_group(i)
+            if (group := (term, "" if once_a_term else place)) in seen:
                 continue
             seen.add(group)
             what, by = spoken.describe_violation(i, x, amount)
@@ -295,10 +308,12 @@ def worst_rows(
 
 
 def explain(program: NonlinearProgram, status: Status, x: Vector, g: Vector, *, tolerance: float) -> str:
-    """The status as a sentence, followed by what is violated, in words."""
-    rows = worst_rows(program, x, g, tolerance=tolerance)
+    """The status as a sentence, followed by what is violated, in words: where each term is worst."""
+    rows = worst_rows(program, x, g, tolerance=tolerance, once_a_term=True)
     if not rows:
         return status.message
+    # rows are of order one, so what is off by so much less only follows from the others
+    rows = [violation for violation in rows if violation.amount >= MINOR * rows[0].amount]
     listed = "; ".join(str(violation) for violation in rows)
     heading = "Rows that cannot be met" if status is Status.INFEASIBLE else "Rows not met"
     more = int(

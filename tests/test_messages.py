@@ -17,7 +17,7 @@ from impactopt.nlp.rows import Measure, Place, along, degrees, millimetres, perc
 from impactopt.nlp.start import first_iterate
 from impactopt.nlp.transcription import Transcription
 from impactopt.problem import Phase
-from impactopt.program import SpokenProgram, Status, Violation, worst_rows
+from impactopt.program import SpokenProgram, Status, Violation, explain, worst_rows
 from impactopt.scenario import Scenario
 from impactopt.terms import ContactWrenchCone, TorqueLimit
 
@@ -111,6 +111,13 @@ def test_rows_of_a_term_at_a_place_are_told_once_by_the_worst(biped_transcriptio
     assert len(found) == len(groups) < np.count_nonzero(over > 1e-6)
     assert [v.amount for v in found] == sorted((v.amount for v in found), reverse=True)
     assert found[0].amount == over.max()
+    worst = worst_rows(t.program, x, g, tolerance=1e-6, count=t.program.m, once_a_term=True)
+    assert len(worst) == len({term for term, _ in groups})
+    assert worst == [v for v in found if v in worst]
+    message = explain(t.program, Status.INFEASIBLE, x, g, tolerance=1e-6)
+    told_of = [v for v in worst[:5] if v.amount >= 0.01 * worst[0].amount]
+    assert ": " + "; ".join(str(v) for v in told_of) + "; " in message
+    assert f"; {np.count_nonzero(over > 1e-6)} rows in all." in message
     assert len({v.what for v in found}) == len(found)
 
 

@@ -375,6 +375,21 @@ def test_a_better_bounded_problem_gives_less(arm_plan: Planned) -> None:
     assert np.abs(plan.collision.torque / problem.robot.torque_limit).max() <= 0.4 + 1e-5
 
 
+def test_a_free_duration_is_chosen_within_its_range(arm_transcription: Transcription) -> None:
+    """The more time the arm may take for its swing, the harder it hits, until it needs no more."""
+    found = []
+    for longest in (0.15, 0.3, 0.6):
+        t = changed(arm_transcription, swing=Phase(duration=(0.15, longest), intervals=8))
+        result = solve_ipopt(t.program, first_iterate(t))
+        assert result.status is Status.SOLVED
+        found.append(t.decode(result.x))
+    hasty, limited, free = found
+    assert hasty.impulse + 0.03 < limited.impulse < free.impulse - 0.1
+    assert hasty.swing.duration == pytest.approx(0.15, abs=1e-6)
+    assert limited.swing.duration == pytest.approx(0.3, abs=1e-4)
+    assert 0.31 < free.swing.duration < 0.59
+
+
 def test_what_cannot_be_met_is_named(arm_plan: Planned) -> None:
     """An arm that would have to get there at a tenth of its speed."""
     slow = dataclasses.replace(

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 from small_plans import OPTIONS, Planned, changed
 
 from impactopt.errors import InputError
@@ -103,7 +104,7 @@ def test_effort_is_the_integral_of_torque_over_limit(
         total = 0.0
         for phase in (0, 2):
             k = t.phase == phase
-            total += float(np.trapezoid(np.sum((t.torque[k] / limit) ** 2, axis=1), t.time[k]))
+            total += float(trapezoid(np.sum((t.torque[k] / limit) ** 2, axis=1), t.time[k]))
         assert got["effort"] == pytest.approx(total, rel=0.05)
 
 

@@ -18,8 +18,10 @@ from small_plans import LAW, Planned, changed
 from impactopt.cone import contact_wrench_cone
 from impactopt.ipopt import solve_ipopt
 from impactopt.motion import Radau
+from impactopt.nlp.at_contact import rotation_rows
+from impactopt.nlp.mesh import collision_mesh, with_middles
 from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription, collision_mesh, rotation_rows, with_middles
+from impactopt.nlp.transcription import Transcription
 from impactopt.plan import total_ground_wrench
 from impactopt.problem import Phase
 from impactopt.program import Status, check_program

@@ -18,15 +18,21 @@ from impactopt.plan import PlannedCollision, total_ground_wrench
 from impactopt.scenario import Scenario
 
 if TYPE_CHECKING:
-    from impactopt.nlp.transcription import Transcription
+    from impactopt.nlp.at_contact import ContactProgram
 
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 class Collision:
-    """Variables and rows of the contact with one target. ``scenario`` None: the expected one."""
+    """Variables and rows of the contact with one target.
 
-    def __init__(self, t: Transcription, scenario: Scenario | None = None) -> None:
+    scenario : None: the expected target.  after : what the variables of the position after contact have
+    (labels, bounds); None: there are none, a follow-through starts there.
+    """
+
+    def __init__(
+        self, t: ContactProgram, scenario: Scenario | None = None, *, after: dict[str, Any] | None
+    ) -> None:
         self.t, self.scenario, self.stages = t, scenario, t.stages
         p, c = t.problem, t.coordinates
         self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in (0, 1)]
@@ -56,8 +62,8 @@ class Collision:
         self.vt = add("target speed", 1)
         self.xt = add("target travel", 1)
         self.w = add("collision sole wrench", t.nw, **t.of_wrenches)
-        if scenario is not None:  # the expected target's is the follow-through's first
-            self.after = t.layout.add(f"{named}position after contact", 1, t.ny, labels=c.labels)
+        wanted = int(after is not None)
+        self.after = t.layout.add(f"{named}position after contact", wanted, t.ny, **(after or {}))
 
     @property
     def impulse(self) -> Affine:
@@ -186,6 +192,17 @@ class Collision:
         times = self.T[0][0], self.T[1][0]
         return self.t.link_slots(start, times, (self.d[first], self.d[second]), self.u[second])
 
+    @property
+    def state_after(self) -> list[Affine]:
+        """Coordinates, rates, legs and T (1 s) after contact, if its position is a variable."""
+        end = self.end[1]
+        return [self.after[0], self.u[end], self.legs[end], Affine.constant(1.0)]
+
+    def link_after(self) -> list[list[Affine]]:
+        """Slots of the block ``link`` that make its position what the contact leaves behind."""
+        y, rate, _, one = self.state_after
+        return self.link((y, rate, one))
+
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         """A uniform push: the target gains 0.8 m/s while the robot loses 0.4 of its rates."""
@@ -207,11 +224,10 @@ class Collision:
         self.xt.write(x, (speed * mean)[:, None])
         self.d.write(x, (place - 0.4 * mean)[:, None] * rates)
         self.f.write(x, self.mass * speed / total)
-        if self.scenario is not None:
-            self.after.write(x, y + 0.8 * total * rates)
+        self.after.write(x, y + 0.8 * total * rates)
         if c.legs:
             self.legs.write(x, legs)
-            self.w.write(x, t.swing_w.read(x)[-1:])
+            self.w.write(x, t.contact_w.evaluate(x))
             for k, at in enumerate(elapsed):
                 legs = c.solve_legs(y + rates * at, legs)
                 v = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)[1]

@@ -25,14 +25,15 @@ from impactopt.shapes import face_axes
 from impactopt.terms import Term
 
 if TYPE_CHECKING:
+    from impactopt.nlp.at_contact import ContactProgram
     from impactopt.nlp.transcription import Transcription
 
 CONTACT = "contact"
 
 
-def add_extra_terms(t: Transcription) -> None:
-    """Blocks and rows of each extra term that the problem has."""
-    for term in t.problem.terms:
+def add_extra_terms(t: ContactProgram, terms: tuple[Term, ...]) -> None:
+    """Blocks and rows of each extra one among these terms."""
+    for term in terms:
         if (add := _ADD.get(type(term))) is not None:
             add(t, term)
 
@@ -72,32 +73,20 @@ def _repeated(duration: Group, count: int) -> Affine:
     return duration[0].apply(np.ones((count, 1)))
 
 
-def _self_collision(t: Transcription, term: SelfCollision) -> None:
+def _self_collision(t: ContactProgram, term: SelfCollision) -> None:
     names = [f"{first.frame} and {second.frame}" for first, second in term.pairs or ()]
     numbers = [[*corners(a), *corners(b), a.radius + b.radius + term.margin] for a, b in term.pairs or ()]
-    spots = _swing_nodes(t)
-    for part in t.follows:
-        for k, s in enumerate(t.follow_nodes):
-            y = t.at(part.control, t.follow_breaks, s)[0]
-            spots.append((part.place_at(s), [y, part.legs[k]]))
+    spots = [*t.swing_spots(), *t.follow_spots()]
     _each(t, "self_collision", term.name, spots, np.concatenate(numbers), _distinct(names))
 
 
-def _keep_out(t: Transcription, term: KeepOut) -> None:
+def _keep_out(t: ContactProgram, term: KeepOut) -> None:
     numbers = [*t.problem.point, *face_axes(t.problem.normal).ravel(), *(a / 2 for a in term.size or ())]
     names = []
     for shape in term.shapes:
         numbers += [*corners(shape), shape.radius + term.margin]
         names += [shape.frame] if shape.end is None else [f"{shape.frame} start", f"{shape.frame} end"]
-    _each(t, "keep_out", term.name, _swing_nodes(t)[:-1], np.array(numbers), _distinct(names))
-
-
-def _swing_nodes(t: Transcription) -> list[tuple[Place, list[Affine]]]:
-    """Places of the swing's nodes with coordinates and legs."""
-    return [
-        (t.swing_place(s), [t.at(t.swing_control, t.swing_breaks, s)[0], t.swing_legs[k]])
-        for k, s in enumerate(t.swing_nodes)
-    ]
+    _each(t, "keep_out", term.name, t.swing_spots()[:-1], np.array(numbers), _distinct(names))
 
 
 def _distinct(names: list[str]) -> list[str]:
@@ -106,7 +95,7 @@ def _distinct(names: list[str]) -> list[str]:
 
 
 def _each(
-    t: Transcription,
+    t: ContactProgram,
     block: str,
     term: str,
     spots: list[tuple[Place, list[Affine]]],
@@ -126,7 +115,7 @@ def _each(
         )
 
 
-def _hand_orientation(t: Transcription, term: HandOrientation) -> None:
+def _hand_orientation(t: ContactProgram, term: HandOrientation) -> None:
     direction = t.problem.normal if term.direction is None else term.direction
     numbers = np.array([*term.axis, *direction, np.sin(term.angle)])
     at = t.add_block("hand_orientation", [[t.contact_state[0]]], numbers)
@@ -140,8 +129,8 @@ def _hand_orientation(t: Transcription, term: HandOrientation) -> None:
     )
 
 
-def _gaze(t: Transcription, term: Gaze) -> None:
-    nodes = [spot for spot, s in zip(_swing_nodes(t), t.swing_nodes, strict=True) if s >= term.since]
+def _gaze(t: ContactProgram, term: Gaze) -> None:
+    nodes = t.swing_spots(term.since)
     numbers = np.array([*term.axis, *t.problem.point, np.sin(term.angle)])
     at = t.add_block("gaze", [slots for _, slots in nodes], numbers)
     for i, (place, _) in enumerate(nodes):
@@ -155,7 +144,7 @@ def _gaze(t: Transcription, term: Gaze) -> None:
         )
 
 
-def _hit_region(t: Transcription, term: HitRegion) -> None:
+def _hit_region(t: ContactProgram, term: HitRegion) -> None:
     numbers = [*t.problem.point, *face_axes(t.problem.normal).ravel()]
     numbers += [] if term.radius is None else [term.radius]
     at = t.add_block("hit_region", [[t.contact_state[0]]], np.array(numbers))
@@ -174,10 +163,10 @@ def _hit_region(t: Transcription, term: HitRegion) -> None:
     )
 
 
-def _hit_cone(t: Transcription, term: HitCone) -> None:
+def _hit_cone(t: ContactProgram, term: HitCone) -> None:
     y, y1, _ = t.contact_state
     numbers = np.append(face_axes(t.problem.normal).ravel(), np.tan(term.angle))
-    at = t.add_block("hit_cone", [[y, y1, t.swing_T[0]]], numbers)
+    at = t.add_block("hit_cone", [[y, y1, t.contact_T]], numbers)
     t.rows.add(
         term=term.name,
         place=CONTACT,
@@ -188,7 +177,7 @@ def _hit_cone(t: Transcription, term: HitCone) -> None:
     )
 
 
-_ADD: dict[type[Term], Callable[[Transcription, Any], None]] = {
+_ADD: dict[type[Term], Callable[[Any, Any], None]] = {
     TorqueRate: _torque_rate,
     SelfCollision: _self_collision,
     KeepOut: _keep_out,

@@ -54,6 +54,11 @@ class FollowThrough:
             places.append(self.place_at(at))
         return instances, places
 
+    def spots(self) -> list[tuple[Place, list[Affine]]]:
+        """Places of its nodes with coordinates and legs."""
+        instances, places = self.nodes()
+        return [(place, [slots[0], slots[3]]) for place, slots in zip(places, instances, strict=True)]
+
     def coasting_node(self, wrench: Group) -> tuple[list[Affine], Place]:
         """Slots of the block ``node`` where coasting ends and this begins: without acceleration, under a sole
         wrench of its own; and its place. Until then a robot that has hit nothing still coasts."""

@@ -17,13 +17,13 @@ from impactopt.nlp.rows import Measure, percent
 from impactopt.plan import PlannedCollision
 
 if TYPE_CHECKING:
-    from impactopt.nlp.transcription import Transcription
+    from impactopt.nlp.at_contact import ContactProgram
 
 
 class InstantImpact:
     """Variables and rows of an impact in no time; no row of torque or wrench while it lasts."""
 
-    def __init__(self, t: Transcription) -> None:
+    def __init__(self, t: ContactProgram) -> None:
         self.t, c = t, t.coordinates
         add = t.layout.add
         self.mass = t.problem.target.mass
@@ -45,7 +45,7 @@ class InstantImpact:
         """Slots and parameters of the block ``impact``."""
         t, p = self.t, self.t.problem
         y = t.contact_state[0]
-        slots = [y, t.swing_legs[-1], t.u0[0], self.du[0], self.w[0], self.blow[0]]
+        slots = [y, t.contact_legs, t.u0[0], self.du[0], self.w[0], self.blow[0]]
         rigid = float(p.collision == "rigid")
         law = [p.law.parameters[name] for name in ("stiffness", "damping")]
         numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
@@ -67,6 +67,12 @@ class InstantImpact:
         """As of :meth:`impactopt.nlp.collision.Collision.link`; no time passes."""
         none, still = Affine.zeros(1), Affine.zeros(self.t.ny)
         return self.t.link_slots(start, (none, none), (still, still), self.t.u0[0] + self.du[0])
+
+    @property
+    def state_after(self) -> list[Affine]:
+        """As of :meth:`impactopt.nlp.collision.Collision.state_after`."""
+        t = self.t
+        return [t.contact_state[0], t.u0[0] + self.du[0], t.contact_legs, Affine.constant(1.0)]
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         self.du.write(x, -0.3 * rates)

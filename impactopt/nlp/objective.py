@@ -1,7 +1,7 @@
 """What a program minimizes: minus the weighted sum of the problem's objectives, plus small prices.
 
 Every objective is affine or quadratic in the variables. What is neither is an output of a block first, with a
-variable that equals it (:meth:`impactopt.nlp.transcription.Transcription.lift`); only what a problem asks for
+variable that equals it (:meth:`impactopt.nlp.builder.Builder.lift`); only what a problem asks for
 is there.
 """
 
@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
 from impactopt.nlp.collision import Collision
-from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.nlp.layout import Affine, Array, Group, Layout
 from impactopt.objectives import (
     AngularMomentum,
     Effort,
@@ -30,6 +30,7 @@ from impactopt.plan import complete_reference
 from impactopt.statics import static_wrenches
 
 if TYPE_CHECKING:
+    from impactopt.nlp.at_contact import ContactProgram
     from impactopt.nlp.transcription import Transcription
 
 
@@ -46,34 +47,34 @@ class Quantity:
         return float(self.affine.evaluate(x)[0]) + squared
 
 
-def quantities(t: Transcription) -> list[tuple[Objective, Quantity]]:
-    """The objectives of a problem with their quantities; adds what they need to the program."""
-    return [(o, _QUANTITIES[type(o)](t)) for o in t.problem.objectives]
+def quantities(t: ContactProgram, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
+    """Objectives with their quantities; adds what they need to the program."""
+    return [(o, _QUANTITIES[type(o)](t)) for o in objectives]
 
 
-def _impulse(t: Transcription) -> Quantity:
-    return Quantity(t.collisions[0].impulse)
+def _impulse(t: ContactProgram) -> Quantity:
+    return Quantity(t.expected.impulse)
 
 
-def _peak_force(t: Transcription) -> Quantity:
-    hit = t.collisions[0]
+def _peak_force(t: ContactProgram) -> Quantity:
+    hit = t.expected
     assert isinstance(hit, Collision)  # the problem is refused otherwise
     forces = hit.f
     at = t.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
     return Quantity(t.lift("peak force", np.array([at]))[0] * FORCE_SCALE)
 
 
-def _target_energy(t: Transcription) -> Quantity:
+def _target_energy(t: ContactProgram) -> Quantity:
     numbers = np.array(list(t.problem.target.parameters.values()))
-    at = t.add_block("energy", [[t.collisions[0].target_state]], numbers)
+    at = t.add_block("energy", [[t.expected.target_state]], numbers)
     return Quantity(t.lift("target energy", np.array([at]))[0])
 
 
-def _penetration(t: Transcription) -> Quantity:
+def _penetration(t: ContactProgram) -> Quantity:
     return Quantity(t.lift("deepest penetration", t.deepest)[0] * DEPTH_SCALE)
 
 
-def _angular_momentum(t: Transcription) -> Quantity:
+def _angular_momentum(t: ContactProgram) -> Quantity:
     assert t.angular_momentum is not None
     return Quantity(Affine.zeros(1), t.angular_momentum)
 
@@ -91,7 +92,7 @@ def _effort(t: Transcription) -> Quantity:
     return Quantity(of_node.apply(weights[None]) + t.swing_T[0] * start)
 
 
-_QUANTITIES: dict[type[Objective], Callable[[Transcription], Quantity]] = {
+_QUANTITIES: dict[type[Objective], Callable[[Any], Quantity]] = {
     Impulse: _impulse,
     PeakForce: _peak_force,
     TargetEnergy: _target_energy,
@@ -115,22 +116,34 @@ def start_torque(t: Transcription) -> Array:
     return np.asarray(torque / t.robot.torque_limit)
 
 
-def assemble(t: Transcription, wanted: list[tuple[Objective, Quantity]]) -> tuple[Affine, Any, Array]:
-    """Objective, Q and q of :class:`impactopt.nlp.structured.StructuredProgram` [N s].
+@dataclass(frozen=True)
+class Prices:
+    """1/2 x'Qx + q'x + constant [N s], small beside the objectives: what makes the optimum unique."""
 
-    Small prices on accelerations and on sole wrenches, and on ending away from the start posture, make the
-    optimum unique.
-    """
-    p, n = t.problem, t.layout.n
-    quadratic = sp.csr_array((n, n))
-    linear, diagonal = np.zeros(n), np.zeros(n)
-    objective = Affine.zeros(1)
+    quadratic: Any
+    linear: Array
+    constant: float = 0.0
+
+
+def assemble(
+    layout: Layout, wanted: list[tuple[Objective, Quantity]], prices: Prices
+) -> tuple[Affine, Any, Array]:
+    """Objective, Q and q of :class:`impactopt.nlp.structured.StructuredProgram` [N s]."""
+    objective, diagonal = Affine.constant(prices.constant), np.zeros(layout.n)
     for o, quantity in wanted:
         worth = -o.weight if o.cost else o.weight
         objective = objective - quantity.affine * worth
         if (group := quantity.squares) is not None:
             span = slice(group.offset, group.offset + group.count * group.size)
             diagonal[span] -= 2 * worth * np.tile(group.scale**2, group.count)
+    return objective, prices.quadratic + sp.diags_array(diagonal), prices.linear
+
+
+def motion_prices(t: Transcription) -> Prices:
+    """Of accelerations, of sole wrenches and of ending away from the start posture."""
+    p, n = t.problem, t.layout.n
+    quadratic = sp.csr_array((n, n))
+    linear, diagonal = np.zeros(n), np.zeros(n)
     for control, breaks, nodes, bounds in (
         (t.swing_control, t.swing_breaks, t.swing_nodes, p.swing.duration),
         *((f.control, t.follow_breaks, t.follow_nodes, p.follow.duration) for f in t.follows),
@@ -150,5 +163,5 @@ def assemble(t: Transcription, wanted: list[tuple[Objective, Quantity]]) -> tupl
         end = follow.c.index(-1)
         diagonal[end] += 2 * p.return_price
         linear[end] -= 2 * p.return_price * t.y0
-    away = Affine.constant(len(t.follows) * p.return_price * float(t.y0 @ t.y0))
-    return away + objective, quadratic + sp.diags_array(diagonal), linear
+    away = len(t.follows) * p.return_price * float(t.y0 @ t.y0)
+    return Prices(quadratic + sp.diags_array(diagonal), linear, away)

@@ -139,6 +139,21 @@ def test_dependent_rows(name):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("seed", range(4))
+def test_an_equality_that_others_imply(name, seed):
+    free = random_qp(seed, 40, 30, 12)
+    A = free.A.toarray()
+    extra, value = A[:3].sum(axis=0), free.lower[:3].sum()
+    lower, upper = np.append(free.lower, value), np.append(free.upper, value)
+    bounds = free.x_lower, free.x_upper
+    problem = qp(free.P.toarray(), free.q, np.vstack([A, extra]), lower, upper, *bounds)
+    solution = make_qp_solver(name).solve(problem)
+    assert solution.status is QPStatus.SOLVED
+    assert_solves(problem, solution)
+    np.testing.assert_allclose(solution.x, make_qp_solver("active_set").solve(free).x, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
 def test_nonconvex_qps_fail_without_an_exception(name):
     assert not make_qp_solver(name).solve(qp(np.diag([1, -1]), [0, 0], [[1, 1]], [0], [0])).usable
 

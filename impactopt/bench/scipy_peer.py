@@ -185,7 +185,7 @@ def least_multipliers(
     held = np.flatnonzero(high | low)
     y = np.zeros(value.size)
     if held.size:
-        columns = sp.hstack([jacobian.T, sp.eye_array(program.n)], format="csc")[:, held]
+        columns = sp.hstack([jacobian.T, sp.diags_array(np.ones(program.n))], format="csc")[:, held]
         box = np.where(low[held], -np.inf, 0.0), np.where(high[held], np.inf, 0.0)
         small = columns.shape[0] * columns.shape[1] <= 10**6
         found = so.lsq_linear(

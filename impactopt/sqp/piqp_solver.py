@@ -12,6 +12,14 @@ from impactopt.program import Matrix, Vector
 from impactopt.sqp.answers import SMALL, finished, no_answer, refusal
 from impactopt.sqp.qp import QPSolution, QPStatus, QuadraticProgram
 
+# PIQP's own scaling spoils some QPs of whole motions, unless every linear solve is refined; refined, some
+# with dependent rows do not end. So: our unit rows alone, or the other way where they do not do; and for the
+# next QP first the way that did.
+_WAYS: dict[str, dict[str, Any]] = {
+    "unit rows": {"preconditioner_iter": 0},
+    "refined": {"iterative_refinement_always_enabled": True},
+}
+
 
 class PiqpSolver:
     """PIQP with unit rows; a dozen or two iterations, whatever the guess.
@@ -28,8 +36,8 @@ class PiqpSolver:
         """Tolerance as above; dense_limit: most variables for which PIQP's dense factorization is used."""
         self.tolerance, self.setups = tolerance, 0
         self._dense_limit, self._max_iterations = dense_limit, max_iterations
-        self._solver: Any = None
-        self._pattern: list[np.ndarray] = []
+        self._loaded: dict[str, tuple[Any, list[np.ndarray]]] = {}
+        self._first = next(iter(_WAYS))
 
     def solve(
         self,
@@ -59,11 +67,17 @@ class PiqpSolver:
             "x_l": np.where(free, -np.inf, qp.x_lower),
             "x_u": np.where(free, np.inf, qp.x_upper),
         }
-        solver = self._load(matrices, vectors)
-        status = solver.solve()
-        result, iterations = solver.result, int(solver.result.info.iter)
-        if status == piqp.PIQP_PRIMAL_INFEASIBLE:
-            return no_answer(qp, QPStatus.INFEASIBLE, iterations)
+        iterations = 0
+        for way in sorted(_WAYS, key=lambda way: way != self._first):
+            solver = self._load(way, matrices, vectors)
+            status = solver.solve()
+            result = solver.result
+            iterations += int(result.info.iter)
+            if status == piqp.PIQP_PRIMAL_INFEASIBLE:
+                return no_answer(qp, QPStatus.INFEASIBLE, iterations)
+            if status == piqp.PIQP_SOLVED:
+                self._first = way
+                break
         if status not in (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED, piqp.PIQP_NUMERICS):
             return no_answer(qp, QPStatus.FAILED, iterations)
         unit = np.zeros(lower.size)
@@ -72,8 +86,8 @@ class PiqpSolver:
         unit[qp.m :] += np.where(free, 0.0, result.z_bu - result.z_bl)
         return finished(qp, np.array(result.x), unit, self.tolerance, iterations)
 
-    def _load(self, matrices: dict[str, Matrix], vectors: dict[str, Vector]) -> Any:
-        """The solver with the data, in place while the patterns are those of the last QP."""
+    def _load(self, way: str, matrices: dict[str, Matrix], vectors: dict[str, Vector]) -> Any:
+        """The solver of a way with the data, in place while the patterns are those of the last QP."""
         dense = vectors["c"].size <= self._dense_limit
         given: dict[str, Any] = {}
         pattern: list[np.ndarray] = []
@@ -82,18 +96,19 @@ class PiqpSolver:
             sparse.sort_indices()
             given[name] = np.asfortranarray(sparse.toarray()) if dense else sparse
             pattern += [np.array(sparse.shape), sparse.indptr, sparse.indices]
-        if len(pattern) == len(self._pattern) and all(map(np.array_equal, pattern, self._pattern)):
-            self._solver.update(**given, **vectors)
-            return self._solver
+        solver, known = self._loaded.get(way, (None, []))
+        if known and all(map(np.array_equal, pattern, known)):
+            solver.update(**given, **vectors)
+            return solver
         solver = piqp.DenseSolver() if dense else piqp.SparseSolver()
-        # A linear solve refined is dearer, but without it the last digits of hard QPs do not come.
-        solver.settings.iterative_refinement_always_enabled = True
+        for option, value in _WAYS[way].items():
+            setattr(solver.settings, option, value)
         # A row that nearly holds hides in the gap: multiplier and distance 1e-5 each, their product 1e-10.
         eps = 1e-4 * self.tolerance
         solver.settings.eps_abs = solver.settings.eps_duality_gap_abs = eps
         solver.settings.eps_rel = solver.settings.eps_duality_gap_rel = eps
         solver.settings.max_iter = self._max_iterations
         solver.setup(**given, **vectors)
-        self._solver, self._pattern = solver, pattern
+        self._loaded[way] = solver, pattern
         self.setups += 1
         return solver

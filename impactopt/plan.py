@@ -49,14 +49,17 @@ class Trajectory:
 class PlannedCollision:
     """The collision that the plan predicts, at its m collocation points.
 
-    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s];
-    torque (m + 1, n) [N m], servo and feed-forward; ground (m, 6) total ground wrench about the world's
-    origin [N, N m]; sole_wrench (m, 6 a sole) in each sole's frame.
+    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s] of
+    its surface; outcome: what the blow has brought the target, by name and unit (``speed_m_s`` of a free
+    mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n) [N m], servo and feed-forward;
+    ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each
+    sole's frame.
     """
 
     time: Array
     force: Array
     target_speed: Array
+    outcome: dict[str, float]
     torque: Array
     ground: Array
     sole_wrench: Array
@@ -79,6 +82,7 @@ class PlannedScenario:
         out = {
             "name": self.name,
             "impulse_Ns": self.impulse,
+            "target": hit.outcome,
             "peak_force_N": float(hit.force.max()),
             "contact_ms": 1e3 * float(hit.time[-1]),
             "torque_ratio": float(np.abs(hit.torque / torque_limit).max()),

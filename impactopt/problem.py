@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.contact.laws import ContactLaw, SpringDamper
-from impactopt.contact.targets import FreeMass
+from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.extra_terms import HitCone, SelfCollision
@@ -68,14 +68,16 @@ class ImpactProblem:
     point (3,) [m] : where the striking point meets the target, world; the ground is z = 0 and the start
         posture's soles are centred on the origin.
     normal (3,) : unit vector of the blow, world: the target is pushed along it.
-    law, target : contact law and target body.
+    law, target : contact law and target. A plan breaks a `Board`, in compression; it lets a `Nail` creep
+        where it should stand (`Nail.smooth`).
     stance : which soles are held.
     start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
-    contact_duration : bounds [s] of each of compression and restitution.
+    contact_duration : bounds [s] of each of compression and restitution; of what a break makes of
+        compression, the shortest is a tenth.
     collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
-        sum to 1.
+        sum to 1; those of compression before and after a break. They are halved for a nail and a board.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
     collision : "dynamics", the whole equation of motion while the contact lasts; "rigid", an impact in no
         time with ``coefficient_of_restitution`` (speed of separation over that of approach); "virtual mass",
@@ -99,7 +101,7 @@ class ImpactProblem:
     point: Array
     normal: Array
     law: ContactLaw
-    target: FreeMass
+    target: Target
     stance: Stance = field(default_factory=BothSoles)
     start: str | Array = "half_sitting"
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
@@ -212,6 +214,10 @@ class ImpactProblem:
                         )
 
     def _check_collision(self) -> None:
+        for name, kind in (("law", ContactLaw), ("target", Target)):
+            thing = getattr(self, name)
+            if not isinstance(thing, kind):
+                raise InputError(f"{name} must be a {kind.__name__} of impactopt.contact, not {thing!r}")
         if self.collision not in COLLISIONS:
             raise InputError(
                 f"unknown collision {self.collision!r}{did_you_mean(self.collision, COLLISIONS)}: there are "
@@ -229,14 +235,18 @@ class ImpactProblem:
                 'collision="virtual mass" has a closed form for the law SpringDamper only, not '
                 f"{type(self.law).__name__}"
             )
+        if self.collision != "dynamics" and not isinstance(self.target, (FreeMass, RigidWall)):
+            raise InputError(
+                f"collision={self.collision!r} knows the targets FreeMass and RigidWall only, not "
+                f'{type(self.target).__name__}; take collision="dynamics"'
+            )
+        if self.collision == "dynamics":  # refuses what has switches
+            still = [[0.0] * k for k in (self.target.n_states, len(self.target.helpers))]
+            self.target.smooth(still[0], 0.0, still[1], False)
         if self.scenarios and self.collision != "dynamics":
             raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
         for s in self.scenarios:
-            for name in ("stiffness", "damping"):
-                if getattr(s, name) != 1.0 and name not in self.law.parameters:
-                    raise InputError(
-                        f"scenario {s.name!r}: the law {type(self.law).__name__} has no {name}; leave it out"
-                    )
+            s.numbers(self.law, self.target)
         names = [s.name for s in self.scenarios]
         for name in names:
             if names.count(name) > 1:

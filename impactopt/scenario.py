@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 
 
@@ -68,6 +70,29 @@ class Scenario:
             raise InputError(
                 f"{where}: brake_after is a time > 0 s, for a missing target; drop it, or give missing=True"
             )
+
+    def numbers(self, law: ContactLaw, target: Target) -> tuple[dict[str, float], dict[str, float]]:
+        """The contact law's and the target's numbers by name, with the scenario's factors.
+
+        Raises
+        ------
+        InputError : a factor of a number that they do not have.
+        """
+        of_law, of_target = dict(law.parameters), dict(target.parameters)
+        for name, of, numbers in (
+            ("stiffness", law, of_law),
+            ("damping", law, of_law),
+            ("mass", target, of_target),
+        ):
+            factor = getattr(self, name)
+            if name in numbers:
+                numbers[name] *= factor
+            elif factor != 1:
+                what = "law" if of is law else "target"
+                raise InputError(
+                    f"scenario {self.name!r}: the {what} {type(of).__name__} has no {name}; leave it out"
+                )
+        return of_law, of_target
 
     def __str__(self) -> str:
         factors = [f"{getattr(self, name):g} x {name}" for name in ("mass", "stiffness", "damping")]

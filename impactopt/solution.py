@@ -96,6 +96,7 @@ class Solution:
             **self.outcome(),
             "impulse_Ns": plan.impulse,
             "objectives": dict(self.objectives),
+            "target": plan.collision.outcome,
             # a plan of an impact without duration knows no force
             "peak_force_N": float(plan.collision.force.max()) if len(plan.collision.ground) else None,
             "contact_ms": 1e3 * (plan.compression + plan.restitution),

@@ -72,7 +72,7 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     edges = len(support_polygon(problem.robot, c))
     found = {}
     for instant in (False, True):
-        found |= builders(c, problem.striker, problem.law, edges, instant=instant)
+        found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant)
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
 
 

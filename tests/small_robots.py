@@ -122,6 +122,28 @@ def slider(mass: float, **options: Any) -> Robot:
     return Robot.from_model(model, **settings)
 
 
+def table(mass: float, **options: Any) -> Robot:
+    """A mass [kg] on a horizontal table: two prismatic joints, x and y, half of it on each; no servo gains.
+
+    Along x it is a point mass.
+    """
+    model = pin.Model()
+    model.name = "table"
+    half = pin.Inertia.FromSphere(mass / 2, 0.05)
+    first = _add(model, 0, pin.JointModelPX, (0.0, 0.0, 0.0), "along", half)
+    _add(model, first, pin.JointModelPY, (0.0, 0.0, 0.0), "across", half)
+    settings = {
+        "kp": 0.0,
+        "kd": 0.0,
+        "torque_limit": 200.0,
+        "velocity_limit": 3.0,
+        "position_limit": dict.fromkeys(("along", "across"), (-5.0, 5.0)),
+        "strikers": [Striker(name="tip", frame="across", point=np.zeros(3))],
+        **options,
+    }
+    return Robot.from_model(model, **settings)
+
+
 def striking_point(robot: Robot, posture: str, striker: str) -> Any:
     """World position (3,) [m] of a striking point in a named posture."""
     model = robot.model

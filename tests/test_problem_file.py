@@ -13,16 +13,36 @@ from hypothesis import strategies as st
 
 import impactopt.problem_file.sections as sections
 from impactopt import extra_terms, objectives, terms
-from impactopt.contact import FreeMass, SpringDamper
+from impactopt.contact import (
+    Board,
+    FreeMass,
+    HertzDamped,
+    HuntCrossley,
+    KelvinVoigt,
+    Nail,
+    RigidWall,
+    SpringDamper,
+)
 from impactopt.errors import InputError
 from impactopt.problem import COLLISIONS, ImpactProblem, Phase
 from impactopt.problem_file import load_problem, read_problem_file
 from impactopt.problem_file.mistakes import key_lines
+from impactopt.problem_file.section import Section
 from impactopt.robot import Tool
 from impactopt.scenario import Scenario
 from impactopt.shapes import Capsule
 from impactopt.stance import FixedBase, OneSole
 
+TARGETS_AND_LAWS = (
+    Board,
+    FreeMass,
+    HertzDamped,
+    HuntCrossley,
+    KelvinVoigt,
+    Nail,
+    RigidWall,
+    SpringDamper,
+)
 PUNCH = Path(__file__).parents[1] / "problems" / "punch.toml"
 
 GOOD = """\
@@ -309,20 +329,97 @@ def test_what_a_file_leaves_out_is_the_problems_own_default(tmp_path: Path) -> N
 
 def test_every_field_of_what_a_file_describes_has_a_key() -> None:
     """A new field of a term, a phase or the problem that no file could set would be found here."""
-    kinds = {
-        section.kind: section for section in sections.Section.__subclasses__() if section.kind is not None
-    }
+
+    def below(section: type[Section]) -> list[type[Section]]:
+        return [section, *(s for inner in section.__subclasses__() for s in below(inner))]
+
+    kinds = {section.kind: section for section in below(Section) if section.kind is not None}
     for term in terms.DEFAULT_TERMS:
         assert type(term) in kinds
         assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
     extra = [kind for kind in terms.Term.__subclasses__() if kind.__module__ == extra_terms.__name__]
     assert len(extra) == 7
-    described = (*objectives.Objective.__subclasses__(), *extra, Capsule)
-    for kind in (Phase, FreeMass, SpringDamper, Scenario, Tool, *described):
-        assert {f.name for f in dataclasses.fields(kind)} == set(kinds[kind].model_fields)
+    described = (*objectives.Objective.__subclasses__(), *extra, Capsule, *TARGETS_AND_LAWS)
+    for kind in (Phase, Scenario, Tool, *described):
+        keys = set(kinds[kind].model_fields) - {kinds[kind].choice}
+        assert {f.name for f in dataclasses.fields(kind)} == keys
     keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
     keys |= {*sections.Collision.model_fields, "law", "collision_elements"}
     assert {f.name for f in dataclasses.fields(ImpactProblem)} <= keys
+
+
+@pytest.mark.usefixtures("no_robots")
+@pytest.mark.parametrize(
+    ("section", "made"),
+    [
+        ("[target]\nkind = 'free mass'\nmass_kg = 2", FreeMass(mass=2.0)),
+        ("[target]\nkind = 'wall'", RigidWall()),
+        ("[target]\nkind = 'nail'\nmass_kg = 0.1\nresistance_N = 300", Nail(mass=0.1, resistance=300.0)),
+        (
+            "[target]\nkind = 'nail'\nmass_kg = 0.1\nresistance_N = 300\nhardening_N_m = 1e4\ndepth_m = 0.02",
+            Nail(mass=0.1, resistance=300.0, hardening=1e4, depth=0.02),
+        ),
+        (
+            "[target]\nkind = 'board'\nmass_kg = 0.3\nstiffness_N_m = 1e5\nbreaking_force_N = 900\n"
+            "damping_N_s_m = 5",
+            Board(mass=0.3, stiffness=1e5, breaking_force=900.0, damping=5.0),
+        ),
+        (
+            "[contact]\nlaw = 'spring damper'\nstiffness_N_m = 1e4\ndamping_N_s_m = 30",
+            SpringDamper(stiffness=1e4, damping=30.0),
+        ),
+        (
+            "[contact]\nlaw = 'Kelvin-Voigt'\nstiffness_N_m = 1e4\ndamping_N_s_m = 30",
+            KelvinVoigt(stiffness=1e4, damping=30.0),
+        ),
+        (
+            "[contact]\nlaw = 'Hunt-Crossley'\nstiffness_N_mp = 1e6\ndissipation_s_m = 0.2\nexponent = 2",
+            HuntCrossley(stiffness=1e6, dissipation=0.2, exponent=2.0),
+        ),
+        (
+            "[contact]\nlaw = 'Hertz'\nstiffness_N_m1_5 = 1e6\ndamping_N_s_m1_25 = 30",
+            HertzDamped(stiffness=1e6, damping=30.0),
+        ),
+    ],
+)
+def test_every_kind_of_target_and_law_can_be_written(tmp_path: Path, section: str, made: object) -> None:
+    kind, rest = section.split("\n", 1)
+    old = {"[target]": "mass_kg = 5.0", "[contact]": "stiffness_N_m = 1e4\ndamping_N_s_m = 300.0"}[kind]
+    assert old in GOOD
+    given = read_problem_file(write(tmp_path, GOOD.replace(old, rest))).content.arguments()
+    assert made in (given["target"], given["law"])
+
+
+@pytest.mark.usefixtures("no_robots")
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("mass_kg = 5.0", "kind = 'wal'", ["[target] kind", "'wal' is unknown", "did you mean 'wall'"]),
+        (
+            "mass_kg = 5.0",
+            "kind = 'wall'\nmass_kg = 5.0",
+            ["[target] mass_kg", "unknown key", "known are kind"],
+        ),
+        ("mass_kg = 5.0", "kind = 'nail'\nmass_kg = 5.0", ["[target] resistance_N", "missing"]),
+        (
+            "mass_kg = 5.0",
+            "kind = 'nail'\nresistance_N = 0",
+            ["2 mistakes", "mass_kg: missing", "0; give", "> 0"],
+        ),
+        ("mass_kg = 5.0", "kind = 3", ["[target] kind", "3 is unknown"]),
+        ("mass_kg = 5.0", "mass_kg = 5.0\nresistance_N = 3", ["resistance_N", "unknown key", "mass_kg"]),
+        ("stiffness_N_m = 1e4", "law = 'Herz'", ["[contact] law", "did you mean 'Hertz'"]),
+        (
+            "stiffness_N_m = 1e4",
+            "law = 'Hertz'",
+            ["2 mistakes", "stiffness_N_m1_5", "damping_N_s_m", "unknown"],
+        ),
+    ],
+)
+def test_a_kinds_keys_are_its_own(tmp_path: Path, old: str, new: str, parts: list[str]) -> None:
+    text = message(write(tmp_path, GOOD.replace(old, new)))
+    for part in parts:
+        assert part in text, text
 
 
 def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:

@@ -218,6 +218,7 @@ def test_a_robot_without_soles_has_no_zmp_margin() -> None:
         time=np.array([0.0, 0.01, 0.02]),
         force=np.array([3.0, 5.0, 0.0]),
         target_speed=np.array([0.0, 0.5, 1.0]),
+        outcome={"speed_m_s": 1.0},
         torque=np.array([[1.0, -8.0], [2.0, 4.0], [0.0, 0.0]]),
         ground=np.zeros((2, 6)),
         sole_wrench=nothing,
@@ -226,6 +227,7 @@ def test_a_robot_without_soles_has_no_zmp_margin() -> None:
     assert given.summary(torque_limit=np.array([10.0, 16.0]), polygon=np.zeros((0, 2))) == {
         "name": "light",
         "impulse_Ns": 2.0,
+        "target": {"speed_m_s": 1.0},
         "peak_force_N": 5.0,
         "contact_ms": pytest.approx(20.0),
         "torque_ratio": pytest.approx(0.5),

@@ -41,6 +41,8 @@ class Board(Target):
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("broken",)
+    typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
+    breaks: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         positive("Board: mass [kg]", self.mass)
@@ -56,6 +58,19 @@ class Board(Target):
         bending = p["stiffness"] * state[1] + p["damping"] * state[0]
         held = choose(self._beyond(state, p) > 0, 0.0 * bending, bending)
         return [(force - held) / p["mass"], state[0]]
+
+    def smooth(
+        self, state: Any, force: Any, helpers: Any, broken: bool, parameters: Parameters | None = None
+    ) -> tuple[list[Any], list[Any]]:
+        """One branch until it breaks, one after."""
+        p = self.parameters if parameters is None else parameters
+        bending = p["stiffness"] * state[1] + p["damping"] * state[0]
+        return [(force - (0.0 if broken else bending)) / p["mass"], state[0]], []
+
+    def breaking(self, state: Any, parameters: Parameters | None = None) -> Any:
+        """The spring's force over that of the break, less 1."""
+        p = self.parameters if parameters is None else parameters
+        return p["stiffness"] * state[1] / p["breaking_force"] - 1.0
 
     def _beyond(self, state: Any, p: Parameters) -> Any:
         return state[1] - p["breaking_force"] / p["stiffness"]

@@ -50,12 +50,22 @@ class ContactLaw(ABC):
         `parameters` replace the law's own numbers, and may be CasADi symbols.
         """
 
-    def formula(self) -> tuple[str, str]:
-        """Both branches as text in symbols of their own: what a compiled model of this law depends on."""
+    def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
+        """What falls through zero [N] where contact ends, with a slope there: the force of restitution.
+
+        A law whose force leaves off without a slope gives something else that is zero there: plans end
+        contact on it.
+        """
+        return self.branch(penetration, rate, False, parameters)
+
+    def formula(self) -> tuple[str, str, str]:
+        """Both branches, and `separation`, as text in symbols of their own: what a compiled model of this law
+        depends on.
+        """
         names = {name: ca.SX.sym(name) for name in self.parameters}
         x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
         compression, restitution = (text_of([self.branch(x, rate, c, names)]) for c in (True, False))
-        return compression, restitution
+        return compression, restitution, text_of([self.separation(x, rate, names)])
 
     def force(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
         """Force f [N] on the target: never adhesive (f >= 0), and zero while apart (penetration < 0).

@@ -10,6 +10,8 @@ from .targets import Target
 
 __all__ = ["Nail"]
 
+CREEP = 1e-3  # [m/s] of a nail at rest in a plan, with nothing pushing; see `Nail.smooth`
+
 
 @dataclass(frozen=True, kw_only=True)
 class Nail(Target):
@@ -42,6 +44,9 @@ class Nail(Target):
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("depth",)
+    typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
+    helpers: ClassVar[tuple[str, ...]] = ("unused resistance",)
+    forward_only: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         positive("Nail: mass [kg]", self.mass)
@@ -68,6 +73,21 @@ class Nail(Target):
         p = self.parameters if parameters is None else parameters
         beyond = force - self._resistance(state, p)
         return [choose(state[0] > 0, state[0], choose(beyond > 0, state[0], beyond))]
+
+    def smooth(
+        self, state: Any, force: Any, helpers: Any, broken: bool, parameters: Parameters | None = None
+    ) -> tuple[list[Any], list[Any]]:
+        """The nail never quite stands: it creeps at v = CREEP / h under R (1 - h), h >= 0, v >= 0.
+
+        The helper h is the fraction of the wood's resistance that is not used: nearly 0 while the nail moves
+        and 1 - f / R while it stands, which is dry friction's complementarity v h = 0, relaxed. A nail that
+        moves at v feels (1 - CREEP / v) R. Source: Scholtes, SIAM J. Optim. 11 (2001) 918-936.
+        """
+        p = self.parameters if parameters is None else parameters
+        v, unused = state[0], helpers[0]
+        resisted = self._resistance(state, p) * (1.0 - unused)
+        meet = v + unused - ((v - unused) ** 2 + 4.0 * CREEP) ** 0.5
+        return [(force - resisted) / p["mass"], v], [meet]
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
         """Kinetic energy, and the work done against the wood."""

@@ -56,6 +56,11 @@ class HuntCrossley(ContactLaw):
         spring = p["stiffness"] * power(penetration, p["exponent"])
         return spring * (1.0 + 1.5 * p["dissipation"] * rate)
 
+    def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
+        """k x: the force has no slope at x = 0, where contact ends."""
+        p = self.parameters if parameters is None else parameters
+        return p["stiffness"] * penetration
+
 
 @dataclass(frozen=True, kw_only=True)
 class HertzDamped(ContactLaw):
@@ -126,6 +131,11 @@ class HertzDamped(ContactLaw):
         p = self.parameters if parameters is None else parameters
         damper = p["damping"] * _quarter_power(penetration) * rate
         return p["stiffness"] * power(penetration, 1.5) + damper
+
+    def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
+        """k (x - (d |rate| / k)^0.8): zero with the force, and with a slope there without damping too."""
+        p = self.parameters if parameters is None else parameters
+        return p["stiffness"] * (penetration - power(-p["damping"] * rate / p["stiffness"], 0.8))
 
 
 def _quarter_power(x: Any) -> Any:

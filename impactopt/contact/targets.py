@@ -8,9 +8,12 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
+from ..errors import InputError
 from ._expressions import Parameters, numbers_of, positive, text_of
 
 __all__ = ["FreeMass", "RigidWall", "Target"]
+
+UNITS = {"speed": "m_s", "depth": "m"}  # of targets' results
 
 
 class Target(ABC):
@@ -25,11 +28,24 @@ class Target(ABC):
     n_states : size of the state.
     results : names of what `result` gives.
     analytic : whether there are derivatives of all orders between switches, as Taylor steps need them.
+    typical : sizes of the state's numbers, for scaling; ones if not given.
+    breaks : whether it breaks: it switches once, in the first half of a blow, and for good. A plan breaks it.
+    helpers : names of what a plan finds beside the state at each instant, all >= 0; see `smooth`.
+    forward_only : whether the state's numbers and the helpers are never below zero.
     """
 
     n_states: int
     results: ClassVar[tuple[str, ...]] = ()
     analytic: ClassVar[bool] = True
+    typical: ClassVar[tuple[float, ...]] = ()
+    breaks: ClassVar[bool] = False
+    helpers: ClassVar[tuple[str, ...]] = ()
+    forward_only: ClassVar[bool] = False
+
+    @property
+    def switching(self) -> bool:
+        """Whether its motion has switches, so that a plan has something in their place."""
+        return self.breaks or bool(self.helpers)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -55,9 +71,38 @@ class Target(ABC):
         """Expressions whose changes of sign part the motion into smooth pieces; steps end on them."""
         return []
 
+    def smooth(
+        self, state: Any, force: Any, helpers: Any, broken: bool, parameters: Parameters | None = None
+    ) -> tuple[list[Any], list[Any]]:
+        """The motion as a plan has it, where nothing may switch: d(state)/dt, and what is zero [of order 1].
+
+        A target without switches moves as it is. One with switches says here what takes their place: a branch
+        before and one after the break (`broken`), or a smooth law with as many equations as `helpers`.
+
+        Raises
+        ------
+        InputError : it has switches and does not say.
+        """
+        if self.switches(state, force, parameters):
+            raise InputError(
+                f"the target {type(self).__name__} has switches, which a plan cannot have: give it a method "
+                "`smooth`, or plan for FreeMass, RigidWall, Nail or Board"
+            )
+        return self.derivative(state, force, parameters), []
+
+    def breaking(self, state: Any, parameters: Parameters | None = None) -> Any:
+        """Of a target that `breaks`: below zero until it does, zero when it does; of order 1."""
+        raise NotImplementedError(f"{type(self).__name__} does not break")
+
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         """What the blow has brought, from the state at separation; named by `results`."""
         return []
+
+    def outcome(self, state: Any, parameters: Parameters | None = None) -> dict[str, float]:
+        """`result` as numbers by name and unit, as reports have them: `speed_m_s`, `depth_m`, `broken`."""
+        values = self.result([float(x) for x in state], parameters)
+        names = [f"{name}_{UNITS[name]}" if name in UNITS else name for name in self.results]
+        return {name: float(value) for name, value in zip(names, values, strict=True)}
 
     def formula(self) -> tuple[str, ...]:
         """The target as text in symbols of its own: what a compiled model of it depends on."""
@@ -71,6 +116,13 @@ class Target(ABC):
             "switches": self.switches(state, force, numbers),
             "result": self.result(state, numbers),
         }
+        helpers = [ca.SX.sym(f"helper_{i}") for i in range(len(self.helpers))]
+        if self.helpers or self.breaks:
+            for broken in (False, True):
+                moves, rows = self.smooth(state, force, helpers, broken, numbers)
+                parts[f"smooth, {'after' if broken else 'before'} a break"] = [*moves, *rows]
+        if self.breaks:
+            parts["breaking"] = [self.breaking(state, numbers)]
         made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
         return (*made, f"results: {', '.join(self.results)}")
 

@@ -8,13 +8,12 @@ import numpy as np
 
 from impactopt.cone import inward_edges
 from impactopt.extra_terms import HitCone, HitRegion
-from impactopt.motion import Radau
 from impactopt.nlp.builder import Builder
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.extra_terms import add_extra_terms
 from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group
-from impactopt.nlp.mesh import collision_mesh
+from impactopt.nlp.mesh import contact_mesh
 from impactopt.nlp.objective import Prices, assemble, quantities
 from impactopt.nlp.rows import Index, Measure, Place, millimetres, percent
 from impactopt.nlp.structured import StructuredProgram
@@ -48,7 +47,10 @@ class ContactProgram(Builder):
     def _hit(self, *, after: bool) -> None:
         """Variables of the hit; ``after``: the position after the expected one is among them."""
         p, labels = self.problem, self.coordinates.labels
-        self.stages = collision_mesh(p.collision_elements, Radau.of_stages(p.collision_stages))
+        self.stages = contact_mesh(p)
+        compression, restitution, _ = p.law.formula()
+        self.law_switches = compression != restitution
+        self.law_pulls = float(p.law.branch(1e-6, -10.0, False)) < 0  # when bodies part fast
         limit, names = self.torque.fraction, self.robot.joint_names
         self.feedforward = self.layout.add(
             "feed-forward at contact", 1, self.robot.n, lower=-limit, upper=limit, labels=names
@@ -129,7 +131,7 @@ class ContactProgram(Builder):
         sizes = {block.name: block.n_out for block in self.blocks}
         if isinstance(self.expected, Collision):
             self.deepest = (
-                at["force"] + self.expected.end[0] * sizes["force"] + self.parts("force")["penetration"]
+                at["force"] + self.expected.end[-2] * sizes["force"] + self.parts("force")["penetration"]
             )
         for collision, index in zip(self.collisions, first, strict=True):
             collision.add_rows({name: (at[name] + k * sizes[name], sizes[name]) for name, k in index.items()})

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
 
 FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
@@ -37,7 +39,7 @@ def make_block(z: list[Any], p: list[Any], out: dict[str, Any]) -> BlockExpressi
     )
 
 
-def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
+def sizes(c: StanceCoordinates, target: Target, block: str) -> dict[str, int]:
     """Lengths of the named slices of a block's output, in order."""
     n, base, soles = c.robot.n, c.base, len(c.legs)
     return {
@@ -46,8 +48,20 @@ def sizes(c: StanceCoordinates, block: str) -> dict[str, int]:
         "approach": {"along": 1},
         "coasting": {"closure": 6 * soles, "twist": 6 * soles},
         "collision": {"closure": 6 * soles, "base": base, "joints": n, "torque": n},
-        "force": {"law": 1, "target": 1, "rate": 1, "penetration": 1},
+        "force": {
+            "law": 1,
+            "target": target.n_states,
+            "travel": 1,
+            "impulse": 1,
+            "helpers": len(target.helpers),
+            "rate": 1,
+            "penetration": 1,
+            "separation": 1,
+            "speed": 1,
+            "breaking": int(target.breaks),
+        },
         "impact": {"base": base, "joints": n, "blow": 1},
+        "join": {"travel": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
     }[block]
 
@@ -180,36 +194,58 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
     return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out)
 
 
-def force(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpression:
+def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -> BlockExpression:
     """Contact law and target at one collocation point (equations 14 to 17, integrated).
 
-    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; target speed v [m/s], v' (in s), travel x, x1 as
-        d, d1.
-    p = point (3), normal (3), 1 in restitution else 0, 1/mass [1/kg], the law's parameters.
-    out = (f - law) / 100 N, v' - T f / mass [m/s], approach speed [m/s], penetration / 1 cm.
+    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; the target's state and its slope (in s); its
+        helpers; travel x of its surface, x' and x1 as d, u and d1; slope p' of the impulse.
+    p = point (3), normal (3), 1 in restitution else 0, 1 after the break else 0, the law's parameters, the
+        target's.
+    out = (f - law) / 100 N, state' - T d(state)/dt over its typical size, x' - speed [m/s], p' - T f [N s],
+        rows of the helpers, approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N,
+        speed of the target's surface [m/s], what is zero at the break.
     """
-    ny = c.ny
+    ny, n = c.ny, target.n_states
     y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
-    v, v1, x, x1 = (ca.SX.sym(s) for s in ("v", "v1", "x", "x1"))
+    state, slope = ca.SX.sym("state", n), ca.SX.sym("slope", n)
+    helpers = ca.SX.sym("helpers", len(target.helpers))
+    x, rate_x, x1, rate_p = (ca.SX.sym(s) for s in ("x", "rate_x", "x1", "rate_p"))
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("n", 3)
-    after, inverse_mass = ca.SX.sym("after"), ca.SX.sym("im")
-    params = ca.SX.sym("law", len(law.parameters))
+    restituting, broken = ca.SX.sym("restituting"), ca.SX.sym("broken")
+    of_law = ca.SX.sym("law", len(law.parameters))
+    of_target = ca.SX.sym("target", len(target.parameters))
     q, vel, _ = c.upper_motion(y0 + T1 * d1 + T * d, u, ca.SX.zeros(ny))
     place, twist, _ = striker_kinematics(c, striker)(q, vel, ca.SX.zeros(c.rb.nv))
+    named = {name: of_law[i] for i, name in enumerate(law.parameters)}
+    numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
+    speed = ca.SX(target.velocity(state, numbers))
     penetration = ca.dot(normal, place - point) - (T1 * x1 + T * x)
-    rate = ca.dot(normal, twist) - v
-    named = {name: params[i] for i, name in enumerate(law.parameters)}
+    rate = ca.dot(normal, twist) - speed
     compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
+    before, rows = target.smooth(state, f, helpers, False, numbers)
+    after, _ = target.smooth(state, f, helpers, True, numbers) if target.breaks else (before, rows)
+    moves = ca.vertcat(ca.SX(0, 1), *before) * (1 - broken) + ca.vertcat(ca.SX(0, 1), *after) * broken
+    breaking = [target.breaking(state, numbers)] if target.breaks else []
     out = {
-        "law": (f - ((1 - after) * compress + after * restitute)) / FORCE_SCALE,
-        "target": v1 - T * f * inverse_mass,
+        "law": (f - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE,
+        "target": (slope - T * moves) / np.array(typical_state(target)),
+        "travel": rate_x - speed,
+        "impulse": rate_p - T * f,
+        "helpers": ca.vertcat(ca.SX(0, 1), *rows),
         "rate": rate,
         "penetration": penetration / DEPTH_SCALE,
+        "separation": ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE,
+        "speed": speed,
+        "breaking": ca.vertcat(ca.SX(0, 1), *breaking),
     }
-    return make_block(
-        [y0, d1, T1, d, T, u, f, v, v1, x, x1], [point, normal, after, inverse_mass, params], out
-    )
+    z = [y0, d1, T1, d, T, u, f, state, slope, helpers, x, rate_x, x1, rate_p]
+    return make_block(z, [point, normal, restituting, broken, of_law, of_target], out)
+
+
+def typical_state(target: Target) -> tuple[float, ...]:
+    """Sizes of the numbers of a target's state."""
+    return target.typical or (1.0,) * target.n_states
 
 
 def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
@@ -266,6 +302,15 @@ def two_mass_restitution(ratio: Any) -> Any:
     return ca.exp(-ratio * slope)
 
 
+def join() -> BlockExpression:
+    """One coordinate's way through two phases as that through one.
+
+    z = T1, T2, d1, d2, d;  out = T1 d1 + T2 d2 - (T1 + T2) d.
+    """
+    T1, T2, d1, d2, d = z = [ca.SX.sym(s) for s in ("T1", "T2", "d1", "d2", "d")]
+    return make_block(list(z), [], {"travel": T1 * d1 + T2 * d2 - (T1 + T2) * d})
+
+
 def link() -> BlockExpression:
     """One coordinate's hand-over from swing to collision, and from the state after it to the follow-through.
 
@@ -300,7 +345,13 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
 
 
 def builders(
-    c: StanceCoordinates, striker: str, law: ContactLaw, edges: int, *, instant: bool = False
+    c: StanceCoordinates,
+    striker: str,
+    law: ContactLaw,
+    target: Target,
+    edges: int,
+    *,
+    instant: bool = False,
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Block's name -> a function that builds its expression; ``instant``: for an impact without duration.
 
@@ -308,10 +359,12 @@ def builders(
     """
     hit: dict[str, Callable[[], BlockExpression]] = {
         "collision": lambda: collision(c, striker),
-        "force": lambda: force(c, striker, law),
+        "force": lambda: force(c, striker, law, target),
     }
     if c.legs:
         hit["coasting"] = lambda: coasting(c)
+    if target.breaks:
+        hit["join"] = join
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),

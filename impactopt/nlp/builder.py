@@ -150,7 +150,7 @@ class Builder:
 
     def parts(self, block: str) -> dict[str, Any]:
         """Indices of the named slices of a block's output."""
-        size = symbolic.sizes(self.coordinates, block)
+        size = symbolic.sizes(self.coordinates, self.problem.target, block)
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}
 

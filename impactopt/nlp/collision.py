@@ -1,7 +1,8 @@
-"""The two contact phases in the program: Radau IIA collocation of the whole equation of motion.
+"""The contact's phases in the program: Radau IIA collocation of the whole equation of motion.
 
-One for the expected target, one for each scenario. They share the state at contact, the feed-forward and the
-servo; durations, motion, force and wrenches are each one's own.
+Compression and restitution, each of which is smooth; the break of a target that breaks parts compression in
+two. One contact for the expected target, one for each scenario. They share the state at contact, the
+feed-forward and the servo; durations, motion, force and wrenches are each one's own.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
+from impactopt.nlp.blocks import FORCE_SCALE, typical_state
+from impactopt.nlp.guess import blow, effective_mass
 from impactopt.nlp.layout import Affine, Array, Group
-from impactopt.nlp.mesh import Stage
-from impactopt.nlp.rows import Measure, Place, along, millimetres, percent, rates
+from impactopt.nlp.mesh import Stage, contact_phases
+from impactopt.nlp.rows import Measure, Place, along, percent, rates
 from impactopt.plan import PlannedCollision, total_ground_wrench
 from impactopt.scenario import Scenario
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
 
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+SHARE = 0.1  # of the shortest compression that each of the two may last which a break makes of it
 
 
 class Collision:
@@ -35,13 +38,13 @@ class Collision:
     ) -> None:
         self.t, self.scenario, self.stages = t, scenario, t.stages
         p, c = t.problem, t.coordinates
-        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in (0, 1)]
+        phases = contact_phases(p.target.breaks)
+        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in range(len(phases))]
         named = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
-        factors = (scenario.mass, scenario.stiffness, scenario.damping) if scenario else (1.0, 1.0, 1.0)
-        self.mass = p.target.mass * factors[0]
-        scale = {"stiffness": factors[1], "damping": factors[2]}
-        self.law = [value * scale.get(name, 1.0) for name, value in p.law.parameters.items()]
+        self.law, self.target = p.law.parameters, p.target.parameters
+        if scenario is not None:
+            self.law, self.target = scenario.numbers(p.law, p.target)
         self.torque_fraction = scenario.torque if scenario else t.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else t.cone.collision_margin
         n = len(self.stages)
@@ -49,69 +52,104 @@ class Collision:
         def add(name: str, size: int, **options: Any) -> Group:
             return t.layout.add(named + name, n, size, **options)
 
+        shortest, longest = p.contact_duration
+        bounds = (SHARE * shortest if p.target.breaks else shortest, longest), p.contact_duration
         self.T = [
-            t.duration(f"{named}{name} duration", p.contact_duration, 0.01)
-            for name in ("compression", "restitution")
+            t.duration(f"{named}{name} duration", bounds[int(name == "restitution")], 0.01) for name in phases
         ]
         self.coast_legs = add("coasting legs", t.nl, labels=c.leg_labels)
         self.coast_rates = add("coasting leg rates", t.nl, labels=c.leg_labels)
         self.u = add("collision rate", t.ny, labels=c.labels)
         self.d = add("collision travel", t.ny, labels=c.labels)
         self.legs = add("collision legs", t.nl, **t.of_legs)
-        self.f = add("contact force", 1, scale=FORCE_SCALE)
-        self.vt = add("target speed", 1)
+        # it ends with contact; where law or target might make it pull, it has to be kept from that
+        last = (np.arange(n) == n - 1)[:, None]
+        least = 0.0 if p.target.switching or t.law_pulls else np.where(last, 0.0, -np.inf)
+        most = np.where(last, 0.0, np.inf)
+        self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
+        lower, helpers = (0.0 if p.target.forward_only else -np.inf), p.target.helpers
+        self.state = add("target state", p.target.n_states, scale=typical_state(p.target), lower=lower)
+        self.helpers = add("target", len(helpers), lower=0.0, labels=helpers)
         self.xt = add("target travel", 1)
+        self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", t.nw, **t.of_wrenches)
+        joined = int(p.target.breaks)
+        self.joined = t.layout.add(f"{named}travel in compression", joined, t.ny, labels=c.labels)
+        self.joined_x = t.layout.add(f"{named}target travel in compression", joined, 1)
         wanted = int(after is not None)
         self.after = t.layout.add(f"{named}position after contact", wanted, t.ny, **(after or {}))
 
     @property
     def impulse(self) -> Affine:
         """To the target [N s]."""
-        return self.vt[self.end[1]] * self.mass
+        return self.p[self.end[-1]]
 
     @property
     def target_state(self) -> Affine:
         """Of the target, at separation."""
-        return self.vt[self.end[1]]
+        return self.state[self.end[-1]]
+
+    def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
+        """Time [s], travel and the target's travel in the phases before one, both divided by that time."""
+        if phase == 0:
+            return Affine.zeros(1), Affine.zeros(self.t.ny), Affine.zeros(1)
+        if phase == 1:
+            return self.T[0][0], self.d[self.end[0]], self.xt[self.end[0]]
+        return self.T[0][0] + self.T[1][0], self.joined[0], self.joined_x[0]
 
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""
         t, p, r = self.t, self.t.problem, self.t.robot
         y, u0, ff = t.contact_state[0], t.u0[0], t.feedforward[0]
-        zero, none = Affine.zeros(t.ny), Affine.zeros(1)
+        none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
         gains = np.concatenate([r.kp, r.kd, r.torque_limit, t.units])
         coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
         for i, s in enumerate(self.stages):
             u, u1 = self._slots(self.u, i, u0)
-            v, v1 = self._slots(self.vt, i, none)
-            T, T1 = self.T[s.phase][0], self.T[0][0] if s.phase else none
-            d1 = self.d[self.end[0]] if s.phase else zero
-            x1 = self.xt[self.end[0]] if s.phase else none
+            state = self._slots(self.state, i, still)
+            travelled = self._slots(self.xt, i, none, anew=True)
+            given = self._slots(self.p, i, none)[1]
+            T, (T1, d1, x1) = self.T[s.phase][0], self._before(s.phase)
             coast, travel = [self.coast_legs[i], self.coast_rates[i]], [d1, T1, self.d[i], T]
             hit = [self.legs[i], self.f[i], self.w[i]]
-            phase = float(s.phase)
+            after, broken = float(s.phase > 0), float(p.target.breaks and s.phase > 0)
             coasting.append([y, u0, T1, T, *coast])
-            coasting_p.append([s.place, phase])
+            coasting_p.append([s.place, after])
             collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
-            collision_p.append(np.concatenate([p.normal, [s.place, phase], gains]))
-            force.append([y, *travel, u, self.f[i], v, v1, self.xt[i], x1])
-            force_p.append([*p.point, *p.normal, phase, 1 / self.mass, *self.law])
+            collision_p.append(np.concatenate([p.normal, [s.place, after], gains]))
+            force.append([y, *travel, u, self.f[i], *state, self.helpers[i], *travelled, x1, given])
+            branch = [float(self._restitution(i)), broken]
+            numbers = [*self.law.values(), *self.target.values()]
+            force_p.append([*p.point, *p.normal, *branch, *numbers])
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
             "force": (force, force_p),
         }
         if t.coordinates.legs:
             out["coasting"] = coasting, coasting_p
+        if p.target.breaks:
+            out["join"] = self._join(), [np.zeros(0)] * (t.ny + 1)
         return out
 
-    def _slots(self, group: Group, i: int, start: Affine) -> tuple[Affine, Affine]:
-        """Value and d/ds of a collocated group (u or target speed) at stage i; ``start``: at contact."""
+    def _join(self) -> list[list[Affine]]:
+        """Slots of the block ``join``: ways to the break and on to the end of compression, as one."""
+        first, second = self.end[:2]
+        times = self.T[0][0], self.T[1][0]
+        ways = self.d[first], self.d[second], self.joined[0]
+        slots = [[*times, *(way[k : k + 1] for way in ways)] for k in range(self.t.ny)]
+        return [*slots, [*times, self.xt[first], self.xt[second], self.joined_x[0]]]
+
+    def _restitution(self, i: int) -> bool:
+        return self.stages[i].phase == len(self.end) - 1
+
+    def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
+        """Value and d/ds of a collocated group at stage i; ``start``: at contact; ``anew``: of each phase."""
         s = self.stages[i]
         slope = Affine.zeros(group.size)
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + group[m] * w
-        before = group[s.previous] if s.previous >= 0 else start
+        begins = s.previous < 0 or (anew and s.new_phase)
+        before = start if begins else group[s.previous]
         return group[i], slope + before * s.start
 
     # ------------------------------------------------------------------ rows
@@ -123,40 +161,41 @@ class Collision:
             first = {name: start + i * size for name, (start, size) in at.items()}
             self._dynamics_rows(i, place, first)
         start, size = at["force"]
-        for term, component, k, part, measure in (
-            ("end of compression", "approach speed", self.end[0], 2, Measure("m/s", 1.0, "left")),
-            ("separation", "penetration", self.end[1], 3, millimetres("left", scale=DEPTH_SCALE)),
+        part, where = self.t.parts("force"), self.suffix.lstrip(", ")
+        for term, component, k, name, measure in (
+            ("end of compression", "approach speed", self.end[-2], "rate", Measure("m/s", 1.0, "left")),
+            ("separation", "force", self.end[-1], "separation", Measure("N", FORCE_SCALE, "left")),
         ):
-            output = np.array([start + k * size + part])
-            self.t.equal(term, self.suffix.lstrip(", "), [component], output, measure)
+            self.t.equal(term, where, [component], start + k * size + part[name], measure)
+        if self.t.problem.target.breaks:
+            output = start + self.end[0] * size + part["breaking"]
+            self.t.equal("break", where, ["target"], output, percent("off"))
+            names = [*self.t.coordinates.labels, "target"]
+            outputs = at["join"][0] + np.arange(self.t.ny + 1)
+            self.t.equal("travel in compression", where, names, outputs, along(names, "off"))
 
     def _place(self, s: Stage) -> Place:
-        time = self.T[1][0] * s.place + self.T[0][0] if s.phase else self.T[0][0] * s.place
+        time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
         suffix = self.suffix.replace("{", "{{").replace("}", "}}")
         return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
 
     def _integral_rows(self, i: int, place: Place) -> None:
-        """d and the target's travel are the integrals of u and of the target's speed in the phase so far."""
-        s = self.stages[i]
-        names = self.t.coordinates.labels
-        for term, integral, rate, labels, measures in (
-            ("collision kinematics", self.d, self.u, names, rates(names)),
-            ("target kinematics", self.xt, self.vt, ("target",), [Measure("m/s", 1.0, "off")]),
-        ):
-            expression = integral[i]
-            for m, w in zip(s.members, s.quadrature, strict=True):
-                expression = expression - rate[m] * w
-            if not s.new_phase:
-                expression = expression - integral[s.previous]
-            self.t.rows.add(
-                term=term,
-                place=place,
-                components=labels,
-                affine=expression,
-                lower=0,
-                upper=0,
-                measure=measures,
-            )
+        """d is the integral of u in the phase so far."""
+        s, labels = self.stages[i], self.t.coordinates.labels
+        way = self.d[i]
+        for m, w in zip(s.members, s.quadrature, strict=True):
+            way = way - self.u[m] * w
+        if not s.new_phase:
+            way = way - self.d[s.previous]
+        self.t.rows.add(
+            term="collision kinematics",
+            place=place,
+            components=labels,
+            affine=way,
+            lower=0,
+            upper=0,
+            measure=rates(labels),
+        )
 
     def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         t, c, joints = self.t, self.t.coordinates, self.t.robot.joint_names
@@ -182,20 +221,54 @@ class Collision:
         )
         minimum = t.cone.minimum_force if self.scenario is None else 0.0
         t.cone_rows(self.w[i], place, self.cone_margin, minimum)
-        law, motion = (np.array([first["force"] + k]) for k in (0, 1))
-        t.equal("contact law", place, ["force"], law, Measure("N", FORCE_SCALE, "off"))
-        t.equal("target's motion", place, ["speed"], motion, Measure("m/s", 1.0, "off"))
+        self._target_rows(i, place, first["force"])
+
+    def _target_rows(self, i: int, place: Place, first: int) -> None:
+        t, target = self.t, self.t.problem.target
+        part, fast = t.parts("force"), Measure("m/s", 1.0, "off")
+        if i != self.end[-1]:  # there the force is zero by its bounds
+            force = Measure("N", FORCE_SCALE, "off")
+            t.equal("contact law", place, ["force"], first + part["law"], force)
+        states = [f"state {k}" for k in range(target.n_states)]
+        of_size = percent("of its size off")
+        t.equal("target's motion", place, states, first + part["target"], of_size)
+        t.equal("target's motion", place, ["travel"], first + part["travel"], fast)
+        t.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
+        t.equal("target's law", place, target.helpers, first + part["helpers"], of_size)
+        if i in self.end:
+            return
+        if t.law_switches and target.switching:
+            back = self._restitution(i)
+            t.rows.add(
+                term="approach speed",
+                place=place,
+                components=["striker and target"],
+                outputs=first + part["rate"],
+                lower=-np.inf if back else 0.0,
+                upper=0.0 if back else np.inf,
+                measure=Measure("m/s", 1.0, "the other way"),
+            )
+        if target.breaks and self.stages[i].phase == 0:
+            t.rows.add(
+                term="break",
+                place=place,
+                components=["target"],
+                outputs=first + part["breaking"],
+                upper=0,
+                measure=percent("too early"),
+            )
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
         """Slots of the block ``link``: this state after contact to a ``start`` (y, d y/ds, duration [s])."""
-        first, second = self.end
-        times = self.T[0][0], self.T[1][0]
-        return self.t.link_slots(start, times, (self.d[first], self.d[second]), self.u[second])
+        last = len(self.end) - 1
+        time, travel, _ = self._before(last)
+        ways = travel, self.d[self.end[last]]
+        return self.t.link_slots(start, (time, self.T[last][0]), ways, self.u[self.end[last]])
 
     @property
     def state_after(self) -> list[Affine]:
         """Coordinates, rates, legs and T (1 s) after contact, if its position is a variable."""
-        end = self.end[1]
+        end = self.end[-1]
         return [self.after[0], self.u[end], self.legs[end], Affine.constant(1.0)]
 
     def link_after(self) -> list[list[Affine]]:
@@ -205,26 +278,32 @@ class Collision:
 
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """A uniform push: the target gains 0.8 m/s while the robot loses 0.4 of its rates."""
-        t, c = self.t, self.t.coordinates
-        times = np.clip([0.015, 0.02], *t.problem.contact_duration)
-        total = float(times.sum())
-        for group, value in zip(self.T, times, strict=True):
-            group.write(x, value)
+        """The robot loses rates all alike, as a point mass in its place does."""
+        t, c, p = self.t, self.t.coordinates, self.t.problem
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
-        elapsed = np.where(phase == 0, place * times[0], times[0] + place * times[1])
-        fraction = elapsed / total
-        speed = 0.8
-        self.vt.write(x, (speed * fraction)[:, None])
-        self.u.write(x, (1 - 0.4 * fraction)[:, None] * rates)
-        # integrals over each phase of a linear ramp, in the phase's own s
-        start = np.where(phase == 0, 0.0, times[0] / total)
-        mean = (start + fraction) / 2 * place
-        self.xt.write(x, (speed * mean)[:, None])
-        self.d.write(x, (place - 0.4 * mean)[:, None] * rates)
-        self.f.write(x, self.mass * speed / total)
-        self.after.write(x, y + 0.8 * total * rates)
+        mass, speed = effective_mass(c, p.striker, p.normal, y, legs, rates)
+        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
+        found = blow(law, target, mass, speed, phase, place)
+        times = np.clip(found.durations, *np.transpose([t.layout.bounds(group) for group in self.T]))
+        for group, value in zip(self.T, times, strict=True):
+            group.write(x, value)
+        before = np.concatenate([[0.0], np.cumsum(times)])
+        elapsed = before[phase] + place * times[phase]
+        per_time = (1 / found.durations[phase])[:, None]
+        d = found.way[:, None] * per_time * rates
+        self.u.write(x, found.speed[:, None] * rates)
+        self.d.write(x, d)
+        self.state.write(x, found.state)
+        self.helpers.write(x, found.helpers)
+        self.xt.write(x, found.travel[:, None] * per_time)
+        self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
+        self.p.write(x, found.impulse[:, None])
+        if p.target.breaks:
+            share = times[:2, None] / before[2]
+            self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
+            self.joined_x.write(x, (share * self.xt.read(x)[self.end[:2]]).sum(axis=0))
+        self.after.write(x, y + float(found.way[self.end].sum()) * rates)
         if c.legs:
             self.legs.write(x, legs)
             self.w.write(x, t.contact_w.evaluate(x))
@@ -235,23 +314,26 @@ class Collision:
 
     def durations(self, x: Array) -> tuple[float, float]:
         """Compression and restitution [s]."""
-        first, second = (float(g.read(x)[0, 0]) for g in self.T)
-        return first, second
+        *compression, restitution = (float(g.read(x)[0, 0]) for g in self.T)
+        return sum(compression), restitution
 
     def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
         """The collision that solver variables (n,) stand for; ``outputs`` are the blocks'."""
-        t, durations = self.t, self.durations(x)
-        time = [(durations[0] if s.phase else 0.0) + s.place * durations[s.phase] for s in self.stages]
-        law = dict(zip(t.problem.law.parameters, self.law, strict=True))
-        first = float(t.problem.law.branch(0.0, approach, True, law))
+        t, target = self.t, self.t.problem.target
+        durations = [float(g.read(x)[0, 0]) for g in self.T]
+        time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
+        first = float(t.problem.law.branch(0.0, approach, True, self.law))
         wrench = self.w.read(x)
         start = t.collisions.index(self) * len(self.stages)  # of its instances in the blocks
-        torque = outputs["collision"][start : start + len(self.stages), t.parts("collision")["torque"]]
+        of_stages = slice(start, start + len(self.stages))
+        torque = outputs["collision"][of_stages, t.parts("collision")["torque"]]
+        speed = outputs["force"][of_stages, t.parts("force")["speed"][0]]
         return PlannedCollision(
             time=np.array([0.0, *time]),
             force=np.array([first, *self.f.read(x)[:, 0]]),
-            target_speed=np.array([0.0, *self.vt.read(x)[:, 0]]),
+            target_speed=np.array([0.0, *speed]),
             torque=np.vstack([t.feedforward.read(x), torque]) * t.robot.torque_limit,
             sole_wrench=wrench,
             ground=total_ground_wrench(t.coordinates, wrench),
+            outcome=target.outcome(self.state.read(x)[-1], self.target),
         )

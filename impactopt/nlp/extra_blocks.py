@@ -14,7 +14,7 @@ import casadi as ca
 from impactopt.coordinates import StanceCoordinates
 from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion, KeepOut, SelfCollision
 from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, make_block, striker_kinematics
-from impactopt.nlp.mesh import stage_count
+from impactopt.nlp.mesh import contact_mesh
 from impactopt.objectives import Effort, PeakForce, TargetEnergy
 from impactopt.problem import ImpactProblem
 from impactopt.shapes import Capsule
@@ -33,7 +33,7 @@ def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, Extr
     kinds = {type(o) for o in problem.objectives}
     out: dict[str, ExtraBlock] = {}
     if PeakForce in kinds:
-        stages = stage_count(problem.collision_elements, problem.collision_stages)
+        stages = len(contact_mesh(problem))
         out["peak"] = ExtraBlock((stages,), lambda: peak(stages))
     if TargetEnergy in kinds:
         out["energy"] = ExtraBlock(problem.target.formula(), lambda: energy(problem.target))

@@ -26,7 +26,9 @@ class InstantImpact:
     def __init__(self, t: ContactProgram) -> None:
         self.t, c = t, t.coordinates
         add = t.layout.add
-        self.mass = t.problem.target.mass
+        self.target = t.problem.target
+        # a wall takes any impulse without moving
+        self.mass = self.target.parameters.get("mass", np.inf)
         self.du = add("change of rate", 1, t.ny, labels=c.labels)
         self.blow = add("impulse", 1, 1, lower=1e-3, scale=10.0)
         self.w = add("impulsive sole wrench", 1, t.nw, **{**t.of_wrenches, "scale": 0.05 * t.wrench_scale})
@@ -47,7 +49,7 @@ class InstantImpact:
         y = t.contact_state[0]
         slots = [y, t.contact_legs, t.u0[0], self.du[0], self.w[0], self.blow[0]]
         rigid = float(p.collision == "rigid")
-        law = [p.law.parameters[name] for name in ("stiffness", "damping")]
+        law = [p.law.parameters.get(name, 1.0) for name in ("stiffness", "damping")]
         numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
         return {"impact": ([slots], [np.concatenate([numbers, t.robot.torque_limit, t.units])])}
 
@@ -76,7 +78,7 @@ class InstantImpact:
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         self.du.write(x, -0.3 * rates)
-        self.blow.write(x, 0.5 * self.mass)
+        self.blow.write(x, 0.5 * self.mass if np.isfinite(self.mass) else 1.0)
 
     def durations(self, x: Array) -> tuple[float, float]:
         return 0.0, 0.0
@@ -84,10 +86,12 @@ class InstantImpact:
     def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
         t = self.t
         speed = float(self.blow.read(x)[0, 0]) / self.mass
+        outcome = self.target.outcome([speed] * self.target.n_states)
         return PlannedCollision(
             time=np.zeros(2),
             force=np.zeros(2),
             target_speed=np.array([0.0, speed]),
+            outcome=outcome,
             torque=np.repeat(t.feedforward.read(x), 2, axis=0) * t.robot.torque_limit,
             sole_wrench=np.zeros((0, t.nw)),
             ground=np.zeros((0, 6)),

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.motion import Radau
+from impactopt.problem import ImpactProblem
 
 Array = NDArray[np.float64]
 
@@ -16,7 +17,8 @@ Array = NDArray[np.float64]
 class Stage:
     """One collocation point of the collision."""
 
-    phase: int  # 0 compression, 1 restitution
+    phase: int  # the last one is restitution
+    phase_name: str
     place: float  # s in the phase
     weights: Array  # (stages,) of this element's stages in u', d u/ds
     start: float  # weight of the element's start value in u'
@@ -27,14 +29,25 @@ class Stage:
 
     @property
     def name(self) -> str:
-        return f"{('compression', 'restitution')[self.phase]}, {100 * self.place:.0f} %"
+        return f"{self.phase_name}, {100 * self.place:.0f} %"
 
 
-def collision_mesh(elements: tuple[tuple[float, ...], tuple[float, ...]], radau: Radau) -> list[Stage]:
-    """Stages of both contact phases; ``elements`` are the elements' lengths as fractions of each phase."""
+def contact_phases(breaks: bool) -> tuple[str, ...]:
+    """Names of the pieces of a contact in each of which all is smooth; ``breaks``: the target does."""
+    return ("compression", *(("compression after the break",) if breaks else ()), "restitution")
+
+
+def collision_mesh(
+    elements: tuple[tuple[float, ...], tuple[float, ...]], radau: Radau, *, breaks: bool = False
+) -> list[Stage]:
+    """Stages of the contact's phases; ``elements``: lengths of those of compression and of restitution, as
+    fractions of a phase.
+    """
+    names = contact_phases(breaks)
     inverse = np.linalg.inv(radau.a)
     stages: list[Stage] = []
-    for phase, lengths in enumerate(elements):
+    for phase, name in enumerate(names):
+        lengths = elements[int(name == "restitution")]
         s = 0.0
         for e, h in enumerate(lengths):
             first = len(stages)
@@ -43,6 +56,7 @@ def collision_mesh(elements: tuple[tuple[float, ...], tuple[float, ...]], radau:
                 stages.append(
                     Stage(
                         phase,
+                        name,
                         s + c * h,
                         inverse[i] / h,
                         -float(inverse[i].sum()) / h,
@@ -56,9 +70,13 @@ def collision_mesh(elements: tuple[tuple[float, ...], tuple[float, ...]], radau:
     return stages
 
 
-def stage_count(elements: tuple[tuple[float, ...], tuple[float, ...]], stages: int) -> int:
-    """Number of collocation points of a mesh with so many stages an element."""
-    return stages * sum(len(lengths) for lengths in elements)
+def contact_mesh(problem: ImpactProblem) -> list[Stage]:
+    """Stages of the contact of a problem; elements are halved if its target sticks, slips or breaks."""
+    target, elements = problem.target, problem.collision_elements
+    if target.switching:
+        first, second = (tuple(h / 2 for h in lengths for _ in range(2)) for lengths in elements)
+        elements = first, second
+    return collision_mesh(elements, Radau.of_stages(problem.collision_stages), breaks=target.breaks)
 
 
 def with_middles(breaks: Array) -> Array:

@@ -53,13 +53,14 @@ def block_functions(
         ),
         tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
         problem.striker,
-        problem.law.formula(),
         edges,
     )
+    target = problem.target
+    contact = (problem.law.formula(), target.formula(), symbolic.typical_state(target))
     out: dict[str, Any] = {}
     instant = problem.collision != "dynamics"
-    builders = symbolic.builders(coordinates, problem.striker, problem.law, edges, instant=instant)
-    found = {name: ExtraBlock((), build) for name, build in builders.items()}
+    builders = symbolic.builders(coordinates, problem.striker, problem.law, target, edges, instant=instant)
+    found = {name: ExtraBlock(contact if name == "force" else (), build) for name, build in builders.items()}
     for name, block in {**found, **extra_blocks(problem, coordinates)}.items():
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:

@@ -1,6 +1,8 @@
 """Problem files: an `impactopt.problem.ImpactProblem` written in TOML, in SI units.
 
-* sections.py   the sections and keys of a file, and what they make
+* section.py    what all sections have in common
+* contacts.py   [target] and [contact], of which there are several kinds
+* sections.py   the other sections and keys of a file, and what they make
 * values.py     ranges of the keys' values
 * mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
 * reading.py    from file to problem

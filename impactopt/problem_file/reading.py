@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
+from impactopt.problem_file.contacts import with_kinds
 from impactopt.problem_file.mistakes import Mistake, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file
 from impactopt.problem_file.sections import File
@@ -105,11 +106,11 @@ def parse_problem_file(text: str, path: Path) -> ProblemFile:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not TOML: {error}") from error
-    mistakes = _robot_given_once(data)
+    mistakes, model = _robot_given_once(data), with_kinds(File, data)
     try:
-        content = File.model_validate(data)
+        content = model.model_validate(data)
     except ValidationError as error:
-        mistakes += mistakes_of(error, File)
+        mistakes += mistakes_of(error, model)
     if mistakes:
         raise InputError(report_mistakes(path, text, mistakes))
     given = content.solver.model_dump(exclude_unset=True) if content.solver else {}

@@ -8,15 +8,15 @@ stand nowhere twice.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast, get_type_hints
+from typing import Any, Literal, cast, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import Field, create_model, model_validator
 
 from impactopt import extra_terms, objectives, terms
-from impactopt.contact.laws import SpringDamper
-from impactopt.contact.targets import FreeMass
 from impactopt.presets import load_robot
 from impactopt.problem import ImpactProblem, Phase
+from impactopt.problem_file.contacts import Contact, Target
+from impactopt.problem_file.section import Section, optional
 from impactopt.problem_file.values import (
     Duration,
     Fraction,
@@ -38,50 +38,13 @@ from impactopt.shapes import Capsule
 from impactopt.sqp import SQPOptions
 
 
-def _optional(key: str | None = None) -> Any:
-    """A key that may be left out; the class that is built has the default."""
-    return Field(default=None, alias=key)
-
-
-class Section(BaseModel):
-    """A section; unknown keys, NaN, infinity and text where a number belongs are refused."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-    kind: ClassVar[Any] = None
-
-    def given(self) -> dict[str, Any]:
-        """The keys that the file has, by the names of the class's fields."""
-        return self.model_dump(exclude_unset=True)
-
-    def build(self) -> Any:
-        """The thing that this section describes."""
-        return self.kind(**self.given())
-
-    @model_validator(mode="after")
-    def _can_be_built(self) -> Section:
-        if self.kind is not None:
-            self.build()
-        return self
-
-
 class Problem(Section):
-    name: str = _optional()
-    robot: Preset = _optional()
+    name: str = optional()
+    robot: Preset = optional()
     striker: str
     point: Vector = Field(alias="point_m")
     normal: UnitVector
     start: str = cast(str, ImpactProblem.start)
-
-
-class Target(Section):
-    kind = FreeMass
-    mass: Positive = Field(alias="mass_kg")
-
-
-class Contact(Section):
-    kind = SpringDamper
-    stiffness: Positive = Field(alias="stiffness_N_m")
-    damping: NotNegative = Field(alias="damping_N_s_m")
 
 
 class Stance(Section):
@@ -91,8 +54,8 @@ class Stance(Section):
 class PhaseSection(Section):
     kind = Phase
     duration: Duration = Field(alias="duration_s")
-    intervals: int = _optional()
-    grading: float = _optional()
+    intervals: int = optional()
+    grading: float = optional()
 
 
 class Collision(Section):
@@ -101,121 +64,121 @@ class Collision(Section):
     `model`: "dynamics", or an impact without duration, to compare with: "rigid", "virtual mass".
     """
 
-    collision: Literal["dynamics", "rigid", "virtual mass"] = _optional("model")
-    coefficient_of_restitution: Restitution = _optional()
-    contact_duration: Duration = _optional("duration_s")
-    collision_stages: Literal[2, 3] = _optional("stages")
-    compression: Fractions = _optional()
-    restitution: Fractions = _optional()
+    collision: Literal["dynamics", "rigid", "virtual mass"] = optional("model")
+    coefficient_of_restitution: Restitution = optional()
+    contact_duration: Duration = optional("duration_s")
+    collision_stages: Literal[2, 3] = optional("stages")
+    compression: Fractions = optional()
+    restitution: Fractions = optional()
 
 
 class ScenarioSection(Section):
     kind = Scenario
     name: str
-    mass: Positive = _optional()
-    stiffness: Positive = _optional()
-    damping: NotNegative = _optional()
-    missing: bool = _optional()
-    brake_after: Positive = _optional("brake_after_s")
-    torque: Positive = _optional()
-    cone_margin: NotNegative = _optional("cone_margin_m")
-    capture_margin: NotNegative = _optional("capture_margin_m")
+    mass: Positive = optional()
+    stiffness: Positive = optional()
+    damping: NotNegative = optional()
+    missing: bool = optional()
+    brake_after: Positive = optional("brake_after_s")
+    torque: Positive = optional()
+    cone_margin: NotNegative = optional("cone_margin_m")
+    capture_margin: NotNegative = optional("capture_margin_m")
 
 
 class Objective(Section):
-    smoothness: NotNegative = _optional()
-    wrench_price: NotNegative = _optional()
-    return_price: NotNegative = _optional()
+    smoothness: NotNegative = optional()
+    wrench_price: NotNegative = optional()
+    return_price: NotNegative = optional()
 
 
 class Impulse(Section):
     kind = objectives.Impulse
-    weight: float = _optional()
+    weight: float = optional()
 
 
 class PeakForce(Section):
     kind = objectives.PeakForce
-    weight: float = _optional()
+    weight: float = optional()
 
 
 class TargetEnergy(Section):
     kind = objectives.TargetEnergy
-    weight: float = _optional()
+    weight: float = optional()
 
 
 class Penetration(Section):
     kind = objectives.Penetration
-    weight: float = _optional()
+    weight: float = optional()
 
 
 class AngularMomentum(Section):
     kind = objectives.AngularMomentum
-    weight: float = _optional()
+    weight: float = optional()
 
 
 class Effort(Section):
     kind = objectives.Effort
-    weight: float = _optional()
+    weight: float = optional()
 
 
 class Objectives(Section):
     """What is maximized; if there are any, only those that are given."""
 
-    impulse: Impulse = _optional()
-    peak_force: PeakForce = _optional()
-    target_energy: TargetEnergy = _optional()
-    penetration: Penetration = _optional()
-    angular_momentum: AngularMomentum = _optional()
-    effort: Effort = _optional()
+    impulse: Impulse = optional()
+    peak_force: PeakForce = optional()
+    target_energy: TargetEnergy = optional()
+    penetration: Penetration = optional()
+    angular_momentum: AngularMomentum = optional()
+    effort: Effort = optional()
 
 
 class TorqueLimit(Section):
     kind = terms.TorqueLimit
-    fraction: Fraction = _optional()
-    collision: Fraction = _optional()
+    fraction: Fraction = optional()
+    collision: Fraction = optional()
 
 
 class VelocityLimit(Section):
     kind = terms.VelocityLimit
-    fraction: Fraction = _optional()
+    fraction: Fraction = optional()
 
 
 class PositionLimit(Section):
     kind = terms.PositionLimit
-    margin: NotNegative = _optional("margin_rad")
+    margin: NotNegative = optional("margin_rad")
 
 
 class ContactWrenchCone(Section):
     kind = terms.ContactWrenchCone
-    friction: Positive = _optional()
-    margin: NotNegative = _optional("margin_m")
-    collision_margin: NotNegative = _optional("collision_margin_m")
-    minimum_force: NotNegative = _optional("minimum_force_N")
+    friction: Positive = optional()
+    margin: NotNegative = optional("margin_m")
+    collision_margin: NotNegative = optional("collision_margin_m")
+    minimum_force: NotNegative = optional("minimum_force_N")
 
 
 class Balance(Section):
     kind = terms.Balance
-    capture_margin: NotNegative = _optional("capture_margin_m")
-    vertical_speed: NotNegative = _optional("vertical_speed_m_s")
-    angular_momentum: NotNegative = _optional("angular_momentum_N_m_s")
+    capture_margin: NotNegative = optional("capture_margin_m")
+    vertical_speed: NotNegative = optional("vertical_speed_m_s")
+    angular_momentum: NotNegative = optional("angular_momentum_N_m_s")
 
 
 class Incidence(Section):
     kind = terms.Incidence
-    speed: NotNegative = _optional("speed_m_s")
+    speed: NotNegative = optional("speed_m_s")
 
 
 class LegExtension(Section):
     kind = terms.LegExtension
-    minimum: Fraction = _optional()
+    minimum: Fraction = optional()
 
 
 class Shape(Section):
     kind = Capsule
     frame: str
     radius: NotNegative = Field(alias="radius_m")
-    start: Vector = _optional("start_m")
-    end: Vector = _optional("end_m")
+    start: Vector = optional("start_m")
+    end: Vector = optional("end_m")
 
 
 class Pair(Section):
@@ -233,8 +196,8 @@ class TorqueRate(Section):
 
 class SelfCollision(Section):
     kind = extra_terms.SelfCollision
-    pairs: list[Pair] = _optional()
-    margin: NotNegative = _optional("margin_m")
+    pairs: list[Pair] = optional()
+    margin: NotNegative = optional("margin_m")
 
     def build(self) -> Any:
         pairs = None if self.pairs is None else tuple(pair.build() for pair in self.pairs)
@@ -244,8 +207,8 @@ class SelfCollision(Section):
 class KeepOut(Section):
     kind = extra_terms.KeepOut
     shapes: list[Shape]
-    size: Vector = _optional("size_m")
-    margin: NotNegative = _optional("margin_m")
+    size: Vector = optional("size_m")
+    margin: NotNegative = optional("margin_m")
 
     def build(self) -> Any:
         return self.kind(**{**self.given(), "shapes": tuple(shape.build() for shape in self.shapes)})
@@ -254,58 +217,58 @@ class KeepOut(Section):
 class HandOrientation(Section):
     kind = extra_terms.HandOrientation
     axis: UnitVector
-    direction: UnitVector = _optional()
-    angle: Positive = _optional("angle_rad")
+    direction: UnitVector = optional()
+    angle: Positive = optional("angle_rad")
 
 
 class Gaze(Section):
     kind = extra_terms.Gaze
     frame: str
     axis: UnitVector
-    angle: Positive = _optional("angle_rad")
-    since: NotNegative = _optional()
+    angle: Positive = optional("angle_rad")
+    since: NotNegative = optional()
 
 
 class HitRegion(Section):
     kind = extra_terms.HitRegion
-    radius: Positive = _optional("radius_m")
-    size: Point2 = _optional("size_m")
+    radius: Positive = optional("radius_m")
+    size: Point2 = optional("size_m")
 
 
 class HitCone(Section):
     kind = extra_terms.HitCone
-    angle: Positive = _optional("angle_rad")
+    angle: Positive = optional("angle_rad")
 
 
 class Terms(Section):
-    torque_limit: TorqueLimit = _optional()
-    velocity_limit: VelocityLimit = _optional()
-    position_limit: PositionLimit = _optional()
-    contact_wrench_cone: ContactWrenchCone = _optional()
-    balance: Balance = _optional()
-    incidence: Incidence = _optional()
-    leg_extension: LegExtension = _optional()
-    torque_rate: TorqueRate = _optional()
-    self_collision: SelfCollision = _optional()
-    keep_out: KeepOut = _optional()
-    hand_orientation: HandOrientation = _optional()
-    gaze: Gaze = _optional()
-    hit_region: HitRegion = _optional()
-    hit_cone: HitCone = _optional()
+    torque_limit: TorqueLimit = optional()
+    velocity_limit: VelocityLimit = optional()
+    position_limit: PositionLimit = optional()
+    contact_wrench_cone: ContactWrenchCone = optional()
+    balance: Balance = optional()
+    incidence: Incidence = optional()
+    leg_extension: LegExtension = optional()
+    torque_rate: TorqueRate = optional()
+    self_collision: SelfCollision = optional()
+    keep_out: KeepOut = optional()
+    hand_orientation: HandOrientation = optional()
+    gaze: Gaze = optional()
+    hit_region: HitRegion = optional()
+    hit_cone: HitCone = optional()
 
 
 _SQP_KEYS: dict[str, Any] = {
-    name: (hint, _optional()) for name, hint in get_type_hints(SQPOptions).items() if name != "time_limit"
+    name: (hint, optional()) for name, hint in get_type_hints(SQPOptions).items() if name != "time_limit"
 }
 SQP: Any = create_model("SQP", __base__=Section, **_SQP_KEYS)
 SQP.kind = SQPOptions
 
 
 class Solver(Section):
-    name: Literal["ipopt", "sqp"] = _optional()
-    time_limit: Positive = _optional("time_limit_s")
-    ipopt: IpoptOptions = _optional()
-    sqp: SQP = _optional()
+    name: Literal["ipopt", "sqp"] = optional()
+    time_limit: Positive = optional("time_limit_s")
+    ipopt: IpoptOptions = optional()
+    sqp: SQP = optional()
 
 
 class SoleSection(Section):
@@ -338,22 +301,22 @@ class RobotSection(Section):
     A preset keeps its own strikers beside the section's. A tool's inertia is its diagonal.
     """
 
-    preset: Preset = _optional()
-    urdf: str = _optional()
-    srdf: str = _optional()
-    name: str = _optional()
-    floating: bool = _optional()
-    locked: dict[str, float] = _optional("locked_rad")
-    armature: PerJoint = _optional("armature_kg_m2")
-    kp: PerJoint = _optional("kp_N_m_rad")
-    kd: PerJoint = _optional("kd_N_m_s_rad")
-    torque_limit: PerJoint = _optional("torque_limit_N_m")
-    velocity_limit: PerJoint = _optional("velocity_limit_rad_s")
-    position_limit: dict[str, Range] = _optional("position_limit_rad")
-    soles: list[SoleSection] = _optional()
-    strikers: list[StrikerSection] = _optional()
-    tools: list[ToolSection] = _optional()
-    postures: dict[str, dict[str, float]] = _optional("postures_rad")
+    preset: Preset = optional()
+    urdf: str = optional()
+    srdf: str = optional()
+    name: str = optional()
+    floating: bool = optional()
+    locked: dict[str, float] = optional("locked_rad")
+    armature: PerJoint = optional("armature_kg_m2")
+    kp: PerJoint = optional("kp_N_m_rad")
+    kd: PerJoint = optional("kd_N_m_s_rad")
+    torque_limit: PerJoint = optional("torque_limit_N_m")
+    velocity_limit: PerJoint = optional("velocity_limit_rad_s")
+    position_limit: dict[str, Range] = optional("position_limit_rad")
+    soles: list[SoleSection] = optional()
+    strikers: list[StrikerSection] = optional()
+    tools: list[ToolSection] = optional()
+    postures: dict[str, dict[str, float]] = optional("postures_rad")
 
     @model_validator(mode="after")
     def _one_source(self) -> RobotSection:
@@ -385,21 +348,21 @@ class RobotSection(Section):
 
 
 class File(Section):
-    """A whole problem file."""
+    """A whole problem file; its [target] and [contact] are of a kind (`with_kinds`)."""
 
     problem: Problem
-    robot: RobotSection = _optional()
+    robot: RobotSection = optional()
     target: Target
     contact: Contact
-    stance: Stance = _optional()
-    swing: PhaseSection = _optional()
-    follow: PhaseSection = _optional()
-    collision: Collision = _optional()
-    scenarios: list[ScenarioSection] = _optional()
-    objective: Objective = _optional()
-    objectives: Objectives = _optional()
-    terms: Terms = _optional()
-    solver: Solver = _optional()
+    stance: Stance = optional()
+    swing: PhaseSection = optional()
+    follow: PhaseSection = optional()
+    collision: Collision = optional()
+    scenarios: list[ScenarioSection] = optional()
+    objective: Objective = optional()
+    objectives: Objectives = optional()
+    terms: Terms = optional()
+    solver: Solver = optional()
 
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset that [problem] names."""

@@ -79,6 +79,7 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+AtLeastOne = Annotated[float, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]

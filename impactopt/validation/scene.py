@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.problem import ImpactProblem
 from impactopt.support import support_polygon
@@ -21,6 +22,8 @@ def scene_of(problem: ImpactProblem) -> Scene:
         raise InputError(
             f"the validation knows the contact law SpringDamper only, not {type(p.law).__name__}"
         )
+    if not isinstance(p.target, FreeMass):
+        raise InputError(f"the validation knows the target FreeMass only, not {type(p.target).__name__}")
     return Scene(
         point=p.point,
         normal=p.normal,

@@ -73,6 +73,7 @@ _EXPORTS = {
     "VirtualMass": "collision",
     "arm7": "presets",
     "draw_conditions": "robustness",
+    "drive_nail": "blows",
     "effective_mass": "collision",
     "g1": "presets",
     "holding_torque": "reference.holding",

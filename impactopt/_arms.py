@@ -68,7 +68,7 @@ def arm_model(name: str, links: tuple[Link, ...]) -> Any:
 
 def _soft_kd(links: Iterable[Link]) -> dict[str, float]:
     """Kd [N m s/rad] by joint of an arm's servo."""
-    return {part.joint: 0.2 * part.drive.torque for part in links}
+    return {part.joint: 0.1 * part.drive.torque for part in links}
 
 
 def planar_arm(**overrides: Any) -> Robot:
@@ -76,7 +76,7 @@ def planar_arm(**overrides: Any) -> Robot:
 
     * Joints `shoulder`, `elbow`, `wrist`, about y, straight up at zero angles: 0.4, 0.36, 0.08 m, 9 kg.
     * Torque 180, 100, 40 N m; velocity 4, 5, 8 rad/s; armature 0.4, 0.2, 0.04 kg m2.
-    * Servo: Kd = 0.2 s/rad x torque limit, Kp = 30 1/s x Kd: soft enough for a hammer that rebounds.
+    * Servo: Kd = 0.1 s/rad x torque limit, Kp = 30 1/s x Kd: soft enough for a hammer that rebounds.
     * Striker `hammer`: `Tool.hammer`, its handle along the hand, its face forward where the hand points up.
     * Posture `ready`: the hand level and in front, the hammer's face down.
 
@@ -99,7 +99,7 @@ def arm7(*, tool: Tool | None = None, **overrides: Any) -> Robot:
 
     * Joints `joint_1` to `joint_7` about z, y, z, y, z, y, z, straight up at zero angles; 19 kg move.
     * Armature: 0.51 kg m2 in the first two joints, 0.31 in the next three, 0.1 in the last two.
-    * Servo: Kd = 0.2 s/rad x torque limit, Kp = 30 1/s x Kd, as the planar arm's.
+    * Servo: Kd = 0.1 s/rad x torque limit, Kp = 30 1/s x Kd, as the planar arm's.
     * Strikers `fist`, the middle of the flange, and that of the tool.
     * Posture `ready`: elbow bent, the flange looks ahead.
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from impactopt._drive_command import drive
 from impactopt._validate_command import validate
 from impactopt.bench.command import app as bench_app
 from impactopt.plain_errors import plain_errors
@@ -122,6 +123,7 @@ def solve(
 
 
 app.command()(validate)
+app.command()(drive)
 app.command()(reproduce)
 
 

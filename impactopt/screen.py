@@ -15,7 +15,7 @@ from rich.table import Table
 
 from impactopt.program import IterationRecord
 
-__all__ = ["Progress", "replay_table", "result_table", "violation_table"]
+__all__ = ["Progress", "blows_table", "replay_table", "result_table", "violation_table"]
 
 PHASES = ("swing", "collision", "follow")
 QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
@@ -158,4 +158,22 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     table.add_column("by how much", overflow="fold")
     for violation in violations:
         table.add_row(escape(str(violation["row"])), escape(str(violation["by"])))
+    return table
+
+
+def blows_table(series: Mapping[str, Any]) -> Table:
+    """A row for each blow on a nail; `series` as in `impactopt drive --json`."""
+    table = Table(title="blows on the nail", title_justify="left")
+    columns = (
+        ("driven [mm]", "driven_m", 1e3, 1),
+        ("depth [mm]", "depth_m", 1e3, 1),
+        ("impulse [N s]", "impulse_Ns", 1.0, 2),
+        ("peak force [N]", "peak_force_N", 1.0, 0),
+        ("speed [m/s]", "hand_speed_m_s", 1.0, 2),
+        ("solved in [s]", "solve_seconds", 1.0, 1),
+    )
+    for name in ("blow", *(label for label, *_ in columns)):
+        table.add_column(name, justify="right")
+    for k, blow in enumerate(series["blows"], start=1):
+        table.add_row(str(k), *(f"{scale * blow[key]:.{n}f}" for _, key, scale, n in columns))
     return table

@@ -27,10 +27,10 @@ LAYERS = (
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),
     ("reference", "cases"),
-    ("solution", "baseline", "planner", "robustness"),
+    ("solution", "baseline", "planner", "blows", "robustness"),
     ("problem_file", "output", "replay", "sweep"),
     ("plotting", "report", "screen"),
-    ("plain_errors", "bench", "reproduce", "_validate_command", "cli", "__main__"),
+    ("plain_errors", "bench", "reproduce", "_validate_command", "_drive_command", "cli", "__main__"),
 )
 RANK = {room: rank for rank, room in enumerate(room for layer in LAYERS for room in layer)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.

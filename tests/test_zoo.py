@@ -16,7 +16,9 @@ from small_plans import planned, transcribed
 
 from impactopt import Tool, arm7, load_problem, load_robot, planar_arm, problem_names, robot_names, standin
 from impactopt._arms import ARM7, arm_model
+from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
+from impactopt.objectives import Impulse
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.problem_file import names, read_problem_file
 from impactopt.robot import Robot
@@ -146,6 +148,11 @@ def test_the_seven_joint_arm_has_the_public_numbers() -> None:
 def test_an_arm_plans_and_both_engines_replay_it() -> None:
     problem = dataclasses.replace(
         load_problem("arm_planar"),
+        law=SpringDamper(stiffness=1e5, damping=100.0),
+        target=FreeMass(mass=2.0),
+        contact_duration=(0.003, 0.01),
+        objectives=(Impulse(),),
+        terms=(),
         swing=Phase(duration=0.4, intervals=6),
         follow=Phase(duration=0.6, intervals=6),
     )

@@ -1,0 +1,63 @@
+"""The command `impactopt drive`: blows on a nail until it is in."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.plain_errors import plain_errors
+
+NOT_IN = 1  # exit code
+
+
+def drive(
+    problem: Annotated[
+        str, typer.Argument(metavar="PROBLEM", help="Name or file of a problem with a nail, such as nailing.")
+    ],
+    depth: Annotated[float, typer.Option(metavar="M", help="How deep the nail is to go.")] = 0.05,
+    most: Annotated[int, typer.Option(metavar="N", help="Blows at most.", min=1)] = 20,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write blows.json there.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON, no table.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Plan blow after blow on a nail, each where the one before has left it, until it is in.
+
+    Exit code: 0 it is in, 1 it is not, 2 bad input.
+    """
+    with plain_errors("interrupted before the nail was in") as console:
+        from impactopt.blows import drive_nail
+        from impactopt.output import make_directory, plain, write_file
+        from impactopt.problem_file import read_problem_file
+        from impactopt.screen import Progress, blows_table
+
+        read = read_problem_file(problem)
+        directory = None if out is None else make_directory(out)
+        name = read.solver.name
+        with Progress(console, quiet=quiet) as progress:
+            series = drive_nail(
+                read.build(),
+                depth=depth,
+                most=most,
+                report=progress.say,
+                solver=name,
+                options=read.solver.options.get(name),
+                time_limit=read.solver.time_limit,
+            )
+        done = plain(series.describe())
+        text = json.dumps(done, indent=2)
+        if directory is not None:
+            write_file(directory / "blows.json", lambda file: file.write(f"{text}\n".encode()))
+        if as_json:
+            typer.echo(text)
+        else:
+            from rich.console import Console
+
+            Console().print(blows_table(done))
+            typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
+        if not series.done:
+            raise typer.Exit(NOT_IN)

@@ -15,7 +15,7 @@ NOT_IN = 1  # exit code
 
 def drive(
     problem: Annotated[
-        str, typer.Argument(metavar="PROBLEM", help="Name or file of a problem with a nail, such as nailing.")
+        str, typer.Argument(metavar="PROBLEM", help="Name or file of a problem with a nail, such as arm7.")
     ],
     depth: Annotated[float, typer.Option(metavar="M", help="How deep the nail is to go.")] = 0.05,
     most: Annotated[int, typer.Option(metavar="N", help="Blows at most.", min=1)] = 20,

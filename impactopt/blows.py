@@ -92,7 +92,7 @@ def drive_nail(
             f"the nail is {nail.depth:g} m deep already; give a depth beyond that, not {depth:g} m"
         )
     blows: list[Blow] = []
-    at, x = nail.depth, options.pop("start", None)
+    at, x = nail.depth, options.pop("start", "reach")
     while at < depth:
         if len(blows) == most:
             return Series(blows=tuple(blows), reason=f"the nail is not in yet at {1e3 * at:.1f} mm")
@@ -102,8 +102,8 @@ def drive_nail(
             target=dataclasses.replace(nail, depth=at),
         )
         solution = solve(here, start=x, report=report, **options)
-        if x is not None and not solution.status.usable:  # from a plain reach, then
-            solution = solve(here, start=None, report=report, **options)
+        if not isinstance(x, str) and not solution.status.usable:  # from a plain reach, then
+            solution = solve(here, start="reach", report=report, **options)
         if not solution.status.usable:
             why = f"blow {len(blows) + 1} has no plan: {solution.result.message}"
             return Series(blows=tuple(blows), reason=why)

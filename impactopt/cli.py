@@ -1,4 +1,4 @@
-"""The command line: `impactopt solve`, `validate`, `check`, `problems`, `robots`, and what it gathers.
+"""The command line: `impactopt solve`, `strike`, `check`, `problems`, `robots`, and what it gathers.
 
 What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
 Exit codes: 0 solved, 1 not solved, or fallen in a replay, 2 bad input.
@@ -13,7 +13,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from impactopt._command_options import (
+    NOT_SOLVED,
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Seed,
+    SolverName,
+    Starts,
+    TimeLimit,
+    check_time_limit,
+)
 from impactopt._drive_command import drive
+from impactopt._strike_command import strike
 from impactopt._validate_command import validate
 from impactopt.bench.command import app as bench_app
 from impactopt.plain_errors import plain_errors
@@ -28,7 +40,6 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
-NOT_SOLVED = 1
 WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
 
 app = typer.Typer(
@@ -42,14 +53,10 @@ app = typer.Typer(
 
 app.add_typer(bench_app)
 
-ProblemPath = Annotated[
-    Path, typer.Argument(metavar="PROBLEM", help="Its name, as `impactopt problems` lists them, or its file.")
-]
 
-
-class Solver(str, enum.Enum):
-    ipopt = "ipopt"
-    sqp = "sqp"
+class Start(str, enum.Enum):
+    reach = "reach"
+    strike = "strike"
 
 
 def main() -> None:
@@ -73,12 +80,13 @@ def solve(
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
     ] = None,
-    solver: Annotated[Solver | None, typer.Option(help="Instead of the one that the file names.")] = None,
-    time_limit: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Stop the solver then; keep its best iterate.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    solver: SolverName = None,
+    start: Annotated[Start, typer.Option(help="A plain reach, or the hardest strike near it.")] = Start.reach,
+    starts: Starts = 1,
+    seed: Seed = 0,
+    time_limit: TimeLimit = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
     validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
     baseline: Annotated[
         bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach in the same limits.")
@@ -94,8 +102,7 @@ def solve(
         from impactopt.problem_file import read_problem_file
         from impactopt.screen import Progress
 
-        if time_limit is not None and not time_limit > 0:
-            raise typer.BadParameter(f"{time_limit:g}; give seconds > 0", param_hint="--time-limit")
+        check_time_limit(time_limit)
         read = read_problem_file(file)
         chosen = solver.value if solver is not None else read.solver.name
         with Progress(console, quiet=quiet) as progress:
@@ -106,6 +113,9 @@ def solve(
             solution = plan(
                 problem,
                 solver=chosen,
+                start=start.value,
+                starts=starts,
+                seed=seed,
                 options=read.solver.options.get(chosen),
                 time_limit=time_limit if time_limit is not None else read.solver.time_limit,
                 report=progress.say,
@@ -122,6 +132,7 @@ def solve(
             raise typer.Exit(NOT_SOLVED)
 
 
+app.command()(strike)
 app.command()(validate)
 app.command()(drive)
 app.command()(reproduce)
@@ -231,7 +242,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         return
     from rich.console import Console
 
-    from impactopt.screen import result_table, violation_table
+    from impactopt.screen import result_table, starts_table, violation_table
 
     console, summary = Console(), record.summary
     if record.completed:
@@ -246,6 +257,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     for text in (summary.get("note"), summary.get("simulated", {}).get("error"), reach.get("error")):
         if text:
             console.print(text, markup=False, highlight=False)
+    if len(summary["starts"]) > 1:
+        console.print(starts_table(summary["starts"]))
     if summary["violations"]:
         console.print(violation_table(summary["violations"]))
     console.print(

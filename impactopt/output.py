@@ -22,7 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.problem import ImpactProblem
+from impactopt.program import SolverResult
 from impactopt.solution import Solution
+from impactopt.strike import StrikeSolution
+from impactopt.support import support_polygon
 
 __all__ = [
     "Record",
@@ -30,6 +34,7 @@ __all__ = [
     "make_directory",
     "plain",
     "record_of",
+    "record_of_strike",
     "replay_arrays",
     "save_record",
     "write_file",
@@ -89,16 +94,7 @@ def record_of(
     no `reference_*`, and a summary without the motion's numbers and with a `note` that says why.
     """
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
-    arrays: dict[str, Any] = {
-        "joints": np.array(robot.joint_names),
-        "torque_limit": robot.torque_limit,
-        "velocity_limit": robot.velocity_limit,
-        "polygon": plan.polygon,
-    }
-    for leg in plan.coordinates.legs:
-        corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
-        world = corners @ leg.placement.rotation.T + leg.placement.translation
-        arrays[f"sole_{leg.sole.name}"] = world[:, :2]
+    arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
     parts |= {"collision": plan.collision, "solver": result}
     summary = _summary(solution, simulation, replay)
@@ -112,13 +108,48 @@ def record_of(
         arrays |= replay_arrays(replay)
     for prefix in {"reference", "simulated"} & parts.keys():
         arrays[f"{prefix}_angle"] = np.array([robot.joint_positions(q) for q in parts[prefix].q])
-    for prefix, thing in parts.items():
-        arrays |= {f"{prefix}_{name}": value for name, value in _numbers(thing).items()}
-    if result.history:
-        history = [_numbers(iteration) for iteration in result.history]
-        arrays |= {f"history_{name}": [row[name] for row in history] for name in history[0]}
+    arrays |= _parts_arrays(parts, result)
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     return Record(summary=plain(summary), problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def record_of_strike(
+    solution: StrikeSolution, *, problem: str = "", problem_path: Path | None = None
+) -> Record:
+    """The record of a strike: as of a solution, with `strike_*` (`PlannedStrike`) and no motion."""
+    hit = solution.strike
+    parts = {"strike": hit, "collision": hit.collision, "solver": solution.result}
+    arrays = _scene_arrays(solution.problem) | _parts_arrays(parts, solution.result)
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    summary = plain(solution.summary())
+    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
+    """What a record keeps of the robot and of where it stands."""
+    robot, c = problem.robot, problem.coordinates
+    out: dict[str, Any] = {
+        "joints": np.array(robot.joint_names),
+        "torque_limit": robot.torque_limit,
+        "velocity_limit": robot.velocity_limit,
+        "polygon": support_polygon(robot, c),
+    }
+    for leg in c.legs:
+        corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
+        world = corners @ leg.placement.rotation.T + leg.placement.translation
+        out[f"sole_{leg.sole.name}"] = world[:, :2]
+    return out
+
+
+def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, Any]:
+    """Numbers of dataclasses under their prefixes, and the solver's history."""
+    out: dict[str, Any] = {}
+    for prefix, thing in parts.items():
+        out |= {f"{prefix}_{name}": value for name, value in _numbers(thing).items()}
+    if result.history:
+        history = [_numbers(iteration) for iteration in result.history]
+        out |= {f"history_{name}": [row[name] for row in history] for name in history[0]}
+    return out
 
 
 def replay_arrays(replay: Any) -> dict[str, Any]:

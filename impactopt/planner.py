@@ -7,27 +7,28 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, did_you_mean
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.start import first_iterate
+from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.nlp.start import first_iterate, iterate_from_strike, strike_iterate
+from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
 from impactopt.problem import ImpactProblem
-from impactopt.program import Callback, NonlinearProgram, SolverResult, worst_rows
+from impactopt.program import Callback
 from impactopt.solution import Solution
-from impactopt.sqp import SQPOptions, solve_sqp
+from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, solve_from
 
-SOLVERS = ("ipopt", "sqp")
-VIOLATED = 1e-4  # rows beyond this are named
-NAMED = 20  # at most
+Array = NDArray[np.float64]
+STARTS = ("reach", "strike")
 
 
 def solve(
     problem: ImpactProblem,
     *,
     solver: str = "ipopt",
-    start: ArrayLike | None = None,
+    start: str | ArrayLike = "reach",
+    starts: int = 1,
+    seed: int = 0,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
     report: Callable[[str], None] | None = None,
@@ -36,9 +37,12 @@ def solve(
     """Plan the motion that hits hardest within the problem's terms.
 
     solver : "ipopt" (exact Hessian, the dependable one) or "sqp" (ours, on OSQP).
-    start (n,) : solver variables to start from, such as ``solution.result.x`` of a neighbouring problem;
-        default: a plain reach.
-    options : the solver's own.  time_limit [s] : of the solver.
+    start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
+        a reach, which is a program of its own (:func:`impactopt.optimize_strike`); or solver variables (n,),
+        such as ``solution.result.x`` of a neighbouring problem.
+    starts : so many of them, the first one plain, the others with perturbed postures and other speeds, drawn
+        by ``seed``; the best motion is kept, ``Solution.attempts`` tells of all.
+    options : the solver's own.  time_limit [s] : of the solver, for all starts together.
     report : told in words what is being built; callback : called with every iteration's record; returning
         True, or Ctrl-C, stops with the best iterate.
 
@@ -46,46 +50,38 @@ def solve(
 
     Raises
     ------
-    InputError : unknown solver or option, a start of the wrong length.
+    InputError : unknown solver, option or start, a start of the wrong length, several of a given start.
     """
-    if solver not in SOLVERS:
-        raise InputError(
-            f"unknown solver {solver!r}{did_you_mean(solver, SOLVERS)}: there are {', '.join(SOLVERS)}"
-        )
+    check_solver(solver)
+    check_starts(starts, seed, given=not isinstance(start, str))
+    given = start if isinstance(start, str) else check_array("start", start, (None,))
+    if isinstance(given, str) and given not in STARTS:
+        near = did_you_mean(given, STARTS)
+        raise InputError(f"unknown start {given!r}{near}: give 'reach', 'strike' or solver variables (n,)")
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report)
-    transcription = Transcription(problem, problem.coordinates, functions)
-    program = transcription.program
-    x0 = first_iterate(transcription) if start is None else np.asarray(start, dtype=float)
-    built = time.perf_counter()
+    t = Transcription(problem, problem.coordinates, functions)
     if report is not None:
-        report(f"program of {program.n} variables and {program.m} rows; {solver} starts")
-    result = _run(program, x0, solver, options, time_limit, callback)
-    solved = time.perf_counter()
-    found = program.constraints(result.x)
-    return Solution(
-        problem=problem,
-        plan=transcription.decode(result.x),
-        result=result,
-        solver=solver,
-        build_seconds=built - began,
-        solve_seconds=solved - built,
-        violations=tuple(worst_rows(program, result.x, found, tolerance=VIOLATED, count=NAMED)),
-        objectives=transcription.achieved(result.x),
-    )
+        report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
+    fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began)
+    return Solution(plan=t.decode(fields["result"].x), **fields)
 
 
-def _run(
-    program: NonlinearProgram,
-    x0: Any,
-    solver: str,
-    options: Mapping[str, Any] | None,
-    time_limit: float | None,
-    callback: Callback | None,
-) -> SolverResult:
-    if solver == "ipopt":
-        return solve_ipopt(program, x0, options=options, callback=callback, time_limit=time_limit)
-    settings = dict(options or {})
-    if time_limit is not None:
-        settings["time_limit"] = time_limit
-    return solve_sqp(program, x0, options=SQPOptions(**settings), callback=callback)
+def _starts(t: Transcription, start: str | Array, starts: int, seed: int, budget: Budget) -> Starts:
+    """Names of the starts, and what makes them."""
+    if not isinstance(start, str):
+        yield "given", lambda: start
+        return
+    strike = None
+    if start == "strike":
+        strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
+    for k, draw in enumerate(drawn(starts, seed)):
+
+        def make(draw: dict[str, Any] = draw) -> Array:
+            if strike is None:
+                return first_iterate(t, **draw)
+            hit = budget.run(strike.program, strike_iterate(strike, **draw))
+            return iterate_from_strike(t, strike, hit.x)
+
+        yield f"{start} {k + 1}", make

@@ -15,9 +15,18 @@ from rich.table import Table
 
 from impactopt.program import IterationRecord
 
-__all__ = ["Progress", "blows_table", "replay_table", "result_table", "violation_table"]
+__all__ = [
+    "Progress",
+    "blows_table",
+    "replay_table",
+    "result_table",
+    "starts_table",
+    "strike_table",
+    "violation_table",
+]
 
 PHASES = ("swing", "collision", "follow")
+PHASES_OF_STRIKE = ("contact", "collision")
 QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
 
 
@@ -81,13 +90,36 @@ def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table
     return _table(summary, {"planned": summary, name: _by_phase(report)})
 
 
+def strike_table(summary: Mapping[str, Any]) -> Table:
+    """The planned blow; `summary` as of a :class:`impactopt.StrikeSolution`."""
+    table = _table(summary, {"planned": summary}, PHASES_OF_STRIKE)
+    if "capture_margin_m" in summary:
+        margin = summary["capture_margin_m"]
+        _row(table, "capture point's margin after contact [mm]", [margin], 1, scale=1e3, least=-1e-6)
+    return table
+
+
+def starts_table(starts: Sequence[Mapping[str, Any]]) -> Table:
+    """What came of each start; `starts` as in a summary."""
+    table = Table(title="starts", title_justify="left")
+    for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
+        table.add_column(name, justify="left" if name in ("start", "status") else "right")
+    for start in starts:
+        name, numbers = str(start["start"]), (start["impulse_Ns"], start["iterations"], start["seconds"])
+        cells = (f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 0, 1), strict=True))
+        table.add_row(f"{name}, kept" if start["kept"] else name, str(start["status"]), *cells)
+    return table
+
+
 def _by_phase(report: Mapping[str, Any]) -> dict[str, Any]:
     """A report with its numbers by phase, named as in a summary."""
     names = {"zmp_margin_m": "zmp_margin_by_phase_m", "torque_ratio": "torque_ratio_by_phase"}
     return {**report, **{name: report.get(other) or {} for name, other in names.items()}} if report else {}
 
 
-def _table(summary: Mapping[str, Any], sources: Mapping[str, Mapping[str, Any]]) -> Table:
+def _table(
+    summary: Mapping[str, Any], sources: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
+) -> Table:
     """A column for each source that says something; the first is the plan's."""
     columns = {name: source for name, source in sources.items() if source and "error" not in source}
     table = Table(title=escape(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
@@ -105,7 +137,7 @@ def _table(summary: Mapping[str, Any], sources: Mapping[str, Mapping[str, Any]])
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
     ):
-        for phase in PHASES:
+        for phase in phases:
             values = [source.get(key, {}).get(phase) for source in columns.values()]
             _row(table, f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
     replays = list(columns.values())[1:]

@@ -14,35 +14,63 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.plan import Plan, Trajectory
+from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
 from impactopt.program import SolverResult, Status, Violation
+from impactopt.starts import Attempt
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Solution:
-    """A solved (or stopped) impact problem.
+class Solved:
+    """What a solved (or stopped) program of a problem is told by.
 
-    plan : the motion; for a status that is not usable, that of the best iterate.
-    result : the solver's own record, its history included.
-    build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver.
+    result : the solver's own record, its history included; of the best start.
+    build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver,
+        from all starts.
     violations : what is not met, worst first.
     objectives : what each of the problem's objectives comes to, by name, in its own unit.
+    attempts : what came of each start.
     """
 
     problem: ImpactProblem
-    plan: Plan
     result: SolverResult
     solver: str
     build_seconds: float
     solve_seconds: float
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
+    attempts: tuple[Attempt, ...] = ()
 
     @property
     def status(self) -> Status:
         return self.result.status
+
+    def outcome(self) -> dict[str, Any]:
+        """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""
+        return {
+            "status": self.status.value,
+            "message": self.result.message,
+            "solver": self.solver,
+            "iterations": self.result.iterations,
+            "solve_seconds": self.solve_seconds,
+            "build_seconds": self.build_seconds,
+            "max_violation": self.result.max_violation,
+            "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
+            "starts": [attempt.summary() for attempt in self.attempts],
+            "problem": self.problem.describe(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution(Solved):
+    """A solved (or stopped) impact problem.
+
+    plan : the motion; for a status that is not usable, that of the best iterate.  The rest: :class:`Solved`.
+    """
+
+    plan: Plan
 
     @property
     def impulse(self) -> float:
@@ -75,32 +103,13 @@ class Solution:
             options.setdefault("missed", self.missed_trajectory)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
 
-    def outcome(self) -> dict[str, Any]:
-        """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""
-        return {
-            "status": self.status.value,
-            "message": self.result.message,
-            "solver": self.solver,
-            "iterations": self.result.iterations,
-            "solve_seconds": self.solve_seconds,
-            "build_seconds": self.build_seconds,
-            "max_violation": self.result.max_violation,
-            "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
-            "problem": self.problem.describe(),
-        }
-
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan
         out: dict[str, Any] = {
             **self.outcome(),
-            "impulse_Ns": plan.impulse,
+            **blow_numbers(plan),
             "objectives": dict(self.objectives),
-            "target": plan.collision.outcome,
-            # a plan of an impact without duration knows no force
-            "peak_force_N": float(plan.collision.force.max()) if len(plan.collision.ground) else None,
-            "contact_ms": 1e3 * (plan.compression + plan.restitution),
-            "hand_speed_m_s": plan.hand_speed,
             "duration_s": plan.duration,
             **plan.margins(self.trajectory),
             "versions": versions(),
@@ -118,6 +127,18 @@ class Solution:
         if replay is not None:
             out["replayed"] = replay.report(**known)
         return out
+
+
+def blow_numbers(hit: Plan | PlannedStrike) -> dict[str, Any]:
+    """What ``summary.json`` says of a planned blow; one without duration knows no force."""
+    duration = hit.compression + hit.restitution
+    return {
+        "impulse_Ns": hit.impulse,
+        "target": hit.collision.outcome,
+        "peak_force_N": float(hit.collision.force.max()) if duration > 0 else None,
+        "contact_ms": 1e3 * duration,
+        "hand_speed_m_s": hit.hand_speed,
+    }
 
 
 def versions() -> dict[str, str]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from derivative_checks import check_derivatives
 from numpy.typing import NDArray
 from small_plans import LAW, Planned, changed
 
@@ -71,27 +72,9 @@ def test_the_first_iterate_is_inside_its_bounds_and_finite_in_all_rows(transcrip
 
 @pytest.mark.parametrize("away", [0.0, 0.02], ids=["at the first iterate", "near it"])
 def test_jacobian_and_hessian_agree_with_differences(transcription: Transcription, away: float) -> None:
-    """Along dense random directions, in which every entry has its part."""
-    program, rng = transcription.program, np.random.default_rng(0)
-    x = first_iterate(transcription) + away * rng.standard_normal(program.n)
-    y, sigma, h = rng.standard_normal(program.m), 0.7, 1e-6
-
-    def slope(at: Array) -> Array:
-        return np.asarray(sigma * program.gradient(at) + program.jacobian(at).T @ y)
-
-    jacobian, hessian = program.jacobian(x), program.hessian(x, sigma, y)
-    assert abs(hessian - hessian.T).max() < 1e-9 * abs(hessian).max()
-    for _ in range(3):
-        d = rng.standard_normal(program.n)
-        of_rows = (program.constraints(x + h * d) - program.constraints(x - h * d)) / (2 * h)
-        # against the terms that a row or a column adds up, not against their sum
-        size = abs(jacobian) @ np.abs(d)
-        assert (np.abs(jacobian @ d - of_rows) <= 1e-6 * size + 1e-6).all()
-        of_slope = (slope(x + h * d) - slope(x - h * d)) / (2 * h)
-        size = abs(hessian) @ np.abs(d)
-        assert (np.abs(hessian @ d - of_slope) <= 1e-5 * size + 1e-5 * size.max()).all()
-        of_f = (program.objective(x + h * d) - program.objective(x - h * d)) / (2 * h)
-        assert of_f == pytest.approx(program.gradient(x) @ d, rel=1e-6, abs=1e-6)
+    program = transcription.program
+    x = first_iterate(transcription)
+    check_derivatives(program, x + away * np.random.default_rng(0).standard_normal(program.n))
 
 
 def test_every_row_and_every_variable_has_a_name_of_its_own(transcription: Transcription) -> None:

@@ -44,8 +44,11 @@ class ContactProgram(Builder):
     contact_legs: Affine
     contact_w: Affine
 
-    def _hit(self, *, after: bool) -> None:
-        """Variables of the hit; ``after``: the position after the expected one is among them."""
+    def _hit(self, *, after: bool, rates: dict[str, Any] | None = None) -> None:
+        """Variables of the hit.
+
+        after : the position after the expected one is among them.  rates : bounds of the rates at contact.
+        """
         p, labels = self.problem, self.coordinates.labels
         self.stages = contact_mesh(p)
         compression, restitution, _ = p.law.formula()
@@ -55,7 +58,7 @@ class ContactProgram(Builder):
         self.feedforward = self.layout.add(
             "feed-forward at contact", 1, self.robot.n, lower=-limit, upper=limit, labels=names
         )
-        self.u0 = self.layout.add("rate at contact", 1, self.ny, labels=labels)
+        self.u0 = self.layout.add("rate at contact", 1, self.ny, labels=labels, **(rates or {}))
         self.angular_momentum: Group | None = None  # after contact, if an objective asks for it
         self.scenarios: list[Collision] = []
         self.expected: Collision | InstantImpact
@@ -242,6 +245,10 @@ class ContactProgram(Builder):
         """What the objectives' quantities come to, by their names, for solver variables (n,)."""
         return {o.name: quantity.evaluate(x) for o, quantity in self.objectives}
 
+    def impulse(self, x: Array) -> float:
+        """To the expected target [N s], for solver variables (n,)."""
+        return float(self.expected.impulse.evaluate(x)[0])
+
     def _decode_hit(self, x: Array) -> dict[str, Any]:
         """What plans and strikes say of the contact, for solver variables (n,)."""
         outputs = self.program.outputs(x)
@@ -261,6 +268,6 @@ class ContactProgram(Builder):
             "restitution": restitution,
             "collision": self.expected.decode(x, outputs, approach),
             "hand_speed": approach,
-            "impulse": float(self.expected.impulse.evaluate(x)[0]),
+            "impulse": self.impulse(x),
             "scenarios": tuple(scenarios),
         }

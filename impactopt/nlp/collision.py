@@ -7,10 +7,12 @@ feed-forward and the servo; durations, motion, force and wrenches are each one's
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impactopt.errors import InputError
 from impactopt.nlp.blocks import FORCE_SCALE, typical_state
 from impactopt.nlp.guess import blow, effective_mass
 from impactopt.nlp.layout import Affine, Array, Group
@@ -308,7 +310,8 @@ class Collision:
             self.legs.write(x, legs)
             self.w.write(x, t.contact_w.evaluate(x))
             for k, at in enumerate(elapsed):
-                legs = c.solve_legs(y + rates * at, legs)
+                with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+                    legs = c.solve_legs(y + rates * at, legs)
                 v = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)[1]
                 x[self.coast_legs.index(k)], x[self.coast_rates.index(k)] = legs, v[c.base + c.dependent]
 

@@ -139,11 +139,20 @@ def assemble(
     return objective, prices.quadratic + sp.diags_array(diagonal), prices.linear
 
 
+def wrench_prices(t: ContactProgram, groups: list[tuple[Group, int]]) -> Array:
+    """Diagonal (n,) of the price of sole wrenches: the mean of so many nodes as each group comes with."""
+    diagonal = np.zeros(t.layout.n)
+    for group, nodes in groups:
+        span = slice(group.offset, group.offset + group.count * group.size)
+        diagonal[span] = t.problem.wrench_price / max(1, nodes)
+    return diagonal
+
+
 def motion_prices(t: Transcription) -> Prices:
     """Of accelerations, of sole wrenches and of ending away from the start posture."""
     p, n = t.problem, t.layout.n
     quadratic = sp.csr_array((n, n))
-    linear, diagonal = np.zeros(n), np.zeros(n)
+    linear, diagonal, constant = np.zeros(n), np.zeros(n), 0.0
     for control, breaks, nodes, bounds in (
         (t.swing_control, t.swing_breaks, t.swing_nodes, p.swing.duration),
         *((f.control, t.follow_breaks, t.follow_nodes, p.follow.duration) for f in t.follows),
@@ -156,12 +165,12 @@ def motion_prices(t: Transcription) -> Prices:
             m = acc.matrix(n)
             quadratic = quadratic + 2 * weight * (m.T @ m)
             linear += 2 * weight * (m.T @ acc.const)
-    for group in (t.swing_w, t.coast_w, *[part.w for part in (*t.follows, *t.collisions)]):
-        span = slice(group.offset, group.offset + group.count * group.size)
-        diagonal[span] = p.wrench_price / max(1, group.count)
+            constant += weight * float(acc.const @ acc.const)
+    groups = (t.swing_w, t.coast_w, *[part.w for part in (*t.follows, *t.collisions)])
+    diagonal += wrench_prices(t, [(group, group.count) for group in groups])
     for follow in t.follows:  # price (y_end - y_start)^2: rest near the start posture
         end = follow.c.index(-1)
         diagonal[end] += 2 * p.return_price
         linear[end] -= 2 * p.return_price * t.y0
-    away = len(t.follows) * p.return_price * float(t.y0 @ t.y0)
-    return Prices(quadratic + sp.diags_array(diagonal), linear, away)
+        constant += p.return_price * float(t.y0 @ t.y0)
+    return Prices(quadratic + sp.diags_array(diagonal), linear, constant)

@@ -1,0 +1,84 @@
+"""The command `impactopt strike`: the hardest blow by itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt._command_options import (
+    NOT_SOLVED,
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Seed,
+    SolverName,
+    Starts,
+    TimeLimit,
+    check_time_limit,
+)
+from impactopt.plain_errors import plain_errors
+
+
+def strike(
+    file: ProblemPath,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Write numbers there."),
+    ] = None,
+    starts: Starts = 4,
+    seed: Seed = 0,
+    solver: SolverName = None,
+    time_limit: TimeLimit = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find the posture and velocity at contact that hit hardest, with no motion that leads to them.
+
+    From several starts, as local optima differ much. Exit code: 0 solved, 1 not solved, 2 bad input.
+    """
+    with plain_errors("interrupted before there was a strike to keep") as console:
+        from impactopt.output import make_directory, record_of_strike, save_record
+        from impactopt.problem_file import read_problem_file
+        from impactopt.screen import Progress
+        from impactopt.strike import optimize_strike
+
+        check_time_limit(time_limit)
+        read = read_problem_file(file)
+        chosen = solver.value if solver is not None else read.solver.name
+        with Progress(console, quiet=quiet) as progress:
+            progress.say(f"{read.path} is read; building the robot")
+            problem = read.build()
+            directory = None if out is None else make_directory(out)
+            progress.say("building the program (compiles for a minute or two the first time)")
+            solution = optimize_strike(
+                problem,
+                solver=chosen,
+                starts=starts,
+                seed=seed,
+                options=read.solver.options.get(chosen),
+                time_limit=time_limit if time_limit is not None else read.solver.time_limit,
+                report=progress.say,
+                callback=progress.iteration,
+            )
+            progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
+        record = record_of_strike(solution, problem=read.text, problem_path=read.path)
+        written = [] if directory is None else save_record(record, directory)
+        if as_json:
+            typer.echo(json.dumps(record.summary, indent=2))
+        else:
+            from rich.console import Console
+
+            from impactopt.screen import starts_table, strike_table, violation_table
+
+            shown = Console()
+            shown.print(strike_table(record.summary))
+            shown.print(starts_table(record.summary["starts"]))
+            if record.summary["violations"]:
+                shown.print(violation_table(record.summary["violations"]))
+            for path in written:
+                shown.print(str(path), highlight=False, markup=False, soft_wrap=True)
+        if not solution.status.usable:
+            raise typer.Exit(NOT_SOLVED)

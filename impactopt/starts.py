@@ -1,0 +1,159 @@
+"""One program from several starts: the problem has local optima, and the best of them is kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError, did_you_mean
+from impactopt.ipopt import solve_ipopt
+from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, worst_rows
+from impactopt.sqp import SQPOptions, solve_sqp
+
+if TYPE_CHECKING:
+    from impactopt.nlp.at_contact import ContactProgram
+
+Array = NDArray[np.float64]
+Starts = Iterable[tuple[str, Callable[[], Array]]]
+SOLVERS = ("ipopt", "sqp")
+VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
+NAMED = 20  # at most
+SPEEDS, NOISE = (0.5, 3.0), 0.15  # [m/s], [rad] that the starts beside the plain one are drawn with
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """What came of one start.
+
+    start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
+    """
+
+    start: str
+    status: Status
+    impulse: float
+    objective: float
+    max_violation: float
+    iterations: int
+    seconds: float
+    kept: bool = False
+
+    def summary(self) -> dict[str, Any]:
+        """As in ``summary.json``."""
+        return {
+            "start": self.start,
+            "status": self.status.value,
+            "impulse_Ns": self.impulse,
+            "objective": self.objective,
+            "max_violation": self.max_violation,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "kept": self.kept,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """A solver with its options, and the time [s] that is left for all that it is given; None: any."""
+
+    solver: str
+    options: Mapping[str, Any] | None
+    time_limit: float | None
+    callback: Callback | None
+    since: float = field(default_factory=time.perf_counter)
+
+    @property
+    def left(self) -> float | None:
+        """[s]"""
+        if self.time_limit is None:
+            return None
+        return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
+
+    def run(self, program: NonlinearProgram, x0: Array) -> SolverResult:
+        """Let the solver work on a program in the time that is left."""
+        left = self.left
+        if self.solver == "ipopt":
+            return solve_ipopt(program, x0, options=self.options, callback=self.callback, time_limit=left)
+        settings = dict(self.options or {})
+        if left is not None:
+            settings["time_limit"] = left
+        return solve_sqp(program, x0, options=SQPOptions(**settings), callback=self.callback)
+
+
+def check_solver(solver: str) -> None:
+    """InputError if there is no solver of this name."""
+    if solver not in SOLVERS:
+        raise InputError(
+            f"unknown solver {solver!r}{did_you_mean(solver, SOLVERS)}: there are {', '.join(SOLVERS)}"
+        )
+
+
+def check_starts(starts: int, seed: int, *, given: bool) -> None:
+    """InputError if these are no number of starts, or no seed; ``given``: the one start is given."""
+    for name, value, least in (("starts", starts, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise InputError(f"{name} is {value!r}; give a whole number >= {least}")
+    if given and starts > 1:
+        raise InputError(f"starts is {starts}, of one start that is given; leave one of the two out")
+
+
+def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
+    """Speed, noise and seed of each start's reach; the first one is the plain reach."""
+    rng = np.random.default_rng(seed)
+    others = [
+        {"speed": float(rng.uniform(*SPEEDS)), "noise": NOISE, "seed": int(rng.integers(2**31))}
+        for _ in range(starts - 1)
+    ]
+    return [{}, *others]
+
+
+def solve_from(t: ContactProgram, starts: Starts, budget: Budget, began: float) -> dict[str, Any]:
+    """The fields of a :class:`impactopt.solution.Solved` for the best result from these starts.
+
+    starts : name, and what makes its x (n,) when its turn comes. An interrupted solve is the last one, and so
+    is one after which no time is left.  began [s] : when work on the problem did.
+
+    Of those that meet their rows the one of least objective is best, else the one of least violation.
+    """
+    program, built = t.program, time.perf_counter()
+    results, attempts = list[SolverResult](), list[Attempt]()
+    for name, make in starts:
+        result = budget.run(program, make())
+        results.append(result)
+        attempts.append(
+            Attempt(
+                start=name,
+                status=result.status,
+                impulse=t.impulse(result.x),
+                objective=result.objective,
+                max_violation=result.max_violation,
+                iterations=result.iterations,
+                seconds=result.seconds,
+            )
+        )
+        if result.status is Status.INTERRUPTED or budget.left == 0:
+            break
+    order = [_rank(result) for result in results]
+    best = order.index(min(order))
+    attempts[best] = replace(attempts[best], kept=True)
+    result, solved = results[best], time.perf_counter()
+    rows = program.constraints(result.x)
+    return {
+        "problem": t.problem,
+        "result": result,
+        "solver": budget.solver,
+        "build_seconds": built - began,
+        "solve_seconds": solved - built,
+        "violations": tuple(worst_rows(program, result.x, rows, tolerance=VIOLATED, count=NAMED)),
+        "objectives": t.achieved(result.x),
+        "attempts": tuple(attempts),
+    }
+
+
+def _rank(result: SolverResult) -> tuple[bool, float]:
+    met = result.status.usable or result.max_violation <= VIOLATED
+    return not met, result.objective if met else result.max_violation

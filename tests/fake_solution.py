@@ -15,6 +15,7 @@ from impactopt.plan import Plan, PlannedCollision
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.program import IterationRecord, SolverResult, Status, Violation
 from impactopt.solution import Solution
+from impactopt.starts import Attempt
 from impactopt.statics import static_wrenches
 from impactopt.validation import Simulation
 
@@ -148,6 +149,7 @@ def still_solution(
     violations: tuple[Violation, ...] = (),
     kind: type[Solution] = FakeSolution,
     solver: str = "ipopt",
+    attempts: tuple[Attempt, ...] = (),
 ) -> Solution:
     problem = still_problem() if problem is None else problem
     worst = violations[0].amount if violations else 1e-9
@@ -180,4 +182,5 @@ def still_solution(
         build_seconds=0.2,
         solve_seconds=0.3,
         violations=violations,
+        attempts=attempts,
     )

@@ -22,6 +22,7 @@ from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile
 from impactopt.program import IterationRecord, Status, Violation
 from impactopt.solution import Solution
+from impactopt.starts import Attempt
 
 GOOD = """\
 [problem]
@@ -220,6 +221,21 @@ def test_options_go_over_the_file(planner: Planner, file: Path, tmp_path: Path) 
     run("solve", file, "--out", tmp_path / "out", "--solver", "sqp", "--time-limit", 3)
     assert (planner.options["solver"], planner.options["time_limit"]) == ("sqp", 3)
     assert planner.options["options"] == {"price": 50.0}, "the other solver's options are not its own"
+
+
+def test_starts_reach_the_solver_and_are_told(planner: Planner, file: Path, tmp_path: Path) -> None:
+    run("solve", file, "--out", tmp_path / "a")
+    assert [planner.options[name] for name in ("start", "starts", "seed")] == ["reach", 1, 0]
+    told: dict[str, Any] = {"status": Status.SOLVED, "max_violation": 0.0, "iterations": 7, "seconds": 1.5}
+    planner.solution["attempts"] = (
+        Attempt(start="strike 1", impulse=12.345, objective=-12.0, kept=True, **told),
+        Attempt(start="strike 2", impulse=3.21, objective=-3.0, **told),
+    )
+    out, _ = run("solve", file, "--out", tmp_path / "b", "--start", "strike", "--starts", 2, "--seed", 5)
+    assert [planner.options[name] for name in ("start", "starts", "seed")] == ["strike", 2, 5]
+    assert "strike 1, kept" in out and "12.35" in out and "strike 2, kept" not in out and "3.21" in out
+    summary = json.loads((tmp_path / "b" / "summary.json").read_text(encoding="utf-8"))
+    assert [start["kept"] for start in summary["starts"]] == [True, False]
 
 
 def test_an_infeasible_problem_names_its_rows_and_exits_1(

@@ -89,12 +89,14 @@ class NativeCode:
     ----------
     name : of the function.
     code : C, one translation unit.
-    graph : builds the same function as a graph, for where there is no compiler.
+    level : of optimization, as the compiler's flags.
+    graph : builds the function that takes its place where there is no compiler.
     """
 
     name: str
     code: str
     graph: Callable[[], ca.Function]
+    level: str = _NATIVE_LEVEL
 
 
 Buildable = Any  # ca.Function or NativeCode
@@ -239,7 +241,7 @@ def _build_entry(
 def _c_code(function: Buildable) -> tuple[str, str, str]:
     """Name, C code and optimization level of a function."""
     if isinstance(function, NativeCode):
-        return function.name, function.code, _NATIVE_LEVEL
+        return function.name, function.code, function.level
     name = str(function.name())
     generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
     generator.add(function)
@@ -275,7 +277,7 @@ def _library(
 def _longest_body(function: Buildable) -> int:
     """Instructions in the longest of the C functions that `function` becomes."""
     if isinstance(function, NativeCode):
-        return _MAX_OPTIMIZED
+        return function.code.count("\n")
     parts = [function, *function.find_functions()]
     return max(
         (int(f.n_instructions()) for f in parts if f.class_name() in ("SXFunction", "MXFunction")), default=0

@@ -17,43 +17,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
+from impactopt.nlp.batched import BatchedFunction
 from impactopt.nlp.layout import Affine, Array, Layout, stack
 from impactopt.nlp.rows import Index, Rows
-
-THREADS = 2
-
-
-class BatchedFunction:
-    """A CasADi function over ``count`` columns, called through its buffer: no copies, no Python lists."""
-
-    def __init__(self, function: Any, count: int) -> None:
-        self._mapped = function.map(count, "thread", THREADS) if count > 1 else function
-        self._buffer, self._run = self._mapped.buffer()
-        self.inputs = [np.zeros((count, function.size1_in(i))) for i in range(function.n_in())]
-        self.output = np.zeros((count, function.nnz_out(0)))
-        for i, a in enumerate(self.inputs):
-            if a.size:
-                self._buffer.set_arg(i, a.data)
-        if self.output.size:
-            self._buffer.set_res(0, self.output.data)
-
-    def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
-        """Rows are instances: z (count, n_z) -> (count, nnz of the output).
-
-        The result is overwritten by the next call.
-        """
-        self.inputs[0][...] = z
-        if multipliers is not None:
-            self.inputs[2][...] = multipliers
-        self._run()
-        return self.output
-
-
-def pattern(sparsity: Any) -> tuple[Index, Index]:
-    """Rows and columns of a CasADi sparsity's nonzeros, in its (column-major) order."""
-    start = np.array(sparsity.colind(), dtype=np.intp)
-    columns = np.repeat(np.arange(sparsity.size2()), start[1:] - start[:-1])
-    return np.array(sparsity.row(), dtype=np.intp), columns
 
 
 @dataclass
@@ -79,7 +45,7 @@ class Block:
         instances: Sequence[Sequence[Affine]],
         parameters: ArrayLike,
     ) -> Block:
-        """``instances``: the slots that make up z, one list an instance.
+        """``functions``: of one instance, or `in_lanes`; ``instances``: of each, the slots that make up z.
 
         ``parameters``: (n_p,) for all or (count, n_p).
         """
@@ -91,9 +57,7 @@ class Block:
                 raise ValueError(f"block {name} takes {n_in} inputs, was given {lift.size}")
         count = len(lifts)
         p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))
-        value, jacobian, hessian = (BatchedFunction(function, count) for function in (f, j, h))
-        for batched in (value, jacobian, hessian):
-            batched.inputs[1][...] = p
+        value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
         return cls(
             name=name,
             value=value,
@@ -103,8 +67,8 @@ class Block:
             n_out=n_out,
             count=count,
             lift=stack(lifts),
-            jac_pattern=pattern(j.sparsity_out(0)),
-            hess_pattern=pattern(h.sparsity_out(0)),
+            jac_pattern=jacobian.pattern,
+            hess_pattern=hessian.pattern,
         )
 
 
@@ -181,16 +145,11 @@ class StructuredProgram:
         key, slot = np.unique(c.astype(np.int64) * self.m + r, return_inverse=True)
         self._jac_rows, jac_cols = (key % self.m).astype(np.int32), key // self.m
         self._jac_indptr = np.searchsorted(jac_cols, np.arange(self.n + 1)).astype(np.int32)
-        self._jac_map = sp.csr_array(
-            (
-                np.concatenate(s_all or [np.zeros(0)]),
-                (slot[:nonlinear], np.concatenate(e_all or [np.zeros(0, int)])),
-            ),
-            shape=(len(key), start),
-        )
+        self._jac_map = _sums(slot[:nonlinear], e_all, s_all, (len(key), start))
         self._jac_const = np.bincount(slot[nonlinear:], lin.data, len(key))
 
     def _build_hessian(self) -> None:
+        """The map gives the lower triangle; the whole is taken from that."""
         r_all, c_all, e_all, s_all, start = [], [], [], [], 0
         for b, z0 in zip(self.blocks, self._z_offset, strict=False):
             hr, hc = b.hess_pattern  # lower triangle
@@ -202,26 +161,28 @@ class StructuredProgram:
             o1, i1, s1 = self._expand(zr)
             o2, i2, s2 = self._expand(zc[o1])
             r, c, s, e = i1[o2], i2, s1[o2] * s2, entry[o1[o2]]
+            # an entry below the diagonal of z stands for the one above it too: for (r, c) and (c, r) of x
             off = (zr != zc)[o1[o2]]
-            r_all += [r, c[off]]
-            c_all += [c, r[off]]
-            e_all += [e, e[off]]
-            s_all += [s, s[off]]
-        q = self._Q.tocoo()
+            s = np.where(off & (r == c), 2 * s, s)
+            keep = off | (r >= c)
+            r_all.append(np.maximum(r, c)[keep])
+            c_all.append(np.minimum(r, c)[keep])
+            e_all.append(e[keep])
+            s_all.append(s[keep])
+        q = sp.tril(self._Q).tocoo()
         r = np.concatenate([*r_all, q.coords[0]])
         c = np.concatenate([*c_all, q.coords[1]])
         nonlinear = sum(len(x) for x in r_all)
         key, slot = np.unique(c.astype(np.int64) * self.n + r, return_inverse=True)
-        self._hess_rows, hess_cols = (key % self.n).astype(np.int32), key // self.n
-        self._hess_indptr = np.searchsorted(hess_cols, np.arange(self.n + 1)).astype(np.int32)
-        self._hess_map = sp.csr_array(
-            (
-                np.concatenate(s_all or [np.zeros(0)]),
-                (slot[:nonlinear], np.concatenate(e_all or [np.zeros(0, int)])),
-            ),
-            shape=(len(key), start),
-        )
+        self._hess_map = _sums(slot[:nonlinear], e_all, s_all, (len(key), start))
         self._hess_const = np.bincount(slot[nonlinear:], q.data, len(key))
+        rows, cols = key % self.n, key // self.n
+        above = np.flatnonzero(rows != cols)
+        source = np.concatenate([np.arange(len(key)), above])
+        rows, cols = np.concatenate([rows, cols[above]]), np.concatenate([cols, rows[above]])
+        order = np.lexsort((rows, cols))
+        self._hess_source, self._hess_rows = source[order], rows[order].astype(np.int32)
+        self._hess_indptr = np.searchsorted(cols[order], np.arange(self.n + 1)).astype(np.int32)
 
     # ------------------------------------------------------------------ evaluation
     def _lifted(self, x: Array) -> list[Array]:
@@ -264,14 +225,15 @@ class StructuredProgram:
 
     def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
         t = time.perf_counter()
-        data = sigma * self._hess_const
+        lower = sigma * self._hess_const
         if self.blocks:
             lam = np.zeros(int(self._out_offset[-1]))
             lam[self._row_out[self._nonlinear]] = multipliers[self._nonlinear]
             parts = []
             for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
                 parts.append(b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out)).ravel())
-            data = data + self._hess_map @ np.concatenate(parts)
+            lower += self._hess_map @ np.concatenate(parts)
+        data = lower[self._hess_source]
         self.seconds += time.perf_counter() - t
         return sp.csc_array((data, self._hess_rows, self._hess_indptr), shape=(self.n, self.n))
 
@@ -289,6 +251,13 @@ class StructuredProgram:
 
     def variable_name(self, j: int) -> str:
         return self.layout.name(j)
+
+
+def _sums(slot: Index, entries: list[Index], factors: list[Array], shape: tuple[int, int]) -> sp.csr_array:
+    """The matrix that adds factor times entry to each slot; short indices, as reading it takes long."""
+    entry = np.concatenate([np.zeros(0, dtype=np.intp), *entries])
+    where = slot.astype(np.int32), entry.astype(np.int32)
+    return sp.csr_array((np.concatenate([np.zeros(0), *factors]), where), shape=shape)
 
 
 def derivative_functions(name: str, z: Any, p: Any, out: Any) -> list[Any]:

@@ -23,6 +23,7 @@ from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
+from impactopt.nlp.lanes import in_lanes
 from impactopt.nlp.layout import Affine, Array, Group, stack
 from impactopt.nlp.mesh import with_middles
 from impactopt.nlp.objective import Prices, motion_prices
@@ -65,7 +66,7 @@ def block_functions(
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
             b = block.build()
-            return derivative_functions(name, b.z, b.p, b.out)
+            return [in_lanes(function) for function in derivative_functions(name, b.z, b.p, b.out)]
 
         out |= cached(f"{robot.name}-{name}", (name, *recipe, *block.key), functions, report=report)
     return out

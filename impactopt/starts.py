@@ -23,7 +23,7 @@ Starts = Iterable[tuple[str, Callable[[], Array]]]
 SOLVERS = ("ipopt", "sqp")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
-SPEEDS, NOISE = (0.5, 3.0), 0.15  # [m/s], [rad] that the starts beside the plain one are drawn with
+SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +105,11 @@ def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
     """Speed, noise and seed of each start's reach; the first one is the plain reach."""
     rng = np.random.default_rng(seed)
     others = [
-        {"speed": float(rng.uniform(*SPEEDS)), "noise": NOISE, "seed": int(rng.integers(2**31))}
+        {
+            "speed": float(rng.uniform(*SPEEDS)),
+            "noise": float(rng.uniform(*NOISE)),
+            "seed": int(rng.integers(2**31)),
+        }
         for _ in range(starts - 1)
     ]
     return [{}, *others]

@@ -59,6 +59,12 @@ class Spread:
                 _changed(Conditions(), {name: bound})  # refuses what is out of range
         Conditions(period=self.period)
 
+    def of(self, scene: Scene) -> Spread:
+        """This spread, without factors of numbers that the scene's law or target does not have."""
+        has = {"mass": scene.target.parameters, "stiffness": scene.law.parameters}
+        none: dict[str, Any] = {name: (1.0, 1.0) for name, numbers in has.items() if name not in numbers}
+        return replace(self, **none)
+
     def ranges(self) -> dict[str, tuple[float, float]]:
         """What is drawn, by name, with its bounds."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "period"}
@@ -233,7 +239,7 @@ def robustness(
     """Replay a reference in MuJoCo, on free soles, under drawn conditions; numbers do not depend on workers.
 
     reference : as of :class:`impactopt.plan.Trajectory`.  planned_impulse [N s].
-    draws, seed, spread : as of :func:`draw_conditions`.
+    draws, seed, spread : as of :func:`draw_conditions`; a wall has no mass, so none is drawn.
     workers : processes. A script that asks for more than 1 needs `if __name__ == "__main__":`.
     step [s] : of the simulation.
     progress : called with how many replays are done, of how many.
@@ -243,20 +249,22 @@ def robustness(
 
     Raises
     ------
-    InputError : draws, seed, workers or step out of range; MuJoCo is not installed; a contact law or target
-        that it does not have here; the processes do not start.
+    InputError : draws, seed, workers or step out of range; MuJoCo is not installed; the processes do not
+        start.
     """
-    conditions = draw_conditions(draws, seed, spread)
+    scene = scene_of(problem)
+    chosen = (spread if spread is not None else Spread()).of(scene)
+    conditions = draw_conditions(draws, seed, chosen)
     if workers < 1:
         raise InputError(f"{workers} workers; ask for at least 1")
     if not (np.isfinite(step) and step > 0):
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
     mujoco_module()
-    shared = _Shared(robot=problem.robot, reference=reference, scene=scene_of(problem), step=step)
+    shared = _Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
     rows = map_on_workers(replay, shared, conditions, workers=workers, crashed=_crashed, progress=progress)
     return Robustness(
         conditions=tuple(conditions),
-        spread=spread if spread is not None else Spread(),
+        spread=chosen,
         standing=np.array([row.standing for row in rows]),
         reason=tuple(row.reason for row in rows),
         impulse=np.array([row.impulse for row in rows]),

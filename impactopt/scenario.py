@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from impactopt.contact.factors import scaled_numbers
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -78,21 +79,14 @@ class Scenario:
         ------
         InputError : a factor of a number that they do not have.
         """
-        of_law, of_target = dict(law.parameters), dict(target.parameters)
-        for name, of, numbers in (
-            ("stiffness", law, of_law),
-            ("damping", law, of_law),
-            ("mass", target, of_target),
-        ):
-            factor = getattr(self, name)
-            if name in numbers:
-                numbers[name] *= factor
-            elif factor != 1:
-                what = "law" if of is law else "target"
-                raise InputError(
-                    f"scenario {self.name!r}: the {what} {type(of).__name__} has no {name}; leave it out"
-                )
-        return of_law, of_target
+        return scaled_numbers(
+            f"scenario {self.name!r}",
+            law,
+            target,
+            mass=self.mass,
+            stiffness=self.stiffness,
+            damping=self.damping,
+        )
 
     def __str__(self) -> str:
         factors = [f"{getattr(self, name):g} x {name}" for name in ("mass", "stiffness", "damping")]

@@ -133,6 +133,7 @@ def _table(
         ("hand speed at contact [m/s]", "hand_speed_m_s", 3),
     ):
         _row(table, label, [source.get(key) for source in columns.values()], digits)
+    _outcome(table, [source.get("target") or {} for source in columns.values()])
     for label, key, digits, scale, least, most in (
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
@@ -151,6 +152,15 @@ def _table(
     if any(source.get("standing") is not None for source in replays):
         _stands(table, replays)
     return table
+
+
+def _outcome(table: Table, targets: Sequence[Mapping[str, Any]]) -> None:
+    """What the blow has brought the target, where that is known."""
+    _row(table, "speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
+    _row(table, "driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
+    broken = [target.get("broken") for target in targets]
+    if any(value is not None for value in broken):
+        table.add_row("the board breaks", *("-" if b is None else "yes" if b else "no" for b in broken))
 
 
 def _stands(table: Table, replays: Sequence[Mapping[str, Any]]) -> None:

@@ -95,7 +95,7 @@ class Solution(Solved):
 
         Raises
         ------
-        InputError : an unknown engine or option; a contact law or target that the engines do not have.
+        InputError : an unknown engine or option.
         """
         from impactopt.validation import simulate
 

@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from small_robots import biped, slider
 
+from impactopt.contact import FreeMass, SpringDamper
 from impactopt.coordinates import StanceCoordinates
 from impactopt.robot import Robot
 from impactopt.statics import static_wrenches
@@ -26,9 +27,8 @@ def scene(striker: str = "striker:tip", **changes: Any) -> Scene:
     settings: dict[str, Any] = {
         "point": NOWHERE,
         "normal": np.array([1.0, 0.0, 0.0]),
-        "stiffness": 1e4,
-        "damping": 100.0,
-        "mass": 5.0,
+        "law": SpringDamper(stiffness=1e4, damping=100.0),
+        "target": FreeMass(mass=5.0),
         "striker": striker,
         "soles": (),
         "corners": (),
@@ -70,8 +70,10 @@ def strike(
     )
     # half a step after a recorded instant: the worst place for an event
     point = np.array([0.5 * speed * push + speed * 0.04 + 0.5 * step * speed, 0.0, 0.0])
-    sim = simulate(robot, ref, scene(point=point, damping=damping, mass=mass), step=step, settle=0.0)
-    k, mu = 1e4, own * mass / (own + mass)
+    law = SpringDamper(stiffness=1e4, damping=damping)
+    there = scene(point=point, law=law, target=FreeMass(mass=mass))
+    sim = simulate(robot, ref, there, step=step, settle=0.0)
+    k, mu = law.stiffness, own * mass / (own + mass)
     w, zeta = np.sqrt(k / mu), damping / (2 * np.sqrt(k * mu))
     wd = w * np.sqrt(1 - zeta**2)
     turn = np.arctan2(wd, zeta * w) / wd  # the approach ends
@@ -125,5 +127,5 @@ def blow_motion() -> tuple[Robot, Any, Scene]:
     jac = pin.computeFrameJacobian(robot.model, data, q[20], fid, pin.LOCAL_WORLD_ALIGNED)[:3]
     speed = jac @ v[20]
     normal = speed / np.linalg.norm(speed)
-    there = replace(where, point=point, normal=normal, mass=3.0)
+    there = replace(where, point=point, normal=normal, target=FreeMass(mass=3.0))
     return robot, motion, there

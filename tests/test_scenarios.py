@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from small_plans import LAW, OPTIONS, Planned, changed, planned
 
+from impactopt.contact import FreeMass, SpringDamper
 from impactopt.ipopt import solve_ipopt
 from impactopt.nlp import transcription as nlp
 from impactopt.nlp.start import first_iterate
@@ -34,11 +35,14 @@ HARD = Scenario(name="hard", stiffness=2.0, damping=0.5)
 def comes(transcription: Transcription, scenario: Scenario, options: dict[str, Any]) -> Planned:
     """The plan, and the simulation of the scenario in full dynamics."""
     scene = scene_of(transcription.problem)
+    law, target = scene.law, scene.target
+    assert isinstance(law, SpringDamper) and isinstance(target, FreeMass)
     scene = dataclasses.replace(
         scene,
-        mass=scenario.mass * scene.mass,
-        stiffness=scenario.stiffness * scene.stiffness,
-        damping=scenario.damping * scene.damping,
+        law=SpringDamper(
+            stiffness=scenario.stiffness * law.stiffness, damping=scenario.damping * law.damping
+        ),
+        target=FreeMass(mass=scenario.mass * target.mass),
     )
     return planned(transcription, options, scene)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from impactopt.contact.factors import scaled_numbers
 from impactopt.errors import InputError
 from impactopt.validation.result import Scene
 
@@ -14,7 +15,7 @@ from impactopt.validation.result import Scene
 class Conditions:
     """What a replay finds; the defaults are what was planned, on a floor of friction 0.9.
 
-    mass, stiffness, damping : of the target and its contact, as factors of the planned ones.
+    mass, stiffness, damping : of the target, and of the contact law, as factors of the planned numbers.
     distance [m] : how much farther along the normal the target waits; negative: it comes early.
     missing : there is no target.
     payload [kg] : a point mass at the striking point that the plan does not know of.
@@ -56,11 +57,19 @@ class Conditions:
                 raise InputError(f"conditions: {name} is {getattr(self, name):g}; give a number > 0")
 
     def scene(self, planned: Scene) -> Scene:
-        """The scene as it turns out."""
+        """The scene as it turns out.
+
+        Raises
+        ------
+        InputError : a factor of a number that the law or the target does not have.
+        """
+        law, target = planned.law, planned.target
+        of_law, of_target = scaled_numbers(
+            "conditions", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
+        )
         return replace(
             planned,
             point=planned.point + self.distance * planned.normal,
-            stiffness=self.stiffness * planned.stiffness,
-            damping=self.damping * planned.damping,
-            mass=self.mass * planned.mass,
+            law=type(law)(**of_law),
+            target=type(target)(**of_target),
         )

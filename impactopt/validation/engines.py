@@ -27,7 +27,7 @@ def simulate(
 
     Raises
     ------
-    InputError : an unknown engine or option; a contact law or target that the engines do not have.
+    InputError : an unknown engine or option.
     """
     if engine not in ENGINES:
         raise InputError(

@@ -65,6 +65,5 @@ def simulation_of(
         lift=lift.reshape(len(time), -1),
         contact_start=contact_start,
         contact_end=contact_end,
-        mass=scene.mass,
         **rest,
     )

@@ -1,8 +1,8 @@
 """Replay in MuJoCo with nothing held: the robot is free on its soles.
 
-Unilateral contact with friction at the soles' corners, the servo with its limits, the target a body of its
-own with the problem's contact law. Shares no code with the planner: it reads a reference (times, positions,
-velocities, feed-forward), the robot's numbers and the scene's.
+Unilateral contact with friction at the soles' corners, the servo with its limits, the target moved by the
+contact law's force. Shares no code with the planner: it reads a reference (times, positions, velocities,
+feed-forward), the robot's numbers and the scene's.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
 from impactopt.validation.soles import BEARS, sole_names, weight_of
-from impactopt.validation.touch import FACE, Touches
+from impactopt.validation.struck import Struck
+from impactopt.validation.touch import Touches
 
 Array = NDArray[np.float64]
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
@@ -43,9 +44,8 @@ class _Replay:
         self.place = np.array([joint.qposadr[0] for joint in joints])
         self.floating = robot.model.nv > robot.n
         self.site = self.world.site("striker").id
-        target = None if conditions.missing else self.world.joint("target")
-        self.target = None if target is None else int(target.dofadr[0])
-        self.travel = None if target is None else int(target.qposadr[0])
+        self.struck = Struck(self.scene)
+        self.target, self.travel = self.struck.at_rest, 0.0  # the target's state, and how far it has gone [m]
         self.row = np.zeros((3, self.world.nv))
         self.held = {name: k for k, name in enumerate(scene.soles)}
         self.geom_sole = np.full(self.world.ngeom, -1)
@@ -82,18 +82,14 @@ class _Replay:
         return float(self.push @ self.data.qvel)
 
     def contact_force(self, speed: float) -> float:
-        if self.target is None:
+        if self.conditions.missing:
             return 0.0
-        way = self.data.site_xpos[self.site] - self.scene.point
-        travel = float(self.scene.normal @ way)
-        depth = travel - float(self.data.qpos[self.travel])
-        if depth <= 0 or np.linalg.norm(way - travel * self.scene.normal) > FACE:
-            return 0.0
-        approach = speed - float(self.data.qvel[self.target])
-        return self.scene.stiffness * depth + self.scene.damping * max(approach, 0.0)
+        return self.struck.force(self.data.site_xpos[self.site], speed, self.travel, self.target)
 
-    def target_speed(self) -> float:
-        return 0.0 if self.target is None else float(self.data.qvel[self.target])
+    def move_target(self, force: float, step: float) -> None:
+        """Semi-implicitly, as MuJoCo moves the robot: by the speed that it has after the step."""
+        self.target = self.struck.moved(self.target, force, step)
+        self.travel += step * self.struck.speed(self.target)
 
     # ------------------------------------------------------------------ what a record needs
     def base(self) -> tuple[Array, Array, float]:
@@ -226,6 +222,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, fall = Touches(), 0.0, ""
+    impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
     with no_log_file():
         for k in range(round((float(reference.end) + settle) / step)):
             t = k * step
@@ -243,11 +240,12 @@ def simulate_mujoco(
             force = replay.contact_force(speed)
             data.qfrc_applied[:] = -force * replay.push
             data.qfrc_applied[replay.dof] += torque
-            if replay.target is not None:
-                data.qfrc_applied[replay.target] = force
             touches.add(t, force, step)
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
-            target_speed = replay.target_speed()
+            target_speed = replay.struck.speed(replay.target)
+            replay.move_target(force, step)
+            impulse += step * force
+            left = replay.target if force > 0 else left
             kept = k % record == 0 or force > 0
             state = replay.state() if kept else None
             moves = replay.sole_moves() if kept else None
@@ -267,6 +265,8 @@ def simulate_mujoco(
         rows,
         touches,
         engine="mujoco",
+        impulse=impulse,
+        outcome=replay.scene.target.outcome(left),
         saturated=saturated,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
         fall=fall or replay.not_standing(ground, weight_of(robot)),

@@ -1,4 +1,4 @@
-"""A robot, its floor and its target as a MuJoCo model, built body by body from the robot's numbers."""
+"""A robot and its floor as a MuJoCo model, built body by body from the robot's numbers."""
 
 from __future__ import annotations
 
@@ -56,9 +56,8 @@ def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solv
     """The compiled mujoco.MjModel.
 
     Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
-    the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners; the target is the body
-    ``target`` on a slide along the normal. Nothing else touches anything: the contact law between striker and
-    target is the engine's business.
+    the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
+    anything: the target, and the contact law between it and the striker, are the engine's business.
     """
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()
@@ -77,12 +76,6 @@ def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solv
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
     _surface(floor, conditions, sole=False)
     _robot_bodies(mujoco, spec, robot, scene, conditions)
-    if not conditions.missing:
-        slide = mujoco.mjtJoint.mjJNT_SLIDE
-        # without weight, as it was planned for: it waits where it is whichever way the normal points
-        body = spec.worldbody.add_body(name="target", pos=scene.point, gravcomp=1.0)
-        body.add_joint(name="target", type=slide, axis=scene.normal)
-        _inertial(body, scene.mass, np.zeros(3), 0.01 * scene.mass * np.eye(3))
     return spec.compile()
 
 

@@ -1,8 +1,8 @@
 """Full dynamics in numeric Pinocchio.
 
-Soles are bilateral constraints, the servo saturates, contact with a free mass is a spring-damper. Shares no
-code with the planner: it reads a reference (times, positions, velocities, feed-forward), the
-robot's numbers and the scene's.
+Soles are bilateral constraints, the servo saturates, the target is moved by the contact law's force. Shares
+no code with the planner: it reads a reference (times, positions, velocities, feed-forward), the robot's
+numbers and the scene's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from impactopt.robot import Robot
 from impactopt.validation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
-from impactopt.validation.touch import FACE, Touches
+from impactopt.validation.struck import Move, Struck, smooth_steps
+from impactopt.validation.touch import Touches
 
 Array = NDArray[np.float64]
 
@@ -28,15 +29,16 @@ class _State:
     q: Array
     v: Array
     x: float  # the target's travel [m]
-    vt: float  # and speed [m/s]
+    target: Array  # and state
+    impulse: float  # that it was given [N s]
 
 
 @dataclass(frozen=True)
 class _Rates:
     v: Array
     a: Array
-    vt: float
-    at: float
+    vt: float  # the target's speed [m/s]
+    target: Array
     force: float
     hand_speed: float
     demand: Array
@@ -49,7 +51,7 @@ class _World:
         self.model, self.data = robot.model, robot.model.createData()
         self.base = robot.model.nv - robot.n
         self.hand = self.model.getFrameId(scene.striker)
-        self.servo = Servo(robot, reference)
+        self.servo, self.struck = Servo(robot, reference), Struck(scene)
         self.contacts = pin.StdVec_RigidConstraintModel()
         for name in scene.soles:
             frame = self.model.frames[self.model.getFrameId(name)]
@@ -71,20 +73,20 @@ class _World:
         self.proximal = pin.ProximalSettings(1e-12, 1e-12, 1)
         self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
 
-    def rates(self, t: float, s: _State) -> _Rates:
-        model, data, scene = self.model, self.data, self.scene
+    def contact(self, s: _State) -> tuple[float, float, Array]:
+        """Force [N] and hand speed [m/s] along the normal, and the row (nv,) of the Jacobian."""
+        model, data = self.model, self.data
         pin.computeJointJacobians(model, data, s.q)
         jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)
         jac = np.reshape(jac, (6, model.nv))[:3]  # pin drops an axis where nv is 1
         point = pin.updateFramePlacement(model, data, self.hand).translation
-        row = scene.normal @ jac
+        row = self.scene.normal @ jac
         speed = float(row @ s.v)
-        way = point - scene.point
-        travel = float(scene.normal @ way)
-        depth = travel - s.x
-        hits = depth > 0 and np.linalg.norm(way - travel * scene.normal) <= FACE
-        approach = speed - s.vt
-        force = scene.stiffness * depth + scene.damping * max(approach, 0.0) if hits else 0.0
+        return self.struck.force(point, speed, s.x, s.target), speed, row
+
+    def rates(self, t: float, s: _State) -> _Rates:
+        model, data = self.model, self.data
+        force, speed, row = self.contact(s)
         demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
         tau = -row * force
         tau[self.base :] += torque
@@ -94,7 +96,17 @@ class _World:
             )
         else:
             a = pin.aba(model, data, s.q, s.v, tau)
-        return _Rates(s.v.copy(), np.array(a), s.vt, force / scene.mass, force, speed, demand, torque)
+        struck = self.struck
+        return _Rates(
+            v=s.v.copy(),
+            a=np.array(a),
+            vt=struck.speed(s.target),
+            target=struck.rates(s.target, force),
+            force=force,
+            hand_speed=speed,
+            demand=demand,
+            torque=torque,
+        )
 
     def ground(self) -> Array:
         """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
@@ -117,7 +129,34 @@ class _World:
         ]
 
     def advance(self, s: _State, r: _Rates, h: float) -> _State:
-        return _State(pin.integrate(self.model, s.q, h * r.v), s.v + h * r.a, s.x + h * r.vt, s.vt + h * r.at)
+        return _State(
+            q=pin.integrate(self.model, s.q, h * r.v),
+            v=s.v + h * r.a,
+            x=s.x + h * r.vt,
+            target=s.target + h * r.target,
+            impulse=s.impulse + h * r.force,
+        )
+
+    def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
+        """A step of the midpoint rule from a state with its rates; several, where the target switches."""
+        struck = self.struck
+
+        def begin(done: float, at: _State) -> Move[_State]:
+            now = first if done == 0 else self.rates(t + done, at)
+            before = struck.side(at.target, now.force)
+
+            def move(length: float) -> tuple[_State, bool]:
+                half = self.advance(at, now, length / 2)
+                middle = self.rates(t + done + length / 2, half)
+                after = self.advance(at, middle, length)
+                if not struck.switching:
+                    return after, True
+                stays = struck.side(half.target, middle.force) == before
+                return after, stays and struck.side(after.target, self.contact(after)[0]) == before
+
+            return move
+
+        return smooth_steps(begin, s, h)
 
 
 def simulate_pinocchio(
@@ -135,7 +174,9 @@ def simulate_pinocchio(
     InputError : the simulation diverges (with the time at which it did).
     """
     world = _World(robot, scene, reference)
-    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, 0.0)
+    struck = world.struck
+    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, struck.at_rest, 0.0)
+    left = state.target  # as the last touch has left it
     end = float(reference.end) + settle
     rows: list[tuple[Any, ...]] = []
     saturated = 0.0
@@ -149,16 +190,11 @@ def simulate_pinocchio(
         if first.force > 0 or k % record == 0:
             corners = world.corners()
             start = corners if start is None else start
-            motion = (state.q, state.v, first.force, state.vt, first.hand_speed)
+            motion = (state.q, state.v, first.force, first.vt, first.hand_speed)
             moves = slip_and_lift(corners, start)
             rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves))
-        middle = world.rates(t + step / 2, world.advance(state, first, step / 2))
-        state = _State(
-            pin.integrate(robot.model, state.q, step * middle.v),
-            state.v + step * middle.a,
-            state.x + step * middle.vt,
-            state.vt + step * middle.at,
-        )
+        before, state = state, world.step(t, state, first, step)
+        left = state.target if state.impulse > before.impulse else left
         check_not_diverged(state.v, t, step)
     return simulation_of(
         robot,
@@ -166,6 +202,8 @@ def simulate_pinocchio(
         rows,
         touches,
         engine="pinocchio",
+        impulse=state.impulse,
+        outcome=scene.target.outcome(left),
         saturated=saturated,
         posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
         fall=None,

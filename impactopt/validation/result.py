@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 
 Array = NDArray[np.float64]
@@ -32,24 +34,24 @@ REPORT = (
     "min_normal_force_N",
     "hand_speed_m_s",
     "sole_cop_margin_m",
+    "target",
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """The target and its contact: a free mass behind a spring-damper that damps in compression only.
+    """The target, its contact and the ground.
 
-    point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; stiffness
-    [N/m]; damping [N s/m]; mass [kg]; striker: frame of the model that hits; soles: frames of the model that
-    the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame, counter-clockwise;
-    polygon (k, 2) [m]: support polygon on the ground, counter-clockwise.
+    point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; law, target:
+    the contact's force and the target's motion; striker: frame of the model that hits; soles: frames of the
+    model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
+    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise.
     """
 
     point: Array
     normal: Array
-    stiffness: float
-    damping: float
-    mass: float
+    law: ContactLaw
+    target: Target
     striker: str
     soles: tuple[str, ...]
     corners: tuple[Array, ...]
@@ -66,10 +68,12 @@ class Simulation:
     their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, nan
     where it bears no load; slip, lift (k, soles) [m]: how far the corner of a sole that moved most went along
     the ground, and rose.
-    contact_start, contact_end [s]: nan if the target was not hit.  saturated [s]: how long some joint asked
-    for more than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None
-    where the engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's
-    orientation, that ends farthest from the reference's last posture.
+    contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
+    integral over the whole motion.  outcome: what the target has of it, as its last touch has left it, by
+    name and unit (``speed_m_s``, ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
+    than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
+    engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
+    that ends farthest from the reference's last posture.
     """
 
     engine: str
@@ -88,7 +92,8 @@ class Simulation:
     lift: Array
     contact_start: float
     contact_end: float
-    mass: float
+    impulse: float
+    outcome: dict[str, float]
     saturated: float
     posture_error: float
     fall: str | None
@@ -102,11 +107,6 @@ class Simulation:
     def sole_normal(self) -> Array:
         """Normal force (k, soles) [N] of each sole, negative where the ground would have to pull."""
         return self.sole_ground[:, :, 2]
-
-    @property
-    def impulse(self) -> float:
-        """What the target has at the end [N s]; 0 if it was not hit."""
-        return float(self.mass * self.target_speed[-1]) if np.isfinite(self.contact_start) else 0.0
 
     @property
     def standing(self) -> bool | None:
@@ -141,6 +141,7 @@ class Simulation:
             else self.fall,
             "impulse_Ns": self.impulse,
             "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1),
+            "target": self.outcome,
             "peak_force_N": float(self.force.max()),
             "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
             # a target that comes early may touch at once

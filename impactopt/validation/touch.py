@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-FACE = 0.2  # [m] how far from the hit point, across the normal, there is something to hit
-
 
 class Touches:
     """Intervals of contact, told step by step. A graze before or after the blow is an interval of its own."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -224,6 +225,16 @@ def _crashed(code: int) -> Row:
     return Row(standing=False, reason=f"the process of the replay died (exit code {code})")
 
 
+def _check_travels(scene: Scene) -> None:
+    try:
+        pickle.dumps((scene.law, scene.target))
+    except Exception as error:  # as its kind is pickle's or Python's, by what is in the way
+        raise InputError(
+            f"the law or target cannot go to other processes ({error}); define its functions at the top of a "
+            "module, no lambdas, or ask for workers=1"
+        ) from error
+
+
 def robustness(
     problem: ImpactProblem,
     reference: Any,
@@ -250,7 +261,7 @@ def robustness(
     Raises
     ------
     InputError : draws, seed, workers or step out of range; MuJoCo is not installed; the processes do not
-        start.
+        start, or a law or target of one's own cannot go to them.
     """
     scene = scene_of(problem)
     chosen = (spread if spread is not None else Spread()).of(scene)
@@ -260,6 +271,8 @@ def robustness(
     if not (np.isfinite(step) and step > 0):
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
     mujoco_module()
+    if workers > 1:
+        _check_travels(scene)
     shared = _Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
     rows = map_on_workers(replay, shared, conditions, workers=workers, crashed=_crashed, progress=progress)
     return Robustness(

@@ -17,6 +17,7 @@ from fake_solution import still_problem, still_solution
 
 from impactopt import _workers
 from impactopt._workers import map_on_workers
+from impactopt.contact import CustomLaw, RigidWall
 from impactopt.errors import InputError
 from impactopt.robustness import LOGARITHMIC, Robustness, Spread, draw_conditions, robustness
 from impactopt.validation import Conditions
@@ -187,6 +188,22 @@ def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:
     falls = robustness(*still, 1.0, draws=1, spread=weak, workers=1, step=STEP)
     assert falls.rate == 0.0 and falls.reason[0].startswith("fell")
     assert falls.lift[0] >= 0.0 and np.isfinite(falls.slip[0])
+
+
+def test_of_a_wall_no_mass_is_drawn(still: tuple[Any, Any]) -> None:
+    _, motion = still
+    wall = still_problem(target=RigidWall())
+    result = robustness(wall, motion, 1.0, draws=2, spread=Spread(distance=(0.1, 0.1)), workers=1, step=STEP)
+    assert [c.mass for c in result.conditions] == [1.0, 1.0] and result.spread.mass == (1.0, 1.0)
+    assert len({c.stiffness for c in result.conditions}) == 2
+    assert np.isfinite(result.impulse).all(), result.reason
+
+
+def test_a_law_that_cannot_go_to_processes_is_refused(still: tuple[Any, Any]) -> None:
+    _, motion = still
+    problem = still_problem(law=CustomLaw(compression=lambda x, _rate, k: k * x, k=1e4))
+    with pytest.raises(InputError, match="no lambdas, or ask for workers=1"):
+        robustness(problem, motion, 1.0, draws=2, workers=2, step=STEP)
 
 
 def test_a_replay_that_diverges_is_a_row(still: tuple[Any, Any]) -> None:

@@ -102,7 +102,7 @@ class Target(ABC):
         """`result` as numbers by name and unit, as reports have them: `speed_m_s`, `depth_m`, `broken`."""
         values = self.result([float(x) for x in state], parameters)
         names = [f"{name}_{UNITS[name]}" if name in UNITS else name for name in self.results]
-        return {name: float(value) for name, value in zip(names, values, strict=True)}
+        return {name: float(value) + 0.0 for name, value in zip(names, values, strict=True)}  # no minus zero
 
     def formula(self) -> tuple[str, ...]:
         """The target as text in symbols of its own: what a compiled model of it depends on."""

@@ -92,9 +92,7 @@ class FirstOrder(FakeSolution):
     def validate(self, *, engine: str = "", step: float = 0.0, **options: Any) -> Simulation:
         simulation = super().validate()
         off = 1 + 30 * step + (0.01 if options.get("iterations") == 10 else 0.0)
-        return dataclasses.replace(
-            simulation, target_speed=off * simulation.target_speed, force=off * simulation.force
-        )
+        return dataclasses.replace(simulation, impulse=off * simulation.impulse, force=off * simulation.force)
 
 
 class Diverging(FirstOrder):

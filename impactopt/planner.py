@@ -14,7 +14,7 @@ from impactopt.nlp.start import first_iterate, iterate_from_strike, strike_itera
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
 from impactopt.problem import ImpactProblem
-from impactopt.program import Callback
+from impactopt.program import Callback, SolverResult
 from impactopt.solution import Solution
 from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, solve_from
 
@@ -25,8 +25,8 @@ STARTS = ("reach", "strike")
 def solve(
     problem: ImpactProblem,
     *,
-    solver: str = "ipopt",
-    start: str | ArrayLike = "reach",
+    solver: str = "sqp",
+    start: str | ArrayLike | Solution = "reach",
     starts: int = 1,
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
@@ -36,10 +36,10 @@ def solve(
 ) -> Solution:
     """Plan the motion that hits hardest within the problem's terms.
 
-    solver : "ipopt" (exact Hessian, the dependable one) or "sqp" (ours, on OSQP).
+    solver : "sqp" (ours) or "ipopt".
     start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
-        a reach, which is a program of its own (:func:`impactopt.optimize_strike`); or solver variables (n,),
-        such as ``solution.result.x`` of a neighbouring problem.
+        a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or
+        the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
     starts : so many of them, the first one plain, the others with perturbed postures and other speeds, drawn
         by ``seed``; the best motion is kept, ``Solution.attempts`` tells of all.
     options : the solver's own.  time_limit [s] : of the solver, for all starts together.
@@ -54,10 +54,16 @@ def solve(
     """
     check_solver(solver)
     check_starts(starts, seed, given=not isinstance(start, str))
-    given = start if isinstance(start, str) else check_array("start", start, (None,))
+    given: str | Array | SolverResult
+    if isinstance(start, Solution):
+        given = start.result
+    else:
+        given = start if isinstance(start, str) else check_array("start", start, (None,))
     if isinstance(given, str) and given not in STARTS:
         near = did_you_mean(given, STARTS)
-        raise InputError(f"unknown start {given!r}{near}: give 'reach', 'strike' or solver variables (n,)")
+        raise InputError(
+            f"unknown start {given!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
+        )
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report)
     t = Transcription(problem, problem.coordinates, functions)
@@ -68,7 +74,9 @@ def solve(
     return Solution(plan=t.decode(fields["result"].x), **fields)
 
 
-def _starts(t: Transcription, start: str | Array, starts: int, seed: int, budget: Budget) -> Starts:
+def _starts(
+    t: Transcription, start: str | Array | SolverResult, starts: int, seed: int, budget: Budget
+) -> Starts:
     """Names of the starts, and what makes them."""
     if not isinstance(start, str):
         yield "given", lambda: start

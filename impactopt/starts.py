@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
 
 Array = NDArray[np.float64]
-Starts = Iterable[tuple[str, Callable[[], Array]]]
-SOLVERS = ("ipopt", "sqp")
+Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
+SOLVERS = ("sqp", "ipopt")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
@@ -73,15 +73,29 @@ class Budget:
             return None
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
 
-    def run(self, program: NonlinearProgram, x0: Array) -> SolverResult:
-        """Let the solver work on a program in the time that is left."""
-        left = self.left
+    def run(self, program: NonlinearProgram, start: Array | SolverResult) -> SolverResult:
+        """Let the solver work on a program in the time that is left.
+
+        start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
+        """
+        left, y, z = self.left, None, None
+        if isinstance(start, SolverResult):
+            x0, y, z = start.x, start.multipliers, start.bound_multipliers
+        else:
+            x0 = start
         if self.solver == "ipopt":
             return solve_ipopt(program, x0, options=self.options, callback=self.callback, time_limit=left)
         settings = dict(self.options or {})
         if left is not None:
-            settings["time_limit"] = left
-        return solve_sqp(program, x0, options=SQPOptions(**settings), callback=self.callback)
+            settings["time_limit"] = max(left, 1e-9)
+        return solve_sqp(
+            program,
+            x0,
+            options=SQPOptions(**settings),
+            callback=self.callback,
+            multipliers=y,
+            bound_multipliers=z,
+        )
 
 
 def check_solver(solver: str) -> None:

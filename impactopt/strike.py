@@ -60,7 +60,7 @@ class StrikeSolution(Solved):
 def optimize_strike(
     problem: ImpactProblem,
     *,
-    solver: str = "ipopt",
+    solver: str = "sqp",
     starts: int = 1,
     seed: int = 0,
     start: ArrayLike | None = None,

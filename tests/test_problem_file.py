@@ -108,7 +108,7 @@ def test_the_demos_file_is_the_punch_it_says() -> None:
     np.testing.assert_array_equal(problem.normal, [1, 0, 0])
     assert problem.target == FreeMass(mass=5.0)
     assert problem.law == SpringDamper(stiffness=1e4, damping=300.0)
-    assert read_problem_file(PUNCH).solver.name == "ipopt"
+    assert read_problem_file(PUNCH).solver.name == "sqp"
 
 
 def test_the_commented_keys_of_the_demos_file_show_the_defaults(tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ time_limit_s = 12
 [solver.ipopt]
 max_iter = 77
 [solver.sqp]
-hessian = "bfgs"
+max_iterations = 99
 price = 50.0
 """
     named = GOOD.replace('"talos"', '"standin"\nstart = "on_left_foot"\nname = "all of it"')
@@ -235,7 +235,7 @@ price = 50.0
         objectives.Effort(),
     )
     assert (solver.name, solver.time_limit) == ("sqp", 12)
-    assert solver.options == {"ipopt": {"max_iter": 77}, "sqp": {"hessian": "bfgs", "price": 50.0}}
+    assert solver.options == {"ipopt": {"max_iter": 77}, "sqp": {"max_iterations": 99, "price": 50.0}}
 
 
 EXTRA = """

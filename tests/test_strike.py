@@ -13,7 +13,7 @@ import pytest
 from derivative_checks import check_derivatives
 from fake_solution import PROBLEM_FILE
 from numpy.typing import NDArray
-from small_plans import OPTIONS, Planned, changed
+from small_plans import Planned, changed
 from typer.testing import CliRunner
 
 from impactopt.cli import app
@@ -59,7 +59,7 @@ def transcription(request: pytest.FixtureRequest) -> StrikeTranscription:
 def optimized(t: Transcription, monkeypatch: pytest.MonkeyPatch, **options: Any) -> StrikeSolution:
     """The strike of a transcription's problem, on its functions."""
     monkeypatch.setattr("impactopt.strike.block_functions", lambda *_: t.functions)
-    return optimize_strike(t.problem, **{"options": OPTIONS, **options})
+    return optimize_strike(t.problem, **options)
 
 
 @pytest.fixture(scope="module", params=["biped", "arm"])
@@ -381,6 +381,19 @@ def test_a_motion_is_solved_from_several_starts(
     told = found.summary()["starts"]
     assert [a["kept"] for a in told].count(True) == 1
     json.dumps(told)
+
+
+def test_a_solution_starts_its_neighbour(
+    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    t = arm_transcription
+    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: t.functions)
+    first = solve(t.problem)
+    assert solve(t.problem, start=first).result.iterations == 0
+    moved = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
+    found, plain = solve(moved, start=first), solve(moved, solver="ipopt")
+    assert found.status is Status.SOLVED
+    assert found.result.objective <= plain.result.objective + 1e-4 * abs(plain.result.objective)
 
 
 def test_a_start_that_is_none_is_refused(arm_transcription: Transcription) -> None:

@@ -53,7 +53,7 @@ def _scipy(program: NonlinearProgram, x0: Vector, time_limit: float, *, method: 
 
 
 def _table() -> dict[str, Solver]:
-    ours = [Solver(name="sqp", qp=qp, run=partial(_sqp, qp=qp)) for qp in ("auto", *sorted(QP_SOLVERS))]
+    ours = [Solver(name="sqp", qp=qp, run=partial(_sqp, qp=qp)) for qp in ("interior", *sorted(QP_SOLVERS))]
     others = [
         Solver(name="ipopt", qp="", run=_ipopt),
         *(Solver(name="sqpmethod", qp=qp, run=partial(_casadi, qp=qp)) for qp in ("qpoases", "piqp")),

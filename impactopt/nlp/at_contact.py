@@ -226,8 +226,43 @@ class ContactProgram(Builder):
         self.objectives = quantities(self, objectives)
         objective, quadratic, linear = assemble(self.layout, self.objectives, self._prices())
         self.program = StructuredProgram(
-            self.layout, self.blocks, self.rows, objective=objective, quadratic=quadratic, linear=linear
+            self.layout,
+            self.blocks,
+            self.rows,
+            objective=objective,
+            quadratic=quadratic,
+            linear=linear,
+            determined=self._determined(),
+            sequence=self._sequence(),
         )
+
+    # ------------------------------------------------------------------ structure
+    def _determined(self) -> list[tuple[int, Index]]:
+        """What rows determine by themselves, with its rank in the elimination.
+
+        Where there are rows to choose from, what stands first here takes the rows that stand first.
+        """
+        out = [(0, node) for node in self._nodes()]
+        out += [(1, group.index(0)) for group, _ in self._lifted]
+        found = [c.determined() for c in self.collisions]
+        out += [(4, legs) for stages, _ in found for legs in stages]
+        out += [(5 + k, part) for _, steps in found for k, parts in enumerate(steps) for part in parts]
+        out.append((3, self.feedforward.index(0)))
+        last = 5 + max(len(steps) for _, steps in found)
+        out += [(last, c.after.index(0)) for c in self.scenarios]
+        return out + [(last, start) for start in self._starts()]
+
+    def _nodes(self) -> list[Index]:
+        """Variables that the rows of each node determine: its legs, and the first sole's wrench."""
+        raise NotImplementedError
+
+    def _starts(self) -> list[Index]:
+        """Variables that the state after contact determines."""
+        return []
+
+    def _sequence(self) -> Array | None:
+        """Where along the motion each variable has its say (n,), if it is not all at once."""
+        return None
 
     def _prices(self) -> Prices:
         raise NotImplementedError

@@ -11,7 +11,7 @@ import numpy as np
 
 from impactopt.motion import CubicSpline
 from impactopt.nlp.layout import Affine, Array, Group
-from impactopt.nlp.rows import Place
+from impactopt.nlp.rows import Index, Place
 
 if TYPE_CHECKING:
     from impactopt.nlp.transcription import Transcription
@@ -41,6 +41,10 @@ class FollowThrough:
         """y and y' at its start."""
         y, y1, _ = self.t.at(self.control, self.t.follow_breaks, 0.0)
         return y, y1
+
+    def determined(self) -> Index:
+        """Control points that the state at its start determines: position and rate."""
+        return np.concatenate([self.c.index(0), self.c.index(1)])
 
     def place_at(self, s: float) -> Place:
         return Place(f"{self.place}, {100 * s:.0f} %", f"{self.place} at {{s}}", self.T[0] * s)

@@ -13,7 +13,7 @@ import numpy as np
 
 from impactopt.nlp.collision import DIRECTIONS
 from impactopt.nlp.layout import Affine, Array
-from impactopt.nlp.rows import Measure, percent
+from impactopt.nlp.rows import Index, Measure, percent
 from impactopt.plan import PlannedCollision
 
 if TYPE_CHECKING:
@@ -52,6 +52,10 @@ class InstantImpact:
         law = [p.law.parameters.get(name, 1.0) for name in ("stiffness", "damping")]
         numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
         return {"impact": ([slots], [np.concatenate([numbers, t.robot.torque_limit, t.units])])}
+
+    def determined(self) -> tuple[list[Index], list[list[Index]]]:
+        """As of :meth:`impactopt.nlp.collision.Collision.determined`."""
+        return [], [[np.concatenate([g.index(0) for g in (self.du, self.w, self.blow)])]]
 
     def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
         t, (start, _) = self.t, at["impact"]

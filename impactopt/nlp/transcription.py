@@ -315,6 +315,32 @@ class Transcription(ContactProgram):
     def _prices(self) -> Prices:
         return motion_prices(self)
 
+    # ------------------------------------------------------------------ structure
+    def _determined(self) -> list[tuple[int, Index]]:
+        return [*super()._determined(), (2, self.u0.index(0))]
+
+    def _nodes(self) -> list[Index]:
+        nodes = [(self.swing_legs, self.swing_w), *[(f.legs, f.w) for f in self.follows]]
+        out = [np.concatenate([legs.index(k), w.index(k)[:6]]) for legs, w in nodes for k in range(w.count)]
+        return out + [self.coast_w.index(k)[:6] for k in range(self.coast_w.count)]
+
+    def _starts(self) -> list[Index]:
+        return [follow.determined() for follow in self.follows]
+
+    def _sequence(self) -> Array:
+        """0 at the start, 1 at contact, 2 at rest."""
+        out = np.ones(self.layout.n)
+        last = self.problem.swing.intervals + 2
+        placed = [(self.swing_c, (3 + np.arange(self.swing_c.count)) / last)]
+        placed += [(self.swing_legs, self.swing_nodes), (self.swing_w, self.swing_nodes)]
+        for f in self.follows:
+            places = 1 + self.follow_nodes
+            placed += [(f.c, 1 + np.arange(f.c.count) / f.c.count), (f.legs, places), (f.w, places)]
+        for group, at in placed:
+            for k, place in enumerate(at):
+                out[group.index(k)] = place
+        return out
+
     # ------------------------------------------------------------------ solution
     def spline(
         self, x: Array, control: Callable[[int], Affine], breaks: Array, duration: Group

@@ -33,7 +33,7 @@ class SolverSettings:
     name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
     """
 
-    name: str = "ipopt"
+    name: str = "sqp"
     time_limit: float | None = None
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 

@@ -22,6 +22,7 @@ from impactopt.program import (
     stationarity,
 )
 from impactopt.sqp.hessian import QuadraticModel, make_hessian
+from impactopt.sqp.interior import solve_interior
 from impactopt.sqp.merit import Filter, Merit
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point, TimedProgram
@@ -68,7 +69,10 @@ def solve_sqp(
         else check_array("bound_multipliers", bound_multipliers, (program.n,))
     )
     x0 = np.clip(x0, program.x_lower, program.x_upper)
-    run = _Run(program, options or SQPOptions(), callback, x0, y, z)
+    options = options or SQPOptions()
+    if options.qp_solver == "interior":
+        return solve_interior(program, x0, y, z, options, callback)
+    run = _Run(program, options, callback, x0, y, z)
     try:
         status = run.iterate()
     except KeyboardInterrupt:
@@ -91,9 +95,7 @@ class _Run:
         self.report = Report(program, options.violation_tolerance, callback)
         self.program, self.options = TimedProgram(program), options
         self.hessian = make_hessian(self.program, options)
-        small = program.n <= options.dense_limit
-        name = ("active_set" if small else "osqp") if options.qp_solver == "auto" else options.qp_solver
-        self.subproblem = Subproblem(self.program, make_qp_solver(name))
+        self.subproblem = Subproblem(self.program, make_qp_solver(options.qp_solver))
         self.subproblem.start_from(y, z)
         self.merit = Merit(price=options.price, price_max=options.price_max)
         self.filter = Filter()

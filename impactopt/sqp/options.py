@@ -16,7 +16,8 @@ class SQPOptions:
 
     Attributes
     ----------
-    qp_solver : name in `QP_SOLVERS`, or "auto": "active_set" for up to `dense_limit` variables, else "osqp".
+    qp_solver : "interior": every QP is taken one interior-point step towards its solution; or a name in
+        `QP_SOLVERS`, which solves every QP to its end. What is of no use to the one is said below.
     hessian : "exact" (made convex) or "bfgs" (damped; dense, for some hundred variables at most).
     violation_tolerance : largest violation of a row or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
@@ -34,14 +35,16 @@ class SQPOptions:
     dense_limit : most variables for which matrices are treated as dense: the Hessian made convex by its
         eigenvalues rather than by a shift, QPs solved by the dense active-set method.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
+    barrier, barrier_warm : with "interior", of the first QP's barrier, without and with multipliers given.
+    push, push_warm : with "interior", how far the start is moved inside its bounds, likewise.
     """
 
-    qp_solver: str = "auto"
+    qp_solver: str = "interior"
     hessian: str = "exact"
     violation_tolerance: float = 1e-6
     kkt_tolerance: float = 1e-6
     acceptable_tolerance: float = 1e-4
-    max_iterations: int = 200
+    max_iterations: int = 500
     time_limit: float | None = None
     radius: float = 1.0
     radius_max: float = 100.0
@@ -52,6 +55,10 @@ class SQPOptions:
     curvature_floor: float = 1e-6
     dense_limit: int = 300
     second_order_correction: bool = True
+    barrier: float = 3e-2
+    barrier_warm: float = 1e-4
+    push: float = 1e-2
+    push_warm: float = 1e-4
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant.
@@ -61,13 +68,18 @@ class SQPOptions:
         InputError : an unknown name, or a number out of its range.
         """
         for name, value, known in (
-            ("qp_solver", self.qp_solver, ("auto", *QP_SOLVERS)),
+            ("qp_solver", self.qp_solver, ("interior", *QP_SOLVERS)),
             ("hessian", self.hessian, HESSIANS),
         ):
             if value not in known:
                 raise InputError(
                     f"{name}: no '{value}'{did_you_mean(value, known)}; there are: {', '.join(sorted(known))}"
                 )
+        if self.qp_solver == "interior" and self.hessian != "exact":
+            raise InputError(
+                'hessian: with qp_solver "interior" it is "exact"; for "bfgs" give another qp_solver, '
+                'such as "active_set"'
+            )
         may_be_zero = {"levenberg", "augmentation", "max_iterations", "dense_limit"}
         for option in fields(self):
             value = getattr(self, option.name)

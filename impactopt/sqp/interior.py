@@ -1,0 +1,460 @@
+"""Sequential quadratic programming where each QP is taken one interior-point step towards its solution.
+
+The QPs of a whole motion have thousands of rows; solving each of them exactly costs more than the functions.
+So the barrier of the rows is kept from one QP to the next, and every QP gets one Newton step: the primal-dual
+interior-point method of Waechter and Biegler (Mathematical Programming 106, 2006), with its filter line
+search, second-order correction and inertia control. What is ours is the Newton system: rows that determine
+variables of their own are eliminated first (`condense`), inequality rows enter a banded matrix of what is
+left (`normal`).
+
+Where no step is progress any more the rows become elastic: they may be violated at a price, as in Sl1QP
+(Nocedal and Wright 2006, section 18.5), so that an infeasible program ends at a point of least violation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from impactopt.program import (
+    Callback,
+    NonlinearProgram,
+    SolverResult,
+    Status,
+    Vector,
+    complementarity,
+    is_stationary_violation,
+    stationarity,
+)
+from impactopt.sqp.barrier import Bounded
+from impactopt.sqp.condense import Condenser, Determined, find_eliminations
+from impactopt.sqp.elastic import Elastic
+from impactopt.sqp.linesearch import Filter, Progress
+from impactopt.sqp.newton import NewtonSystem
+from impactopt.sqp.normal import NormalMatrix
+from impactopt.sqp.options import SQPOptions
+from impactopt.sqp.point import Point, TimedProgram
+from impactopt.sqp.report import Report
+
+_CORRECTIONS = 4  # second-order corrections a step, at most
+_WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
+_CLOSE = 10.0  # the barrier problem is solved to this many mu (kappa_epsilon)
+_FASTER, _POWER = 0.2, 1.5  # mu becomes min(0.2 mu, mu^1.5) (eq. 7)
+_LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
+_COMPLEMENTARY = 1e-2  # of the tolerance: multiplier x distance to the bound at a solution
+_ABSURD = 1e12  # multipliers beyond this come from rows that have none
+_NEAR = 1e-2  # violation from which on elastic rows are made hard again where they do not get further
+_CHANGES = 12  # of what is aimed at, at most
+
+
+@dataclass
+class _Step:
+    """A Newton step: of all variables, the free ones and the slacks; the rows' new multipliers."""
+
+    d: Vector
+    free: Vector
+    slack: Vector
+    y: Vector
+
+
+class _Run:
+    """One solve. Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s."""
+
+    def __init__(
+        self,
+        program: NonlinearProgram,
+        options: SQPOptions,
+        callback: Callback | None,
+        x: Vector,
+        y: Vector,
+        z: Vector,
+    ):
+        self.report = Report(program, options.violation_tolerance, callback)
+        self.program, self.options = TimedProgram(program), options
+        self.y, self.z = y, z
+        self.point = self.program.unknown(x)
+        self._determined: Sequence[Determined] = getattr(program, "determined", ())
+        self._sequence: Vector | None = getattr(program, "sequence", None)
+        self._sigma, self._price = 1.0, options.price  # of the objective; of elastic rows
+        self._changes = 0
+        self._warm = bool(np.any(y) or np.any(z))
+        self._mu = options.barrier_warm if self._warm else options.barrier
+
+    # ------------------------------------------------------------------ start
+    def _begin(self) -> None:
+        p, y, z, point = self.program, self.y, self.z, self.point
+        x = point.x
+        moves = p.x_upper - p.x_lower > 1e-12
+        bounded = (np.isfinite(p.x_lower) | np.isfinite(p.x_upper)) & moves
+        self._condenser = c = Condenser(
+            point.jacobian,
+            p.hessian(x, 1.0, np.zeros(p.m)),
+            find_eliminations(point.jacobian, p.g_lower == p.g_upper, self._determined),
+            bounded,
+        )
+        lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])
+        upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
+        self._gone = lower[c.eliminated]
+        lower, upper = lower[c.rows], upper[c.rows]
+        self._equal, self._unequal = np.flatnonzero(lower == upper), np.flatnonzero(lower < upper)
+        self._level = lower[self._equal]
+        self._held = np.flatnonzero(~moves[c.free])
+        push = self.options.push_warm if self._warm else self.options.push
+        free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
+        first = 0.0 if self._warm else 1.0
+        self._x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self._mu)
+        x = x.copy()
+        x[c.free] = self._x.values
+        self.point = point = p.point(x)
+        multipliers = np.concatenate([y, z[c.bounded]])
+        self._y = multipliers[c.rows]
+        self._gone_y = multipliers[c.eliminated]
+        rows = self._unequal
+        self._s = Bounded(
+            self._values(point)[rows],
+            lower[rows],
+            upper[rows],
+            push=push,
+            multipliers=self._y[rows],
+            mu=self._mu,
+        )
+        if first:
+            for values in (self._x, self._s):
+                values.below, values.above = np.sign(values.below) * first, np.sign(values.above) * first
+        self._newton: NewtonSystem | None = None
+        self._elastic: Elastic | None = None
+        self._filter: Filter | None = None
+
+    def _all(self, point: Point) -> Vector:
+        """Values of the program's rows, and of the bounded eliminated variables."""
+        return np.concatenate([point.g, point.x[self._condenser.bounded]])
+
+    def _values(self, point: Point) -> Vector:
+        return self._all(point)[self._condenser.rows]
+
+    # ------------------------------------------------------------------ the loop
+    def iterate(self) -> Status:
+        """From the start until a status is reached."""
+        self.point = self.program.point(self.point.x)
+        if not self.point.differentiable:
+            return Status.FAILED
+        if self._start_is_solution():
+            self.report.iteration(self.point, self._kkt, "start")
+            return Status.SOLVED
+        self._begin()
+        note = "start"
+        for _ in range(self.options.max_iterations + 1):
+            residual = self._residual(self.point, self._s.values)
+            self._take_multipliers()
+            error = self._error(0.0, residual)
+            if self.report.iteration(self.point, self._kkt, note):
+                return Status.INTERRUPTED
+            if error <= self.options.kkt_tolerance:
+                verdict = self._verdict()
+                if verdict is not None:
+                    return verdict
+                continue
+            if self._out_of_time():
+                return Status.TIME_LIMIT
+            self._lower_barrier(residual)
+            found = self._advance(residual)
+            if isinstance(found, Status):
+                return found
+            note = found
+        return Status.ITERATION_LIMIT
+
+    def _verdict(self) -> Status | None:
+        """At a solution: the end, unless rows are violated, or only the violation counted."""
+        elastic = self._elastic
+        met = elastic is None or elastic.largest() <= self.options.violation_tolerance
+        if met and self._sigma:
+            return Status.SOLVED
+        return self._change_aim(met=met)
+
+    def _start_is_solution(self) -> bool:
+        """Whether the start with the multipliers given meets all tolerances."""
+        options, point = self.options, self.point
+        self._kkt = stationarity(point.gradient, point.jacobian, self.y, self.z)
+        return (
+            self._warm
+            and self._kkt <= options.kkt_tolerance
+            and point.max_violation <= options.violation_tolerance
+            and complementarity(self.program, point.x, point.g, self.y, self.z) <= options.kkt_tolerance
+        )
+
+    def _change_aim(self, *, met: bool) -> Status | None:
+        """Where elastic rows do not get further: let only the violation count, until it is gone or least."""
+        assert self._elastic is not None
+        self._changes += 1
+        if self._changes > _CHANGES:
+            return Status.FAILED
+        price = self._elastic.price
+        if met and price < self.options.price_max:
+            self._elastic, self._sigma = None, 1.0  # from where the rows are met, as if nothing had been
+            self._price = min(10.0 * price, self.options.price_max)
+        elif self._sigma:
+            self._sigma = 0.0
+        else:
+            return Status.INFEASIBLE
+        self._mu = max(self._mu, self.options.barrier_warm)
+        self._filter = None
+        return None
+
+    def _advance(self, residual: Vector) -> str | Status:
+        """Move to the next point; what to note about it, or why there is none."""
+        begin = self.report.elapsed()
+        step = self._step(residual)
+        self.report.seconds_qp += self.report.elapsed() - begin
+        if step is None or np.abs(step.y).max(initial=0.0) > _ABSURD:
+            return self._give_way(residual)
+        keep, longest = max(0.99, 1.0 - self._mu), self._longest(step)
+        at = self._start_of(step, residual)
+        if self._filter is None:
+            self._filter = Filter.around(at.theta)
+        length, trials, corrections = longest, 0, 0
+        while True:
+            trials += 1
+            trial = self._trial(step, length)
+            if self._accepts(at, length, trial):
+                break
+            if trials == 1 and trial.theta >= at.theta and self.options.second_order_correction:
+                found, corrections = self._corrected(at, residual, trial, longest)
+                if found is not None:
+                    step, trial = found
+                    length = longest
+                    break
+            length *= 0.5
+            if length < self._filter.shortest(at):
+                return self._give_way(residual)
+        self._filter.remember(at, length, trial.phi)
+        self._move(step, trial, length, keep)
+        words = [f"barrier {self._mu:.0e}, step {length:.2g}"]
+        if self._shift:
+            words.append(f"shift {self._shift:.0e}")
+        if corrections:
+            words.append(f"{corrections} corrections")
+        if self._elastic is not None:
+            words.append(f"rows elastic at {self._elastic.price:g}")
+        return ", ".join(words)
+
+    def _move(self, step: _Step, trial: _Trial, length: float, keep: float) -> None:
+        x, s, mu = self._x, self._s, self._mu
+        below_x, above_x, dual_x = x.dual_step(step.free, mu, keep)
+        below_s, above_s, dual_s = s.dual_step(step.slack, mu, keep)
+        dual, part = min(dual_x, dual_s), length
+        if self._elastic is not None:
+            part = dual = min(dual, self._elastic.longest_dual(step.y, self._y, keep))
+            self._elastic.take(length, self._residual(trial.point, trial.slack)[self._condenser.rows])
+        gone = self._condenser.multipliers(step.d, step.y, self._shift)[self._condenser.eliminated]
+        self._y = self._y + part * (step.y - self._y)
+        self._gone_y = self._gone_y + part * (gone - self._gone_y)
+        x.move(trial.point.x[self._condenser.free], x.below + dual * below_x, x.above + dual * above_x, mu)
+        s.move(trial.slack, s.below + dual * below_s, s.above + dual * above_s, mu)
+        self.point = trial.point
+
+    # ------------------------------------------------------------------ the Newton system
+    def _residual(self, point: Point, slack: Vector) -> Vector:
+        """What the rows (m,) are off by: eliminated ones and equalities, and inequalities against their
+        slacks."""
+        out, c = self._all(point), self._condenser
+        out[c.eliminated] -= self._gone
+        out[c.rows[self._equal]] -= self._level
+        out[c.rows[self._unequal]] -= slack
+        return out
+
+    def _step(self, residual: Vector) -> _Step | None:
+        point, c = self.point, self._condenser
+        hessian = self.program.hessian(point.x, self._sigma, self.y)
+        try:
+            system = c.condense(point.jacobian, hessian, self._sigma * point.gradient, residual)
+        except np.linalg.LinAlgError:
+            return None
+        if self._newton is None:
+            sequence = None if self._sequence is None else self._sequence[c.free]
+            matrix = NormalMatrix(system.P, system.A, c.owner, sequence)
+            self._newton = NewtonSystem(matrix, self._held)
+        equal = self._equal if self._elastic is None else self._equal[:0]
+        found = self._newton.factor(system, self._weights, self._x.stiffness(), equal, c.identity)
+        if not found:
+            return None
+        return self._solve(system.q, system.r)
+
+    def _weights(self, shift: float) -> Vector:
+        """Of the rows (k,), and their offsets: of the slacks' barrier, shifted too, and of elastic rows."""
+        soft, self._offsets = np.zeros(self._condenser.rows.size), np.zeros(self._condenser.rows.size)
+        self._stiffness = self._s.stiffness() + shift
+        soft[self._unequal] = 1.0 / self._stiffness
+        self._offsets[self._unequal] = self._s.slope(self._mu) / self._stiffness
+        if self._elastic is not None:
+            give, offset = self._elastic.compliance(self._y, self._mu)
+            soft, self._offsets = soft + give, self._offsets + offset
+        return np.divide(1.0, soft, out=np.zeros_like(soft), where=soft > 0.0)
+
+    def _solve(self, q: Vector, r: Vector) -> _Step:
+        """The step for a gradient and a residual of the condensed system; its matrix stays."""
+        assert self._newton is not None
+        if self._elastic is not None:
+            r = self._elastic.residual(r)
+        c, q = self._condenser, q + self._x.slope(self._mu)
+        if self._shift:
+            q = q + self._shift * c.pull(c.expand(np.zeros(c.free.size)))
+        free, y = self._newton.solve(q, r, self._offsets)
+        slack = (y[self._unequal] - self._s.slope(self._mu)) / self._stiffness
+        if self._elastic is not None:
+            self._elastic.step(y, self._y, self._mu)
+        return _Step(c.expand(free), free, slack, y)
+
+    @property
+    def _shift(self) -> float:
+        """Of the Hessian's diagonal, in the last system."""
+        return 0.0 if self._newton is None else self._newton.shift
+
+    # ------------------------------------------------------------------ the line search
+    def _longest(self, step: _Step) -> float:
+        keep = max(0.99, 1.0 - self._mu)
+        length = min(self._x.longest(step.free, keep), self._s.longest(step.slack, keep))
+        return length if self._elastic is None else min(length, self._elastic.longest(keep))
+
+    def _start_of(self, step: _Step, residual: Vector) -> Progress:
+        mu, point = self._mu, self.point
+        slope = float(
+            point.gradient @ step.d + self._x.slope(mu) @ step.free + self._s.slope(mu) @ step.slack
+        )
+        phi = self._sigma * point.objective + mu * (
+            self._x.barrier(self._x.values) + self._s.barrier(self._s.values)
+        )
+        if self._elastic is not None:
+            slope, phi = slope + self._elastic.slope(mu), phi + self._elastic.now(mu)
+        return Progress(theta=self._theta(residual), phi=phi, slope=slope)
+
+    def _theta(self, residual: Vector, excess: Vector | None = None) -> float:
+        c = self._condenser
+        rows = residual[c.rows]
+        if self._elastic is not None:
+            rows = self._elastic.residual(rows) if excess is None else rows - excess
+        return float(np.abs(residual[c.eliminated]).sum() + np.abs(rows).sum())
+
+    def _trial(self, step: _Step, length: float) -> _Trial:
+        x = self.point.x + length * step.d
+        point, slack, mu = self.program.point(x), self._s.values + length * step.slack, self._mu
+        if not point.finite:
+            return _Trial(point, slack, np.inf, np.inf)
+        phi = self._sigma * point.objective + mu * (
+            self._x.barrier(x[self._condenser.free]) + self._s.barrier(slack)
+        )
+        excess = None
+        if self._elastic is not None:
+            p, n = self._elastic.moved(length)
+            phi, excess = phi + self._elastic.cost(p, n, mu), p - n
+        return _Trial(point, slack, self._theta(self._residual(point, slack), excess), phi)
+
+    def _accepts(self, at: Progress, length: float, trial: _Trial) -> bool:
+        assert self._filter is not None
+        return self._filter.accepts(at, length, trial.theta, trial.phi) and trial.point.differentiable
+
+    def _corrected(
+        self, at: Progress, residual: Vector, trial: _Trial, longest: float
+    ) -> tuple[tuple[_Step, _Trial] | None, int]:
+        """Second-order corrections: the step again, with what it left of the rows (section 2.4)."""
+        if self._elastic is not None:
+            return None, 0
+        left, theta = residual, trial.theta
+        for k in range(_CORRECTIONS):
+            if not trial.point.finite:
+                break
+            left = longest * left + self._residual(trial.point, trial.slack)
+            r, q = self._condenser.with_residual(left)
+            step = self._solve(q, r)
+            trial = self._trial(step, self._longest(step))
+            if self._accepts(at, longest, trial):
+                return (step, trial), k + 1
+            if trial.theta > _WORSE * theta:
+                break
+            theta = trial.theta
+        self._condenser.with_residual(residual)
+        return None, 0
+
+    def _give_way(self, residual: Vector) -> str | Status:
+        """What to do where no step is progress: let rows be violated at a price, or end."""
+        if self._error(0.0, residual) <= self.options.acceptable_tolerance and self._elastic is None:
+            return Status.ACCEPTABLE
+        point = self.point
+        if self._elastic is None:
+            self._elastic = Elastic(residual[self._condenser.rows], self._price, self._mu)
+            self._y, self._gone_y = self._elastic.clip(self._y), np.zeros_like(self._gone_y)
+            self._filter = None
+            return "rows become elastic"
+        near = point.max_violation <= _NEAR
+        if self._sigma or near:
+            end = self._change_aim(met=near)
+            if end is not None:
+                return end
+            return "rows are hard again" if self._elastic is None else "only the violation counts"
+        if is_stationary_violation(self.program, point.x, point.g, point.jacobian):
+            return Status.INFEASIBLE
+        return Status.FAILED
+
+    # ------------------------------------------------------------------ errors
+    def _take_multipliers(self) -> None:
+        """Multipliers of the program's rows and bounds, and the dual residual."""
+        p, c, point = self.program, self._condenser, self.point
+        everything = np.zeros(c.m)
+        everything[c.rows], everything[c.eliminated] = self._y, self._gone_y
+        self.y, self.z = everything[: p.m], np.zeros(p.n)
+        self.z[c.free] = self._x.multiplier
+        self.z[c.bounded] = everything[p.m :]
+        dual = self._sigma * point.gradient + point.jacobian.T @ self.y + self.z
+        held = c.free[self._held]
+        self.z[held] -= dual[held]
+        dual[held] = 0.0
+        self._dual = float(np.abs(dual).max(initial=0.0))
+        self._kkt = stationarity(point.gradient, point.jacobian, self.y, self.z)
+
+    def _error(self, mu: float, residual: Vector) -> float:
+        """The scaled error of the barrier problem (eq. 5)."""
+        x, s, c = self._x, self._s, self._condenser
+        bounds, count = x.total() + s.total(), max(1, x.bounds + s.bounds)
+        if self._elastic is not None:  # two more bounds a row, whose multipliers add up to twice the price
+            bounds, count = bounds + 2 * self._elastic.price * self._y.size, count + 2 * self._y.size
+        rows = float(np.abs(self._y).sum() + np.abs(self._gone_y).sum())
+        scale = max(_LARGE, (rows + bounds) / (c.m + count)) / _LARGE
+        slack = float(np.abs(self._y[self._unequal] - s.multiplier).max(initial=0.0))
+        off, left = max(x.off(mu), s.off(mu)), residual[c.rows]
+        if self._elastic is not None:
+            off, left = max(off, self._elastic.off(self._y, mu)), self._elastic.residual(left)
+        violation = max(float(np.abs(v).max(initial=0.0)) for v in (left, residual[c.eliminated]))
+        off /= max(_LARGE, bounds / count) / _LARGE
+        return max(max(self._dual, slack) / scale, violation, off if mu else off / _COMPLEMENTARY)
+
+    def _lower_barrier(self, residual: Vector) -> None:
+        least = _COMPLEMENTARY * self.options.kkt_tolerance / 11.0
+        while self._mu > least and self._error(self._mu, residual) <= _CLOSE * self._mu:
+            self._mu = max(least, min(_FASTER * self._mu, self._mu**_POWER))
+            self._filter = None
+
+    def _out_of_time(self) -> bool:
+        return self.options.time_limit is not None and self.report.elapsed() > self.options.time_limit
+
+
+@dataclass
+class _Trial:
+    """A point to try, with its slacks, violation theta and barrier function phi."""
+
+    point: Point
+    slack: Vector
+    theta: float
+    phi: float
+
+
+def solve_interior(
+    program: NonlinearProgram, x: Vector, y: Vector, z: Vector, options: SQPOptions, callback: Callback | None
+) -> SolverResult:
+    """What `solve_sqp` does with `qp_solver="interior"`; all checked by then."""
+    run = _Run(program, options, callback, x, y, z)
+    try:
+        status = run.iterate()
+    except KeyboardInterrupt:
+        status = Status.INTERRUPTED
+    return run.report.result(status, run.program, run.point, run.y, run.z)

@@ -154,10 +154,13 @@ class Builder:
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}
 
-    def add_nodes(self, instances: list[list[Affine]], places: Sequence[Place | str]) -> list[Index]:
+    def add_nodes(
+        self, instances: list[list[Affine]], places: Sequence[Place | str], *, closed: int = 0
+    ) -> list[Index]:
         """Nodes of the block ``node`` with their rows, but for those of torque; the torques' outputs.
 
-        instances : y, y', y'', legs, sole wrench, T of each.
+        instances : y, y', y'', legs, sole wrench, T of each.  closed : so many of the last have the posture
+        of another, whose rows close their legs.
         """
         c, part = self.coordinates, self.parts("node")
         limits, rates = self.robot.torque_limit, self.robot.velocity_limit[c.dependent]
@@ -172,6 +175,8 @@ class Builder:
                 (self.velocity.name, "leg_rate", c.leg_labels, self.velocity.fraction, fast),
                 ("equation of motion of the base", "base", DIRECTIONS[: c.base], 0.0, self.unbalanced),
             ):
+                if name == "closure" and i >= len(instances) - closed:
+                    continue
                 self.rows.add(
                     term=term,
                     place=place,

@@ -167,7 +167,8 @@ class Transcription(ContactProgram):
             coasting, name = self.brake.coasting_node(self.coast_w)
             instances.append(coasting)
             places.append(name)
-        self._torque_rows(places, self.add_nodes(instances, places))
+        outputs = self.add_nodes(instances, places, closed=int(self.brake is not None))
+        self._torque_rows(places, outputs)
         joints = np.arange(self.coordinates.base, self.ny)
         self.rows.add(
             term=self.position.name,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from impactopt.errors import check_array
 from impactopt.program import (
@@ -71,7 +72,9 @@ def solve_sqp(
     x0 = np.clip(x0, program.x_lower, program.x_upper)
     options = options or SQPOptions()
     if options.qp_solver == "interior":
-        return solve_interior(program, x0, y, z, options, callback)
+        # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
+        with threadpool_limits(limits=1, user_api="blas"):
+            return solve_interior(program, x0, y, z, options, callback)
     run = _Run(program, options, callback, x0, y, z)
     try:
         status = run.iterate()

@@ -10,7 +10,7 @@ from impactopt.program import Matrix, Vector
 from impactopt.sqp.condense import Condensed
 from impactopt.sqp.normal import Index, NormalMatrix
 
-_PENALTY = 1e10  # weight of the equalities that are left, in the matrix: it changes no step
+_PENALTY = 1e9  # weight of the equalities that are left, in the matrix: it changes no step
 _REFINEMENTS = 1  # weights of ten decades cost digits
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
 _GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0

@@ -37,16 +37,13 @@ def drive(
 
         read = read_problem_file(problem)
         directory = None if out is None else make_directory(out)
-        name = read.solver.name
         with Progress(console, quiet=quiet) as progress:
             series = drive_nail(
                 read.build(),
                 depth=depth,
                 most=most,
                 report=progress.say,
-                solver=name,
-                options=read.solver.options.get(name),
-                time_limit=read.solver.time_limit,
+                **read.solver.arguments(),
             )
         done = plain(series.describe())
         text = json.dumps(done, indent=2)

@@ -47,7 +47,7 @@ def strike(
 
         check_time_limit(time_limit)
         read = read_problem_file(file)
-        chosen = solver.value if solver is not None else read.solver.name
+        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
         with Progress(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
@@ -55,13 +55,11 @@ def strike(
             progress.say("building the program (compiles for a minute or two the first time)")
             solution = optimize_strike(
                 problem,
-                solver=chosen,
                 starts=starts,
                 seed=seed,
-                options=read.solver.options.get(chosen),
-                time_limit=time_limit if time_limit is not None else read.solver.time_limit,
                 report=progress.say,
                 callback=progress.iteration,
+                **chosen,
             )
             progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
         record = record_of_strike(solution, problem=read.text, problem_path=read.path)

@@ -104,7 +104,7 @@ def solve(
 
         check_time_limit(time_limit)
         read = read_problem_file(file)
-        chosen = solver.value if solver is not None else read.solver.name
+        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
         with Progress(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
@@ -112,14 +112,12 @@ def solve(
             progress.say("building the program (compiles for a minute or two the first time)")
             solution = plan(
                 problem,
-                solver=chosen,
                 start=start.value,
                 starts=starts,
                 seed=seed,
-                options=read.solver.options.get(chosen),
-                time_limit=time_limit if time_limit is not None else read.solver.time_limit,
                 report=progress.say,
                 callback=progress.iteration,
+                **chosen,
             )
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
             record = _record(solution, read, validate, progress)

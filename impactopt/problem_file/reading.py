@@ -37,6 +37,12 @@ class SolverSettings:
     time_limit: float | None = None
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
+    def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
+        """What `solve` and its like take of a solver; given ones go before the file's."""
+        chosen = self.name if solver is None else solver
+        limit = self.time_limit if time_limit is None else time_limit
+        return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
+
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemFile:

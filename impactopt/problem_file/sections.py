@@ -91,34 +91,32 @@ class Objective(Section):
     return_price: NotNegative = optional()
 
 
-class Impulse(Section):
+class Weighted(Section):
+    weight: float = optional()
+
+
+class Impulse(Weighted):
     kind = objectives.Impulse
-    weight: float = optional()
 
 
-class PeakForce(Section):
+class PeakForce(Weighted):
     kind = objectives.PeakForce
-    weight: float = optional()
 
 
-class TargetEnergy(Section):
+class TargetEnergy(Weighted):
     kind = objectives.TargetEnergy
-    weight: float = optional()
 
 
-class Penetration(Section):
+class Penetration(Weighted):
     kind = objectives.Penetration
-    weight: float = optional()
 
 
-class AngularMomentum(Section):
+class AngularMomentum(Weighted):
     kind = objectives.AngularMomentum
-    weight: float = optional()
 
 
-class Effort(Section):
+class Effort(Weighted):
     kind = objectives.Effort
-    weight: float = optional()
 
 
 class Objectives(Section):

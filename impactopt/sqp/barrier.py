@@ -101,19 +101,16 @@ class Bounded:
         """The longest part <= 1 of a step that leaves 1 - keep of every distance (eq. 15a)."""
         low, high = self._distances()
         return min(
-            _longest(low, np.where(self._has_lower, step, 0.0), keep),
-            _longest(high, np.where(self._has_upper, -step, 0.0), keep),
+            longest(low, np.where(self._has_lower, step, 0.0), keep),
+            longest(high, np.where(self._has_upper, -step, 0.0), keep),
         )
 
     def dual_step(self, step: Vector, mu: float, keep: float) -> tuple[Vector, Vector, float]:
-        """Steps of both multipliers for a step of the values (eq.
-
-        12), and the longest part of them (eq. 15b).
-        """
+        """Both multipliers' steps for a step of the values, eq. 12, and the longest part of them, eq. 15b."""
         low, high = self._distances()
         below = np.where(self._has_lower, mu / low - self.below - self.below / low * step, 0.0)
         above = np.where(self._has_upper, mu / high - self.above + self.above / high * step, 0.0)
-        return below, above, min(_longest(self.below, below, keep), _longest(self.above, above, keep))
+        return below, above, min(longest(self.below, below, keep), longest(self.above, above, keep))
 
     def move(self, values: Vector, below: Vector, above: Vector, mu: float) -> None:
         """Take new values, and multipliers kept near mu / distance."""
@@ -127,6 +124,7 @@ class Bounded:
         )
 
 
-def _longest(room: Vector, step: Vector, keep: float) -> float:
+def longest(room: Vector, step: Vector, keep: float) -> float:
+    """The longest part <= 1 of a step that leaves 1 - keep of the room that it shrinks."""
     shrinks = step < 0.0
     return min(1.0, float((keep * room[shrinks] / -step[shrinks]).min(initial=1.0)))

@@ -72,10 +72,11 @@ def find_eliminations(
 
 @dataclass
 class _Stage:
-    """Where the numbers of one elimination stand: q its rows, e its variables, t other rows that these touch,
-    c the
-    variables that the rows touch, h those that the Hessian couples to e. Values that are none point to the
-    end."""
+    """Where the numbers of one elimination stand; values that are none point to the end.
+
+    q, e : its rows and variables; t : other rows that these variables touch; c : variables that its rows
+    touch; h : those that the Hessian couples to e.
+    """
 
     q: Index
     e: Index
@@ -94,8 +95,7 @@ class _Stage:
 
 
 class _Solved(NamedTuple):
-    """What going back needs: B^-1, X = B^-1 N, the step x0 = B^-1 r that meets the rows, and values touched.
-    What going back needs: B^-1, X = B^-1 N, the step x0 = B^-1 r that meets the rows, and values touched."""
+    """What going back needs: B^-1, X = B^-1 N, the step x0 = B^-1 r that meets the rows, values touched."""
 
     inverse: Stack
     X: Stack

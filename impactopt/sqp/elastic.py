@@ -1,5 +1,6 @@
-"""Rows that may be violated at a price: row = p - n with p, n >= 0 under the barrier, price (p + n) in the
-objective.
+"""Rows that may be violated at a price.
+
+Row = p - n with p, n >= 0 under the barrier, and price (p + n) in the objective.
 
 Source: Waechter and Biegler 2006, section 3.3.1, whose restoration phase does this without the objective.
 """
@@ -9,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from impactopt.program import Vector
+from impactopt.sqp.barrier import longest
 
 
 class Elastic:
@@ -56,11 +58,11 @@ class Elastic:
 
     def longest(self, keep: float) -> float:
         """The longest part <= 1 of the steps of p and n that keeps them positive."""
-        return min(_longest(self._p, self._dp, keep), _longest(self._n, self._dn, keep))
+        return min(longest(self._p, self._dp, keep), longest(self._n, self._dn, keep))
 
     def longest_dual(self, new: Vector, y: Vector, keep: float) -> float:
         """The longest part <= 1 of the multipliers' step that keeps them below the price."""
-        return min(_longest(self.price - y, y - new, keep), _longest(self.price + y, new - y, keep))
+        return min(longest(self.price - y, y - new, keep), longest(self.price + y, new - y, keep))
 
     def moved(self, length: float) -> tuple[Vector, Vector]:
         """p and n after a part of their steps."""
@@ -90,8 +92,3 @@ class Elastic:
         """Largest |multiplier x p - mu|, and likewise of n."""
         gaps = np.abs(self._p * (self.price - y) - mu), np.abs(self._n * (self.price + y) - mu)
         return max(float(g.max(initial=0.0)) for g in gaps)
-
-
-def _longest(room: Vector, step: Vector, keep: float) -> float:
-    shrinks = step < 0.0
-    return min(1.0, float((keep * room[shrinks] / -step[shrinks]).min(initial=1.0)))

@@ -21,7 +21,6 @@ import numpy as np
 from impactopt.program import (
     Callback,
     NonlinearProgram,
-    SolverResult,
     Status,
     Vector,
     complementarity,
@@ -59,8 +58,11 @@ class _Step:
     y: Vector
 
 
-class _Run:
-    """One solve. Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s."""
+class InteriorRun:
+    """One solve with `qp_solver="interior"`.
+
+    Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s.
+    """
 
     def __init__(
         self,
@@ -103,7 +105,6 @@ class _Run:
         self._held = np.flatnonzero(~moves[c.free])
         push = self.options.push_warm if self._warm else self.options.push
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
-        first = 0.0 if self._warm else 1.0
         self._x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self._mu)
         x = x.copy()
         x[c.free] = self._x.values
@@ -120,9 +121,9 @@ class _Run:
             multipliers=self._y[rows],
             mu=self._mu,
         )
-        if first:
+        if not self._warm:
             for values in (self._x, self._s):
-                values.below, values.above = np.sign(values.below) * first, np.sign(values.above) * first
+                values.below, values.above = np.sign(values.below), np.sign(values.above)
         self._newton: NewtonSystem | None = None
         self._elastic: Elastic | None = None
         self._filter: Filter | None = None
@@ -209,7 +210,7 @@ class _Run:
         self.report.seconds_qp += self.report.elapsed() - begin
         if step is None or np.abs(step.y).max(initial=0.0) > _ABSURD:
             return self._give_way(residual)
-        keep, longest = max(0.99, 1.0 - self._mu), self._longest(step)
+        longest = self._longest(step)
         at = self._start_of(step, residual)
         if self._filter is None:
             self._filter = Filter.around(at.theta)
@@ -229,7 +230,7 @@ class _Run:
             if length < self._filter.shortest(at):
                 return self._give_way(residual)
         self._filter.remember(at, length, trial.phi)
-        self._move(step, trial, length, keep)
+        self._move(step, trial, length)
         words = [f"barrier {self._mu:.0e}, step {length:.2g}"]
         if self._shift:
             words.append(f"shift {self._shift:.0e}")
@@ -239,8 +240,8 @@ class _Run:
             words.append(f"rows elastic at {self._elastic.price:g}")
         return ", ".join(words)
 
-    def _move(self, step: _Step, trial: _Trial, length: float, keep: float) -> None:
-        x, s, mu = self._x, self._s, self._mu
+    def _move(self, step: _Step, trial: _Trial, length: float) -> None:
+        x, s, mu, keep = self._x, self._s, self._mu, self._keep
         below_x, above_x, dual_x = x.dual_step(step.free, mu, keep)
         below_s, above_s, dual_s = s.dual_step(step.slack, mu, keep)
         dual, part = min(dual_x, dual_s), length
@@ -312,8 +313,13 @@ class _Run:
         return 0.0 if self._newton is None else self._newton.shift
 
     # ------------------------------------------------------------------ the line search
+    @property
+    def _keep(self) -> float:
+        """The part of a distance to a bound that a step may take, at most (tau, eq. 8)."""
+        return max(0.99, 1.0 - self._mu)
+
     def _longest(self, step: _Step) -> float:
-        keep = max(0.99, 1.0 - self._mu)
+        keep = self._keep
         length = min(self._x.longest(step.free, keep), self._s.longest(step.slack, keep))
         return length if self._elastic is None else min(length, self._elastic.longest(keep))
 
@@ -322,12 +328,15 @@ class _Run:
         slope = float(
             point.gradient @ step.d + self._x.slope(mu) @ step.free + self._s.slope(mu) @ step.slack
         )
-        phi = self._sigma * point.objective + mu * (
-            self._x.barrier(self._x.values) + self._s.barrier(self._s.values)
-        )
+        phi = self._phi(point, self._s.values)
         if self._elastic is not None:
             slope, phi = slope + self._elastic.slope(mu), phi + self._elastic.now(mu)
         return Progress(theta=self._theta(residual), phi=phi, slope=slope)
+
+    def _phi(self, point: Point, slack: Vector) -> float:
+        """The barrier function, without what elastic rows add."""
+        barriers = self._x.barrier(point.x[self._condenser.free]) + self._s.barrier(slack)
+        return self._sigma * point.objective + self._mu * barriers
 
     def _theta(self, residual: Vector, excess: Vector | None = None) -> float:
         c = self._condenser
@@ -341,9 +350,7 @@ class _Run:
         point, slack, mu = self.program.point(x), self._s.values + length * step.slack, self._mu
         if not point.finite:
             return _Trial(point, slack, np.inf, np.inf)
-        phi = self._sigma * point.objective + mu * (
-            self._x.barrier(x[self._condenser.free]) + self._s.barrier(slack)
-        )
+        phi = self._phi(point, slack)
         excess = None
         if self._elastic is not None:
             p, n = self._elastic.moved(length)
@@ -446,15 +453,3 @@ class _Trial:
     slack: Vector
     theta: float
     phi: float
-
-
-def solve_interior(
-    program: NonlinearProgram, x: Vector, y: Vector, z: Vector, options: SQPOptions, callback: Callback | None
-) -> SolverResult:
-    """What `solve_sqp` does with `qp_solver="interior"`; all checked by then."""
-    run = _Run(program, options, callback, x, y, z)
-    try:
-        status = run.iterate()
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
-    return run.report.result(status, run.program, run.point, run.y, run.z)

@@ -30,10 +30,7 @@ class Progress:
         )
 
     def falls(self, length: float, phi: float) -> bool:
-        """Whether phi falls as its slope lets expect (Armijo's condition, eq.
-
-        20); rounding is let through.
-        """
+        """Whether phi falls as its slope lets expect: Armijo's condition, eq. 20, but for rounding."""
         return phi <= self.phi + _ARMIJO * length * self.slope + 1e-13 * abs(self.phi)
 
 

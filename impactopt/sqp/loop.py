@@ -23,7 +23,7 @@ from impactopt.program import (
     stationarity,
 )
 from impactopt.sqp.hessian import QuadraticModel, make_hessian
-from impactopt.sqp.interior import solve_interior
+from impactopt.sqp.interior import InteriorRun
 from impactopt.sqp.merit import Filter, Merit
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point, TimedProgram
@@ -71,15 +71,14 @@ def solve_sqp(
     )
     x0 = np.clip(x0, program.x_lower, program.x_upper)
     options = options or SQPOptions()
-    if options.qp_solver == "interior":
-        # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
-        with threadpool_limits(limits=1, user_api="blas"):
-            return solve_interior(program, x0, y, z, options, callback)
-    run = _Run(program, options, callback, x0, y, z)
-    try:
-        status = run.iterate()
-    except KeyboardInterrupt:
-        status = Status.INTERRUPTED
+    interior = options.qp_solver == "interior"
+    run = (InteriorRun if interior else _Run)(program, options, callback, x0, y, z)
+    # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
+    with threadpool_limits(limits=1 if interior else None, user_api="blas"):
+        try:
+            status = run.iterate()
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
     return run.report.result(status, run.program, run.point, run.y, run.z)
 
 

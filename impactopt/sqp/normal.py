@@ -67,8 +67,7 @@ class NormalMatrix:
         band, width = self._band, self.width
 
         def at(i: Any, j: Any) -> Any:
-            """Where the entry (i, j) of the lower triangle stands: in the band, or behind it in the border.
-            Where the entry (i, j) of the lower triangle stands: in the band, or behind it in the border."""
+            """Where the entry (i, j) of the lower triangle stands: in the band, or in the border behind."""
             below, above = np.maximum(place[i], place[j]), np.minimum(place[i], place[j])
             inside = (below - above) + (width + 1) * above
             return np.where(below < band, inside, band * (width + 1) + (below - band) * self._n + above)

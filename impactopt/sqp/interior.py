@@ -326,7 +326,9 @@ class InteriorRun:
     def _start_of(self, step: _Step, residual: Vector) -> Progress:
         mu, point = self._mu, self.point
         slope = float(
-            point.gradient @ step.d + self._x.slope(mu) @ step.free + self._s.slope(mu) @ step.slack
+            self._sigma * (point.gradient @ step.d)
+            + self._x.slope(mu) @ step.free
+            + self._s.slope(mu) @ step.slack
         )
         phi = self._phi(point, self._s.values)
         if self._elastic is not None:

@@ -16,6 +16,7 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.extra_terms import HitCone, SelfCollision
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
+from impactopt.problem_hash import problem_hash
 from impactopt.reach import reach
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
@@ -267,6 +268,11 @@ class ImpactProblem:
     def extra(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """The problem's own term of a kind that has no default; None if it has none."""
         return next((t for t in self.terms if isinstance(t, kind)), None)
+
+    @cached_property
+    def hash(self) -> str:
+        """What this problem is, in 16 hexadecimal digits: see `impactopt.problem_hash.problem_hash`."""
+        return problem_hash(self)
 
     @cached_property
     def start_posture(self) -> Array:

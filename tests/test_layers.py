@@ -29,6 +29,7 @@ LAYERS = (
         "extra_terms",
         "objectives",
         "scenario",
+        "problem_hash",
         "problem",
         "plan",
     ),

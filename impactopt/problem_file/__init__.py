@@ -6,23 +6,36 @@
 * values.py     ranges of the keys' values
 * mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
 * reading.py    from file to problem
+* changes.py    other values by dotted keys
+* toml.py       text from and to plain data
 * names.py      the files that come with the package, by name
 """
 
+from impactopt.problem_file.changes import change_data, key_place, parse_settings
 from impactopt.problem_file.names import problem_names
 from impactopt.problem_file.reading import (
     ProblemFile,
     SolverSettings,
     load_problem,
     parse_problem_file,
+    problem_file_from_data,
+    problem_from_data,
     read_problem_file,
 )
+from impactopt.problem_file.toml import read_toml, write_toml
 
 __all__ = [
     "ProblemFile",
     "SolverSettings",
+    "change_data",
+    "key_place",
     "load_problem",
     "parse_problem_file",
+    "parse_settings",
+    "problem_file_from_data",
+    "problem_from_data",
     "problem_names",
     "read_problem_file",
+    "read_toml",
+    "write_toml",
 ]

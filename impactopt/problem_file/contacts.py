@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, TypeVar
+from functools import cache
+from typing import Any, ClassVar, Literal, TypeVar, cast
 
 from pydantic import ConfigDict, Field, create_model
 
@@ -107,7 +108,12 @@ def with_kinds(file: type[File], data: Mapping[str, Any]) -> type[File]:
         "target": _chosen(data, "target", "kind", TARGETS, Target, "free mass"),
         "contact": _chosen(data, "contact", "law", LAWS, Contact, "spring damper"),
     }
-    fields: dict[str, Any] = {name: (kind, ...) for name, kind in found.items()}
+    return cast(type[File], _file_with(file, found["target"], found["contact"]))
+
+
+@cache  # a sweep reads thousands
+def _file_with(file: type[Section], target: type[Section], contact: type[Section]) -> type[Section]:
+    fields: dict[str, Any] = {"target": (target, ...), "contact": (contact, ...)}
     return create_model(file.__name__, __base__=file, **fields)
 
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, get_args
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
 
 from impactopt.errors import did_you_mean
-
-Place = tuple[str | int, ...]
+from impactopt.problem_file.toml import Place
 
 _HEADER = re.compile(r"""^\s*(\[\[?)\s*([\w."'\s-]+?)\s*\]\]?\s*(?:#.*)?$""")
 _KEY = re.compile(r"""^\s*([\w."'-]+)\s*=""")
@@ -53,19 +51,22 @@ class Mistake:
         return f"{where}: {self.text}" if where else self.text
 
 
-def report_mistakes(path: Path, text: str, mistakes: Iterable[Mistake]) -> str:
-    """One message for all mistakes, in the order of the file, with the lines where they can be found."""
-    lines = key_lines(text)
+def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[Mistake]) -> str:
+    """One message for all mistakes, in the order of the file, with the lines where they can be found.
+
+    where : the file, or what else it was.  lines : of keys (`key_lines`); 0 for what was set from outside.
+    """
     found = []
     for mistake in mistakes:
         place = mistake.place
         # what is missing has no line of its own, and neither has a key inside a value
         line = next((lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines), None)
-        found.append((line is None, line or 0, f"line {line}, {mistake}" if line else str(mistake)))
+        at = "" if line is None else f"line {line}, " if line else "as set, "
+        found.append((line is None, line or 0, f"{at}{mistake}"))
     rows = list(dict.fromkeys(row for _, _, row in sorted(found)))
     if len(rows) == 1:
-        return f"{path}, {rows[0]}" if rows[0].startswith("line") else f"{path}: {rows[0]}"
-    return "\n".join([f"{path} has {len(rows)} mistakes:", *(f"  {row}" for row in rows)])
+        return f"{where}, {rows[0]}" if rows[0].startswith(("line", "as set")) else f"{where}: {rows[0]}"
+    return "\n".join([f"{where} has {len(rows)} mistakes:", *(f"  {row}" for row in rows)])
 
 
 def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]:

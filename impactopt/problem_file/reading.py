@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,14 +12,24 @@ from pydantic import ValidationError
 
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
+from impactopt.problem_file.changes import change_and_place
 from impactopt.problem_file.contacts import with_kinds
-from impactopt.problem_file.mistakes import Mistake, mistakes_of, report_mistakes
+from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file
 from impactopt.problem_file.sections import File
+from impactopt.problem_file.toml import Place, TOMLError, plain_value, read_toml, write_toml
 from impactopt.robot import Robot
 from impactopt.stance import BothSoles, FixedBase, OneSole, Stance
 
-__all__ = ["ProblemFile", "SolverSettings", "load_problem", "parse_problem_file", "read_problem_file"]
+__all__ = [
+    "ProblemFile",
+    "SolverSettings",
+    "load_problem",
+    "parse_problem_file",
+    "problem_file_from_data",
+    "problem_from_data",
+    "read_problem_file",
+]
 
 _T = TypeVar("_T")
 
@@ -48,13 +56,31 @@ class SolverSettings:
 class ProblemFile:
     """A problem file whose text is sound.
 
-    path, text : where it was read, and what it said.  solver : its [solver] section.
+    path, text : where it was read, and what it said, or says with its changes.  data : the same as tables.
+    solver : its [solver] section.
     """
 
     path: Path
     text: str
+    data: Mapping[str, Any] = field(repr=False)
     solver: SolverSettings
     content: File = field(repr=False)
+    lines: Mapping[Place, int] = field(repr=False, default_factory=dict)
+
+    def changed(self, settings: Mapping[str, Any]) -> ProblemFile:
+        """The file with other values, by dotted keys (`change_data`).
+
+        Raises
+        ------
+        InputError : unknown keys; values that are wrong, as in a file.
+        """
+        if not settings:
+            return self
+        try:
+            data, places = change_and_place(self.data, settings)
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from error
+        return _checked(data, self.path, write_toml(data), {**self.lines, **dict.fromkeys(places, 0)})
 
     def build(self) -> ImpactProblem:
         """The problem, with its robot.
@@ -64,7 +90,7 @@ class ProblemFile:
         InputError : what only shows with the robot: a URDF that is missing or not sound, an unknown joint or
             frame; then an unknown striker, posture and sole, all at once; then a point out of reach.
         """
-        content, mistakes = self.content, _Collector(self.text)
+        content, mistakes = self.content, _Collector(self.lines)
         robot = mistakes.attempt(("robot",), lambda: content.make_robot(self.path.parent))
         mistakes.raise_if_any(self.path)
         assert robot is not None  # for mypy: it would have been a mistake
@@ -89,48 +115,72 @@ def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
     return read_problem_file(path).build()
 
 
-def read_problem_file(path: str | os.PathLike[str]) -> ProblemFile:
+def problem_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str]) -> ImpactProblem:
+    """The problem that a problem file's data describes, as `read_toml` or `change_data` gives them.
+
+    where : what messages call it; files that it names are relative to the folder of that path.
+
+    Raises
+    ------
+    InputError : the data are wrong; one message with all mistakes.
+    """
+    return problem_file_from_data(data, where=where).build()
+
+
+def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str]) -> ProblemFile:
+    """Data checked like the text of a problem file, with that text; see `problem_from_data`."""
+    data = plain_value(data)
+    return _checked(data, Path(where), write_toml(data), {})
+
+
+def read_problem_file(path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None) -> ProblemFile:
     """A problem file, by path or name, checked as far as that is possible without its robot.
+
+    settings : values by dotted key, in place of the file's (`change_data`).
 
     Raises
     ------
     InputError : the file cannot be read, or is wrong; one message with all mistakes and their lines.
     """
     path = problem_file(path)
-    return parse_problem_file(_read(path), path)
+    return parse_problem_file(_read(path), path, settings)
 
 
-def parse_problem_file(text: str, path: Path) -> ProblemFile:
+def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None = None) -> ProblemFile:
     """A problem file's text, checked like the file; `path` is where it was: the place of the files it names.
 
     Raises
     ------
     InputError : the text is wrong; one message with all mistakes and their lines.
     """
-    tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        data = read_toml(text)
+    except TOMLError as error:
         raise InputError(f"{path} is not TOML: {error}") from error
+    return _checked(data, path, text, key_lines(text)).changed(settings or {})
+
+
+def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Place, int]) -> ProblemFile:
     mistakes, model = _robot_given_once(data), with_kinds(File, data)
     try:
         content = model.model_validate(data)
     except ValidationError as error:
         mistakes += mistakes_of(error, model)
     if mistakes:
-        raise InputError(report_mistakes(path, text, mistakes))
+        raise InputError(report_mistakes(str(path), lines, mistakes))
     given = content.solver.model_dump(exclude_unset=True) if content.solver else {}
     options: dict[str, Any] = {}
     for solver in {"ipopt", "sqp"} & given.keys():
         options[solver] = given.pop(solver)
-    return ProblemFile(path=path, text=text, content=content, solver=SolverSettings(**given, options=options))
+    settings = SolverSettings(**given, options=options)
+    return ProblemFile(path=path, text=text, data=data, content=content, solver=settings, lines=lines)
 
 
 class _Collector:
     """Gathers the mistakes of several attempts."""
 
-    def __init__(self, text: str) -> None:
-        self._text, self._mistakes = text, list[Mistake]()
+    def __init__(self, lines: Mapping[Place, int]) -> None:
+        self._lines, self._mistakes = lines, list[Mistake]()
 
     def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
         """What `make` gives; None, and a mistake at `place`, if it raises an InputError."""
@@ -142,7 +192,7 @@ class _Collector:
 
     def raise_if_any(self, path: Path) -> None:
         if self._mistakes:
-            raise InputError(report_mistakes(path, self._text, self._mistakes))
+            raise InputError(report_mistakes(str(path), self._lines, self._mistakes))
 
 
 def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:

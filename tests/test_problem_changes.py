@@ -1,0 +1,240 @@
+"""Problem files as data: other values by dotted keys, text and back, and the hash of what came out."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from impactopt import objectives, terms
+from impactopt.contact import CustomLaw, FreeMass
+from impactopt.errors import InputError
+from impactopt.problem import ImpactProblem, Phase
+from impactopt.problem_file import (
+    change_data,
+    key_place,
+    load_problem,
+    parse_settings,
+    problem_from_data,
+    read_problem_file,
+    read_toml,
+    write_toml,
+)
+from impactopt.problem_hash import problem_hash
+from impactopt.robot import Striker
+
+DATA: dict[str, Any] = {
+    "problem": {
+        "robot": "planar_arm",
+        "striker": "hammer",
+        "start": "ready",
+        "point_m": [0.7, 0.0, 0.75],
+        "normal": [0.0, 0.0, -1.0],
+    },
+    "target": {"mass_kg": 0.5},
+    "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 30.0},
+    "swing": {"duration_s": [0.4, 0.8]},
+    "scenarios": [{"name": "missing", "missing": True}, {"name": "heavy", "mass": 2.0}],
+}
+
+
+@pytest.fixture(scope="module")
+def problem() -> ImpactProblem:
+    return problem_from_data(DATA, where="arm.toml")
+
+
+def message(settings: dict[str, Any]) -> str:
+    with pytest.raises(InputError) as caught:
+        change_data(DATA, settings)
+    return str(caught.value)
+
+
+def test_keys_may_leave_their_unit_out_and_name_entries_of_lists() -> None:
+    before = write_toml(DATA)
+    data = change_data(
+        DATA,
+        {
+            "target.mass": np.float64(8),
+            "contact.stiffness_N_m": 2e4,
+            "problem.point.1": 0.1,
+            "problem.normal": np.array([1.0, 0.0, 0.0]),
+            "scenarios.heavy.mass": 3,
+            "scenarios.0.brake_after": 0.03,
+            "swing.duration": (0.5, 0.6),
+            "terms.torque_limit.fraction": 0.7,
+            "solver.ipopt.tol": 1e-5,
+        },
+    )
+    assert data["target"] == {"mass_kg": 8.0} and type(data["target"]["mass_kg"]) is float
+    assert data["contact"] == {"stiffness_N_m": 2e4, "damping_N_s_m": 30.0}
+    assert data["problem"]["point_m"] == [0.7, 0.1, 0.75]
+    assert data["problem"]["normal"] == [1.0, 0.0, 0.0]
+    assert data["scenarios"][1]["mass"] == 3 and data["scenarios"][0]["brake_after_s"] == 0.03
+    assert data["swing"]["duration_s"] == [0.5, 0.6]
+    assert data["terms"] == {"torque_limit": {"fraction": 0.7}}
+    assert data["solver"] == {"ipopt": {"tol": 1e-5}}
+    assert write_toml(DATA) == before, "the data that were given are left alone"
+    assert key_place(DATA, "scenarios.heavy.mass") == ("scenarios", 1, "mass")
+
+
+def test_a_key_of_the_robot_makes_a_section_of_its_preset() -> None:
+    data = change_data(DATA, {"robot.kp": 500.0, "robot.torque_limit.elbow": 30.0})
+    assert data["robot"] == {
+        "preset": "planar_arm",
+        "kp_N_m_rad": 500.0,
+        "torque_limit_N_m": {"elbow": 30.0},
+    }
+    assert "robot" not in data["problem"]
+    assert change_data(DATA, {"problem.robot": "arm7"})["problem"]["robot"] == "arm7"
+
+
+def test_another_kind_has_other_keys() -> None:
+    data = change_data(DATA, {"target": {"kind": "nail", "mass_kg": 0.1}, "target.resistance": 300})
+    assert data["target"] == {"kind": "nail", "mass_kg": 0.1, "resistance_N": 300}
+    assert "resistance" in message({"target.resistance": 300})
+
+
+@pytest.mark.parametrize(
+    ("key", "parts"),
+    [
+        ("target.mas", ["[target]", "'mas'", "did you mean 'mass'"]),
+        ("targets.mass", ["targets.mass", "did you mean 'target'"]),
+        ("contact.law.x", ["contact.law has no parts"]),
+        ("scenarios.hevy.mass", ["did you mean 'heavy'", "missing, heavy", "0 to 1"]),
+        ("scenarios.2.mass", ["'2'", "0 to 1"]),
+        ("scenarios.heavy.mas", ["[scenarios.1]", "did you mean 'mass'"]),
+        ("problem.point.3", ["problem.point_m", "0 to 2"]),
+        ("collision.compression.0", ["collision.compression is not in the file"]),
+        ("terms.balance.capture", ["[terms.balance]", "capture_margin"]),
+        ("", ["has no key ''", "known are problem"]),
+    ],
+)
+def test_unknown_keys_are_named_with_the_mend(key: str, parts: list[str]) -> None:
+    text = message({key: 1.0})
+    assert [part for part in parts if part not in text] == []
+    with pytest.raises(InputError):
+        key_place(DATA, key)
+
+
+def test_all_unknown_keys_are_named_at_once() -> None:
+    rows = message({"target.mas": 1, "target.mass": 2, "contact.stif": 3}).splitlines()
+    assert "2 mistakes" in rows[0] and "target.mas" in rows[1] and "contact.stif" in rows[2]
+
+
+def test_a_value_that_is_wrong_is_told_as_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "arm.toml"
+    path.write_text(write_toml({**DATA, "contact": {"stiffness_N_m": -1.0, "damping_N_s_m": 1.0}}))
+    with pytest.raises(InputError, match=r"line \d+, \[contact\] stiffness_N_m"):
+        read_problem_file(path)
+    path.write_text(write_toml(DATA))
+    with pytest.raises(InputError, match=r"arm.toml, as set, \[target\] mass_kg: -1; give a number > 0"):
+        read_problem_file(path, {"target.mass": -1})
+    with pytest.raises(InputError, match=r"arm.toml: target.mas: .*did you mean"):
+        read_problem_file(path, {"target.mas": 1})
+    with pytest.raises(InputError, match=r"case 7, \[target\] mass_kg|case 7: \[target\] mass_kg"):
+        problem_from_data(change_data(DATA, {"target.mass": 0}), where="case 7")
+
+
+def test_a_changed_files_text_says_what_is_solved(tmp_path: Path) -> None:
+    path = tmp_path / "arm.toml"
+    path.write_text(write_toml(DATA))
+    read = read_problem_file(path, {"target.mass": 0.75})
+    assert read.build().target == FreeMass(mass=0.75)
+    path.write_text(read.text)
+    assert load_problem(path).hash == read.build().hash
+    assert read_problem_file(path, {}).text == path.read_text(), "without a change its text is its own"
+
+
+def test_settings_of_a_command_line() -> None:
+    texts = [
+        "target.mass = 8",
+        "problem.striker=left_hand",
+        "target={kind='wall'}",
+        "swing.duration=[0.5, 1]",
+    ]
+    assert parse_settings(texts) == {
+        "target.mass": 8,
+        "problem.striker": "left_hand",
+        "target": {"kind": "wall"},
+        "swing.duration": [0.5, 1],
+    }
+    for text in ("target.mass", "=8", "target.mass=", "target.mass=8 kg", "a=1\nb=2", "a=__import__('os')"):
+        with pytest.raises(InputError, match="KEY=VALUE"):
+            parse_settings([text])
+    with pytest.raises(InputError, match="2 mistakes"):
+        parse_settings(["a", "b", "c=1"])
+
+
+NUMBER = st.floats(allow_nan=False) | st.integers(-(2**53), 2**53) | st.booleans()
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+VALUE = st.recursive(NUMBER | TEXT, lambda v: st.lists(v, max_size=3) | st.dictionaries(TEXT, v, max_size=3))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.dictionaries(TEXT, VALUE, max_size=4))
+def test_toml_gives_back_what_was_written(data: dict[str, Any]) -> None:
+    assert read_toml(write_toml(data)) == data
+    assert read_toml(write_toml(data, lambda place: "a comment")) == data
+
+
+def test_the_hash_is_of_the_content(problem: ImpactProblem) -> None:
+    def changed(**changes: Any) -> str:
+        return dataclasses.replace(problem, **changes).hash
+
+    same = [
+        changed(name="another"),
+        changed(target=FreeMass(mass=0.5)),
+        changed(terms=terms.DEFAULT_TERMS[::-1]),
+        changed(objectives=(objectives.Impulse(weight=1),)),
+        changed(start=problem.start_posture, point=tuple(problem.point)),
+        problem_from_data(read_toml(write_toml(DATA)), where="elsewhere").hash,
+    ]
+    assert set(same) == {problem.hash} and problem.hash == problem_hash(problem)
+    hammer = problem.robot.striker("hammer")
+    moved = Striker(name="hammer", frame=hammer.frame, point=hammer.point + np.array([0.001, 0, 0]))
+    law: dict[str, Any] = {"compression": lambda x, rate, k: k * x, "k": 1e4}
+    other = [
+        changed(target=FreeMass(mass=0.5 + 1e-15)),
+        changed(scenarios=()),
+        changed(terms=(terms.TorqueLimit(fraction=0.8),)),
+        changed(objectives=(objectives.Impulse(weight=2.0),)),
+        changed(swing=Phase(duration=(0.4, 0.8), intervals=13)),
+        changed(point=problem.point + np.array([0.001, 0, 0])),
+        changed(robot=dataclasses.replace(problem.robot, kp=problem.robot.kp * 1.01)),
+        changed(robot=problem.robot.with_striker(moved)),
+        changed(law=CustomLaw(**law)),
+        changed(law=CustomLaw(**{**law, "compression": lambda x, rate, k: k * x + 0.1 * rate})),
+        changed(law=CustomLaw(**{**law, "k": 2e4})),
+    ]
+    assert len({problem.hash, *other}) == 1 + len(other)
+
+
+def test_the_hash_is_the_same_in_another_process(problem: ImpactProblem) -> None:
+    code = (
+        "from impactopt.problem_file import problem_from_data\n"
+        f"print(problem_from_data({DATA!r}, where='arm.toml').hash)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == problem.hash
+
+
+def test_every_field_of_a_problem_counts_in_its_hash(problem: ImpactProblem) -> None:
+    """A field that could differ unseen would make two problems one in a sweep's table."""
+    source = (Path(problem_hash.__code__.co_filename)).read_text(encoding="utf-8")
+    assert "dataclasses.fields(problem)" in source
+    for name, value in (
+        ("smoothness", 2e-5),
+        ("wrench_price", 2e-3),
+        ("return_price", 0.2),
+        ("collision_stages", 2),
+        ("contact_duration", (0.002, 0.1)),
+        ("collision_elements", ((0.3, 0.7), (1.0,))),
+    ):
+        assert dataclasses.replace(problem, **{name: value}).hash != problem.hash, name

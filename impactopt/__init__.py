@@ -73,6 +73,7 @@ _EXPORTS = {
     "VelocityLimit": "terms",
     "VirtualMass": "collision",
     "arm7": "presets",
+    "collide_many": "sweeps.collisions",
     "draw_conditions": "robustness",
     "drive_nail": "blows",
     "effective_mass": "collision",

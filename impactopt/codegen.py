@@ -70,7 +70,7 @@ _NOT_IN_GRAPHS = frozenset(
         "screen",
         "solution",
         "sqp",
-        "sweep",
+        "sweeps",
         "validation",
     )
 )

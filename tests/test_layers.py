@@ -39,7 +39,7 @@ LAYERS = (
     ("validation",),
     ("reference", "cases"),
     ("starts", "solution", "baseline", "strike", "planner", "blows", "robustness"),
-    ("problem_file", "output", "replay", "sweep"),
+    ("problem_file", "output", "replay", "sweeps"),
     ("plotting", "report", "screen"),
     ("plain_errors", "bench", "reproduce"),
     ("_command_options", "_strike_command", "_validate_command", "_drive_command", "cli", "__main__"),

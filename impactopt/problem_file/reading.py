@@ -18,8 +18,6 @@ from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, rep
 from impactopt.problem_file.names import problem_file
 from impactopt.problem_file.sections import File
 from impactopt.problem_file.toml import Place, TOMLError, plain_value, read_toml, write_toml
-from impactopt.robot import Robot
-from impactopt.stance import BothSoles, FixedBase, OneSole, Stance
 
 __all__ = [
     "ProblemFile",
@@ -96,7 +94,7 @@ class ProblemFile:
         assert robot is not None  # for mypy: it would have been a mistake
         mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
         mistakes.attempt(("problem", "start"), lambda: robot.posture(content.problem.start))
-        stance = mistakes.attempt(("stance", "soles"), lambda: _stance(content, robot))
+        stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
         mistakes.raise_if_any(self.path)
         assert stance is not None
         try:
@@ -202,17 +200,6 @@ def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
         return []
     text = "given twice: keep this, or the section [robot]" if named else "missing; name a preset"
     return [Mistake(place=("problem", "robot"), sections=1, text=text)]
-
-
-def _stance(content: File, robot: Robot) -> Stance:
-    soles = content.stance.soles if content.stance else "both"
-    stance: Stance = BothSoles() if soles == "both" else OneSole(soles)
-    if not robot.floating:
-        if content.stance:
-            raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
-        stance = FixedBase()
-    stance.soles(robot)
-    return stance
 
 
 def _read(path: Path) -> str:

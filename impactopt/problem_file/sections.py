@@ -13,6 +13,7 @@ from typing import Any, Literal, cast, get_type_hints
 from pydantic import Field, create_model, model_validator
 
 from impactopt import extra_terms, objectives, terms
+from impactopt.errors import InputError
 from impactopt.presets import load_robot
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.problem_file.contacts import Contact, Target
@@ -36,6 +37,8 @@ from impactopt.robot import Robot, Sole, Striker, Tool
 from impactopt.scenario import Scenario
 from impactopt.shapes import Capsule
 from impactopt.sqp import SQPOptions
+from impactopt.stance import BothSoles, FixedBase, OneSole
+from impactopt.stance import Stance as Stances
 
 
 class Problem(Section):
@@ -365,6 +368,17 @@ class File(Section):
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset that [problem] names."""
         return self.robot.make(folder) if self.robot is not None else load_robot(self.problem.robot)
+
+    def make_stance(self, robot: Robot) -> Stances:
+        """What [stance] says of a robot; InputError for what it cannot stand on."""
+        soles = self.stance.soles if self.stance else "both"
+        stance: Stances = BothSoles() if soles == "both" else OneSole(soles)
+        if not robot.floating:
+            if self.stance:
+                raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
+            stance = FixedBase()
+        stance.soles(robot)
+        return stance
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""

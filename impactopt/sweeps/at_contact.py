@@ -1,0 +1,93 @@
+"""What a sweep of collisions says of the state at contact, and of the model that goes on from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from impactopt.collision import SDC, CollisionModel, VirtualMass
+from impactopt.errors import InputError
+from impactopt.problem_file.mistakes import mistakes_of, report_mistakes
+from impactopt.problem_file.section import Section
+from impactopt.problem_file.sections import File
+from impactopt.problem_file.values import Positive
+from impactopt.reference import FullDynamics
+from impactopt.robot import Robot
+from impactopt.stance import FixedBase, Stance
+
+__all__ = ["AtContact", "check_at_contact", "collision_model"]
+
+_VIRTUAL_BASE = {"base_mass": 1e5, "base_inertia": 1e5}  # of the paper
+_FIRST_STEP = 1e-4  # [s] of the full dynamics, which halve it
+
+
+class AtContact(Section):
+    """Section [at_contact] of a sweep of collisions.
+
+    The state at contact is that of `result`, a directory of `impactopt solve` or `strike`; or of `posture`:
+    "reach" for the problem's start with the striking point moved to the problem's point, or a posture of the
+    robot by name, which hits where its hand is. `joints` are added to it. The striking point moves along the
+    normal at `speed`: a result's velocity is scaled, a posture gets the `velocity` of least kinetic energy,
+    or the one whose joint speeds over their limits have the least sum of squares. The feed-forward torque
+    lets the robot coast. Scales are of the robot's own gains and torque limits.
+    """
+
+    posture: str = "reach"
+    result: str | None = None
+    speed: Positive | None = Field(default=None, alias="speed_m_s")
+    velocity: Literal["least energy", "least rates"] = "least energy"
+    joints: dict[str, float] = Field(default_factory=dict, alias="joints_rad")
+    kp_scale: Positive = 1.0
+    kd_scale: Positive = 1.0
+    torque_limit_scale: Positive = 1.0
+    model: Literal["sdc", "paper's sdc", "virtual mass", "full dynamics"] = "sdc"
+    freezes: int = Field(default=0, ge=0)
+    horizon: Positive = Field(default=0.2, alias="horizon_s")
+
+
+class _Holder(Section):
+    at_contact: AtContact
+
+
+def check_at_contact(given: Mapping[str, Any], where: str) -> AtContact:
+    """The section from its table.
+
+    Raises
+    ------
+    InputError : one message with all mistakes; `where` is what it calls the file.
+    """
+    try:
+        section = _Holder.model_validate({"at_contact": dict(given)}).at_contact
+    except ValidationError as error:
+        raise InputError(report_mistakes(where, {}, mistakes_of(error, _Holder))) from None
+    if section.result is not None and "posture" in section.model_fields_set:
+        raise InputError(f"{where}: [at_contact] posture, result: give one of them")
+    if section.result is None and section.speed is None:
+        raise InputError(f"{where}: [at_contact] speed_m_s: missing; only a result has a speed of its own")
+    if section.freezes and section.model != "sdc":
+        raise InputError(f"{where}: [at_contact] freezes: only of the model 'sdc', not of {section.model!r}")
+    return section
+
+
+def collision_model(content: File, robot: Robot, stance: Stance, section: AtContact) -> CollisionModel:
+    """The model that [at_contact] names, for a problem file's blow."""
+    options: dict[str, Any] = {
+        "robot": robot,
+        "striker": content.problem.striker,
+        "normal": content.problem.normal,
+        "law": content.contact.build(),
+        "target": content.target.build(),
+        "stance": stance,
+        "horizon": section.horizon,
+    }
+    if section.model == "virtual mass":
+        return VirtualMass(**options)
+    if section.model == "full dynamics":
+        return FullDynamics(**options, step=_FIRST_STEP)
+    if section.model == "sdc":
+        return SDC(**options, freezes=section.freezes)
+    soft: Any = stance if isinstance(stance, FixedBase) else replace(stance, **_VIRTUAL_BASE)  # type: ignore[type-var]
+    return SDC.paper(**{**options, "stance": soft})

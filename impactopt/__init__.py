@@ -91,6 +91,7 @@ _EXPORTS = {
     "standin": "presets",
     "striking_velocity": "cases",
     "talos": "presets",
+    "write_problem": "problem_file",
 }
 
 __all__ = ["__version__", *sorted(_EXPORTS)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,24 @@ class Tool:
     def striker(self) -> Striker:
         """The striker that the tool makes of the link which holds it."""
         return Striker(name=self.name, frame=self.frame, point=self.head)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Source:
+    """What a robot was made from, so that a problem file can name it.
+
+    Attributes
+    ----------
+    preset : name of one, or None.
+    urdf : path of a URDF, or None.
+    options : what else was given: to the preset, or to `Robot.from_urdf`.
+    tools : what the robot was given to hold after that.
+    """
+
+    preset: str | None = None
+    urdf: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    tools: tuple[Tool, ...] = ()
 
 
 def read_only(array: ArrayLike) -> Array:

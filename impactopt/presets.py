@@ -7,22 +7,41 @@ example-robot-data, which `pip install 'impactopt[robots]'` brings.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import wraps
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 import numpy as np
 import pinocchio as pin
 
-from impactopt._arms import arm7, planar_arm
+from impactopt import _arms
 from impactopt._robot_build import joint_names, lock_joints
+from impactopt._robot_parts import Source
 from impactopt._standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, standin_model
 from impactopt.errors import InputError, did_you_mean
 from impactopt.robot import Robot, Sole, Striker
 
+P = ParamSpec("P")
+
 __all__ = ["arm7", "g1", "load_robot", "planar_arm", "robot_names", "standin", "talos"]
 
 
+def _preset(make: Callable[P, Robot]) -> Callable[P, Robot]:
+    """The function of a preset, whose robots know what they were made from."""
+
+    @wraps(make)
+    def made(*args: P.args, **overrides: P.kwargs) -> Robot:
+        return replace(make(*args, **overrides), source=Source(preset=make.__name__, options=overrides))
+
+    return made
+
+
+arm7, planar_arm = _preset(_arms.arm7), _preset(_arms.planar_arm)
+
+
+@_preset
 def talos(**overrides: Any) -> Robot:
     """PAL Robotics' TALOS: 90 kg, grippers locked, 30 joints and a free-flyer.
 
@@ -81,6 +100,7 @@ _G1_SIDES = {
 _G1_WAIST = {"waist_yaw": (_7520_14, 17.6), "waist_roll": (2 * _5020, 7.0), "waist_pitch": (2 * _5020, 7.0)}
 
 
+@_preset
 def g1(**overrides: Any) -> Robot:
     """Unitree's G1 with 29 joints and rubber hands: 33 kg.
 
@@ -158,6 +178,7 @@ _ON_LEFT_FOOT = {  # half sitting, but leaning to the left, with the right foot 
 }
 
 
+@_preset
 def standin(
     *, floating: bool = True, locked: Iterable[str] | Mapping[str, float] = (), **overrides: Any
 ) -> Robot:
@@ -226,7 +247,7 @@ _PRESETS: dict[str, Callable[..., Robot]] = {
 }
 
 
-def load_robot(name: str, **overrides: Any) -> Robot:
+def load_robot(name: str, /, **overrides: Any) -> Robot:
     """The preset of that name; `overrides` go to its function, such as `standin`."""
     if name not in _PRESETS:
         raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from os import PathLike
+from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt import _robot_build as build
 from impactopt import _robot_checks as checks
-from impactopt._robot_parts import Sole, Striker, Tool, read_only
+from impactopt._robot_parts import Sole, Source, Striker, Tool, read_only
 from impactopt.errors import InputError, check_array
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
@@ -42,6 +42,7 @@ class Robot:
     strikers : by name.
     postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
         the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
+    source : what it was made from, None where that was a model in Python.
 
     Raises
     ------
@@ -61,6 +62,7 @@ class Robot:
     soles: tuple[Sole, ...] = ()
     strikers: Mapping[str, Striker] = field(default_factory=dict)
     postures: Mapping[str, Array] = field(default_factory=dict)
+    source: Source | None = None
 
     def __post_init__(self) -> None:
         checks.check_joint_types(self.model)
@@ -108,7 +110,9 @@ class Robot:
         options : as of `from_model`.
         """
         model = build.read_urdf(path, srdf, floating=floating)
-        return cls.from_model(build.lock_joints(model, locked), name=name or model.name, **options)
+        robot = cls.from_model(build.lock_joints(model, locked), name=name or model.name, **options)
+        given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, **options}
+        return dataclasses.replace(robot, source=Source(urdf=fspath(path), options=given))
 
     @classmethod
     def from_model(
@@ -236,7 +240,9 @@ class Robot:
             raise InputError(f"robot {self.name!r} has a striker {tool.name!r} already; rename the tool")
         model = self.model.copy()
         build.add_tool(model, tool)
-        return dataclasses.replace(self, model=model, strikers={**self.strikers, tool.name: tool.striker})
+        source = self.source and dataclasses.replace(self.source, tools=(*self.source.tools, tool))
+        strikers = {**self.strikers, tool.name: tool.striker}
+        return dataclasses.replace(self, model=model, strikers=strikers, source=source)
 
     def joint_positions(self, q: ArrayLike) -> Array:
         """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""

@@ -27,6 +27,13 @@ class Term:
             if isinstance(value, (int, float)) and not value >= 0:
                 raise InputError(f"{type(self).__name__}.{f.name} must not be negative, it is {value}")
 
+    def check_fractions(self, *names: str) -> None:
+        """InputError if one of these fields is no fraction, above 0 and at most 1."""
+        for name in names:
+            value = getattr(self, name)
+            if not 0 < value <= 1:
+                raise InputError(f"{type(self).__name__}.{name} is {value:g}; give a fraction > 0 and <= 1")
+
     @property
     def frames(self) -> tuple[str, ...]:
         """Frames that the robot must have."""
@@ -65,6 +72,9 @@ class TorqueLimit(Term):
     fraction: float = 0.85
     collision: float = 0.85
 
+    def __post_init__(self) -> None:
+        self.check_fractions("fraction", "collision")
+
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityLimit(Term):
@@ -76,6 +86,9 @@ class VelocityLimit(Term):
     name: ClassVar[str] = "velocity limit"
     unit: ClassVar[str] = "of limit"
     fraction: float = 0.95
+
+    def __post_init__(self) -> None:
+        self.check_fractions("fraction")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +167,11 @@ class LegExtension(Term):
     name: ClassVar[str] = "leg extension"
     unit: ClassVar[str] = "of start"
     minimum: float = 0.35
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.minimum <= 1:
+            raise InputError(f"LegExtension.minimum is {self.minimum:g}; give a fraction from 0 to 1")
 
 
 DEFAULT_TERMS: tuple[Term, ...] = (

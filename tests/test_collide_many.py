@@ -173,7 +173,7 @@ def test_gains_of_one_joint_and_of_all() -> None:
 def test_states_move_the_striking_point_and_coast(velocity: str) -> None:
     robot, normal = biped(), np.array([0.8, 0.6, 0.0])
     states = ContactStates(
-        robot=robot, striker="fist", stance=BothSoles(), start="half_sitting", folder=Path()
+        robot=robot, striker="fist", stance=BothSoles(), start=robot.posture("half_sitting"), folder=Path()
     )
     posture = states.posture("half_sitting", None, (0.0, 0.0, 0.0))
     assert isinstance(posture, Posture)
@@ -207,7 +207,8 @@ def test_states_move_the_striking_point_and_coast(velocity: str) -> None:
 
 def test_a_continuous_joint_turns() -> None:
     robot = arm()
-    states = ContactStates(robot=robot, striker="hand", stance=FixedBase(), start="start", folder=Path())
+    start = robot.posture("start")
+    states = ContactStates(robot=robot, striker="hand", stance=FixedBase(), start=start, folder=Path())
     posture = states.posture("start", None, (0.0, 0.0, 0.0))
     assert isinstance(posture, Posture)
     found = states.rows(posture, {"turn": np.array([0.5, 3.0])}, np.ones(2), np.array([0.0, 1.0, 0.0]), 2)

@@ -238,3 +238,51 @@ def test_every_field_of_a_problem_counts_in_its_hash(problem: ImpactProblem) -> 
         ("collision_elements", ((0.3, 0.7), (1.0,))),
     ):
         assert dataclasses.replace(problem, **{name: value}).hash != problem.hash, name
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("hsllib", "{folder}/evil.so"),
+        ("pardisolib", "{folder}/evil.so"),
+        ("output_file", "{folder}/written.txt"),
+        ("option_file_name", "{folder}/options.txt"),
+        ("tol", [1e-5]),
+    ],
+)
+def test_a_file_loads_no_library_and_writes_no_file(tmp_path: Path, option: str, value: Any) -> None:
+    given = value.format(folder=tmp_path) if isinstance(value, str) else value
+    with pytest.raises(InputError, match=rf"\[solver\] ipopt: {option}"):
+        problem_from_data({**DATA, "solver": {"ipopt": {option: given}}}, where="arm.toml")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "text", ["__import__('os').system('touch x')", "{0.__class__}", "%(x)s", "$(touch x)"]
+)
+def test_text_stays_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = change_data(DATA, {"problem.name": text})
+    assert problem_from_data(read_toml(write_toml(data)), where="x.toml").name == text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_python_can_say_a_file_can_too(problem: ImpactProblem) -> None:
+    """None and infinity have their words; a configuration and a matrix their lists."""
+    balance = {"capture_margin": "anywhere", "vertical_speed": float("inf"), "angular_momentum": float("inf")}
+    data = change_data(DATA, {f"terms.balance.{key}": value for key, value in balance.items()})
+    data = change_data(data, {"terms.incidence.speed": float("inf"), "problem.start": problem.start_posture})
+    made = problem_from_data(data, where="x.toml")
+    free = terms.Balance(capture_margin=None, vertical_speed=np.inf, angular_momentum=np.inf)
+    assert made.term(terms.Balance) == free
+    assert made.term(terms.Incidence) == terms.Incidence(speed=np.inf)
+    np.testing.assert_array_equal(made.start_posture, problem.start_posture)
+    for key, value, said in (
+        ("terms.balance.capture_margin", "nowhere", "anywhere"),
+        ("terms.balance.vertical_speed", float("nan"), ">= 0"),
+        ("problem.start", [0.1, float("nan")], "a list of numbers"),
+        ("problem.start", [0.1, 0.2], r"expected shape \(3\)"),
+        ("robot.position_limit.elbow", [1.0, float("nan")], "must not exceed"),
+    ):
+        with pytest.raises(InputError, match=said):
+            problem_from_data(change_data(DATA, {key: value}), where="x.toml")

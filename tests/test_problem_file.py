@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import impactopt.problem_file.robot_sections as robot_sections
 import impactopt.problem_file.sections as sections
 from impactopt import extra_terms, objectives, terms
 from impactopt.contact import (
@@ -98,7 +99,7 @@ def no_robots(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: Any, **options: Any) -> None:
         raise AssertionError("a robot was built")
 
-    monkeypatch.setattr(sections, "load_robot", refuse)
+    monkeypatch.setattr(robot_sections, "load_robot", refuse)
 
 
 def test_the_demos_file_is_the_punch_it_says() -> None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, TypeVar, cast
 from pydantic import ConfigDict, Field, create_model
 
 from impactopt import contact
-from impactopt.problem_file.section import Section, optional
+from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import AtLeastOne, NotNegative, Positive
 
 TargetKind = Literal["free mass", "wall", "nail", "board"]
@@ -17,77 +17,93 @@ LawKind = Literal["spring damper", "Kelvin-Voigt", "Hunt-Crossley", "Hertz"]
 
 
 class Target(Section):
-    """What every target has: its kind. Of an unknown kind nothing else can be said."""
+    """What is hit; the keys depend on its kind."""
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
-    target_kind: TargetKind = Field(default="free mass", alias="kind")
+    target_kind: TargetKind = Field(default="free mass", alias="kind", description="what it is")
 
 
 class FreeMass(Target):
+    """A mass that moves freely along the normal."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.FreeMass
-    mass: Positive = Field(alias="mass_kg")
+    mass: Positive = required("[kg]", "mass_kg")
 
 
 class Wall(Target):
+    """A wall that never moves."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.RigidWall
 
 
 class Nail(Target):
+    """A nail in wood, which resists with resistance + hardening x depth."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.Nail
-    mass: Positive = Field(alias="mass_kg")
-    resistance: Positive = Field(alias="resistance_N")
-    hardening: NotNegative = optional("hardening_N_m")
-    depth: NotNegative = optional("depth_m")
+    mass: Positive = required("[kg]", "mass_kg")
+    resistance: Positive = required("of the wood at its surface [N]", "resistance_N")
+    hardening: NotNegative = optional("growth of the resistance with depth [N/m]", "hardening_N_m")
+    depth: NotNegative = optional("in the wood before the blow [m]", "depth_m")
 
 
 class Board(Target):
+    """A board held at its edges: a modal mass on a spring that breaks."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.Board
-    mass: Positive = Field(alias="mass_kg")
-    stiffness: Positive = Field(alias="stiffness_N_m")
-    breaking_force: Positive = Field(alias="breaking_force_N")
-    damping: NotNegative = optional("damping_N_s_m")
+    mass: Positive = required("modal mass where it is hit [kg]", "mass_kg")
+    stiffness: Positive = required("of the bending [N/m]", "stiffness_N_m")
+    breaking_force: Positive = required("of the spring [N]", "breaking_force_N")
+    damping: NotNegative = optional("of the bending [N s/m]", "damping_N_s_m")
 
 
 class Contact(Section):
-    """What every contact has: its law. Of an unknown law nothing else can be said."""
+    """What is between hand and target; the keys depend on the law."""
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "law"
-    law: LawKind = "spring damper"
+    law: LawKind = Field(default="spring damper", description="what gives the force")
 
 
 class SpringDamper(Contact):
+    """A spring, and a damper that acts in compression only."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.SpringDamper
-    stiffness: Positive = Field(alias="stiffness_N_m")
-    damping: NotNegative = Field(alias="damping_N_s_m")
+    stiffness: Positive = required("k [N/m]", "stiffness_N_m")
+    damping: NotNegative = required("d [N s/m]", "damping_N_s_m")
 
 
 class KelvinVoigt(Contact):
+    """A spring and a damper, in compression and restitution."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.KelvinVoigt
-    stiffness: Positive = Field(alias="stiffness_N_m")
-    damping: NotNegative = Field(alias="damping_N_s_m")
+    stiffness: Positive = required("k [N/m]", "stiffness_N_m")
+    damping: NotNegative = required("d [N s/m]", "damping_N_s_m")
 
 
 class HuntCrossley(Contact):
+    """f = k x^p (1 + 1.5 alpha dx/dt)."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.HuntCrossley
-    stiffness: Positive = Field(alias="stiffness_N_mp")  # p is the exponent
-    dissipation: NotNegative = Field(alias="dissipation_s_m")
-    exponent: AtLeastOne = optional()
+    stiffness: Positive = required("k [N/m^p], p the exponent", "stiffness_N_mp")
+    dissipation: NotNegative = required("alpha [s/m]", "dissipation_s_m")
+    exponent: AtLeastOne = optional("p; 1.5 for a sphere on a plane")
 
 
 class Hertz(Contact):
+    """f = k x^1.5 + d x^0.25 dx/dt."""
+
     model_config = ConfigDict(extra="forbid")
     kind = contact.HertzDamped
-    stiffness: Positive = Field(alias="stiffness_N_m1_5")  # N/m^1.5
-    damping: NotNegative = Field(alias="damping_N_s_m1_25")  # N s/m^1.25
+    stiffness: Positive = required("k [N/m^1.5]", "stiffness_N_m1_5")
+    damping: NotNegative = required("d [N s/m^1.25]", "damping_N_s_m1_25")
 
 
 TARGETS: dict[str, type[Target]] = {"free mass": FreeMass, "wall": Wall, "nail": Nail, "board": Board}

@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from impactopt.errors import did_you_mean
 from impactopt.problem_file.toml import Place
@@ -74,7 +75,7 @@ def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]
     out, meant = [], set()
     for e in error.errors(include_url=False):
         if e["type"] == "extra_forbidden":
-            section, sections = _section(model, e["loc"][:-1])
+            section, sections = section_at(model, e["loc"][:-1])
             key, known = str(e["loc"][-1]), [_key(section, name) for name in section.model_fields]
             near = did_you_mean(key, known)
             meant |= {(e["loc"][:-1], name) for name in known if near and repr(name) in near}
@@ -86,13 +87,13 @@ def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]
     for e in error.errors(include_url=False):
         # a key that is there, misspelt, is not missing as well
         if e["type"] == "missing" and (e["loc"][:-1], e["loc"][-1]) not in meant:
-            _, sections = _section(model, e["loc"])
+            _, sections = section_at(model, e["loc"])
             out.append(Mistake(place=e["loc"], sections=sections, text="missing"))
     return out
 
 
 def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
-    section, sections = _section(model, e["loc"])
+    section, sections = section_at(model, e["loc"])
     context, value = e.get("ctx", {}), _show(e["input"])
     if e["type"] == "value_error":
         text = str(context["error"])
@@ -109,7 +110,7 @@ def _mistake(model: type[BaseModel], e: Mapping[str, Any]) -> Mistake:
     return Mistake(place=e["loc"], sections=sections, text=text)
 
 
-def _section(model: type[BaseModel], place: Place) -> tuple[type[BaseModel], int]:
+def section_at(model: type[BaseModel], place: Place) -> tuple[type[BaseModel], int]:
     """The innermost table of the file that holds `place`, and how much of the place names it."""
     depth = 0
     while depth < len(place):
@@ -133,10 +134,15 @@ def _range(section: type[BaseModel], keys: Sequence[str | int]) -> str:
     """The allowed range of a number, "> 0 and <= 1"; "" where it is not in the model."""
     for name, info in section.model_fields.items():
         if len(keys) == 1 and _key(section, name) == keys[0]:
-            limits = [m for m in info.metadata if isinstance(m, (Gt, Ge, Lt, Le))]
-            bounds = [(key, getattr(m, key)) for m in limits for key in _SIGNS if hasattr(m, key)]
-            return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in bounds)
+            return range_of(info)
     return ""
+
+
+def range_of(info: FieldInfo) -> str:
+    """The allowed range of a field's numbers, "> 0 and <= 1"; "" for any."""
+    limits = [m for m in info.metadata if isinstance(m, (Gt, Ge, Lt, Le))]
+    bounds = [(key, getattr(m, key)) for m in limits for key in _SIGNS if hasattr(m, key)]
+    return " and ".join(f"{_SIGNS[key]} {bound:g}" for key, bound in bounds)
 
 
 def _bound(e: Mapping[str, Any]) -> str:

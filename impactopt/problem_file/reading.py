@@ -16,7 +16,7 @@ from impactopt.problem_file.changes import change_and_place
 from impactopt.problem_file.contacts import with_kinds
 from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file
-from impactopt.problem_file.sections import File
+from impactopt.problem_file.sections import File, SolverSettings
 from impactopt.problem_file.toml import Place, TOMLError, plain_value, read_toml, write_toml
 
 __all__ = [
@@ -30,24 +30,6 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolverSettings:
-    """What a file's [solver] section says.
-
-    name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
-    """
-
-    name: str = "sqp"
-    time_limit: float | None = None
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-    def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
-        """What `solve` and its like take of a solver; given ones go before the file's."""
-        chosen = self.name if solver is None else solver
-        limit = self.time_limit if time_limit is None else time_limit
-        return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +75,7 @@ class ProblemFile:
         mistakes.raise_if_any(self.path)
         assert robot is not None  # for mypy: it would have been a mistake
         mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
-        mistakes.attempt(("problem", "start"), lambda: robot.posture(content.problem.start))
+        mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
         stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
         mistakes.raise_if_any(self.path)
         assert stance is not None

@@ -2,19 +2,42 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
-def optional(key: str | None = None) -> Any:
-    """A key that may be left out; the class that is built has the default."""
-    return Field(default=None, alias=key)
+def optional(about: str, key: str | None = None) -> Any:
+    """A key that may be left out; the class that is built has the default.
+
+    about : what it is, with its unit in brackets.  key : its name in the file, if a unit belongs to it.
+    """
+    return Field(default=None, alias=key, description=about)
+
+
+def required(about: str, key: str | None = None) -> Any:
+    """A key that has to be there; see `optional`."""
+    return Field(alias=key, description=about)
+
+
+def attribute_docs(kind: type) -> dict[str, str]:
+    """What a class's docstring says of each attribute, on one line; `a, b : text` is said of both."""
+    section = re.split(r"\n *Attributes\n *-+\n", kind.__doc__ or "")[-1]
+    entries = re.split(r"\n(?=    [a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
+    out: dict[str, str] = {}
+    for entry in entries[1:]:
+        names, _, text = entry.partition(" : ")
+        for name in names.split(","):
+            out[name.split()[0]] = " ".join(text.split()).rstrip(".")
+    return out
 
 
 class Section(BaseModel):
     """A section; unknown keys, NaN, infinity and text where a number belongs are refused.
 
+    Of a class below, the docstring's first sentence says in the reference what the section is about.
     kind : the class that it describes.  choice : the field that only says which kind of section this is.
     """
 
@@ -29,6 +52,14 @@ class Section(BaseModel):
     def build(self) -> Any:
         """The thing that this section describes."""
         return self.kind(**self.given())
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        """What keys that may be left out stand for, by field; a field without a default is not in it."""
+        if not is_dataclass(cls.kind):
+            return {}
+        made = {f.name: f.default_factory() for f in fields(cls.kind) if f.default_factory is not MISSING}
+        return made | {f.name: f.default for f in fields(cls.kind) if f.default is not MISSING}
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Section:

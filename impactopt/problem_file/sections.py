@@ -7,367 +7,264 @@ stand nowhere twice.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, cast, get_type_hints
+from typing import Any, Literal, get_type_hints
 
-from pydantic import Field, create_model, model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, create_model
 
-from impactopt import extra_terms, objectives, terms
+from impactopt import objectives
 from impactopt.errors import InputError
-from impactopt.presets import load_robot
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.problem_file.contacts import Contact, Target
-from impactopt.problem_file.section import Section, optional
+from impactopt.problem_file.robot_sections import RobotSection
+from impactopt.problem_file.section import Section, attribute_docs, optional, required
+from impactopt.problem_file.term_sections import Terms
 from impactopt.problem_file.values import (
+    AtLeastOne,
     Duration,
-    Fraction,
     Fractions,
     IpoptOptions,
     NotNegative,
-    PerJoint,
-    Point2,
     Positive,
+    Posture,
     Preset,
-    Range,
     Restitution,
     UnitVector,
     Vector,
 )
-from impactopt.robot import Robot, Sole, Striker, Tool
+from impactopt.robot import Robot
 from impactopt.scenario import Scenario
-from impactopt.shapes import Capsule
 from impactopt.sqp import SQPOptions
 from impactopt.stance import BothSoles, FixedBase, OneSole
 from impactopt.stance import Stance as Stances
 
+ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_elements
+
+
+def _of_problem(section: type[Section]) -> dict[str, Any]:
+    """The defaults of the problem's own fields that a section sets."""
+    known = {f.name: f.default for f in fields(ImpactProblem) if f.default is not MISSING}
+    return {name: known[name] for name in section.model_fields if name in known}
+
 
 class Problem(Section):
-    name: str = optional()
-    robot: Preset = optional()
-    striker: str
-    point: Vector = Field(alias="point_m")
-    normal: UnitVector
-    start: str = cast(str, ImpactProblem.start)
+    """Who hits what, where."""
+
+    name: str = optional("what reports call the problem")
+    robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
+    striker: str = required("what hits: one of the robot's strikers")
+    point: Vector = required(
+        "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
+    )
+    normal: UnitVector = required("which way the target is pushed: a unit vector")
+    start: Posture = Field(
+        default=ImpactProblem.start,
+        description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",
+    )
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return _of_problem(cls)
 
 
 class Stance(Section):
-    soles: str = "both"
+    """What the robot stands on."""
+
+    soles: str = Field(default="both", description='"both", or the name of the sole that is held')
 
 
 class PhaseSection(Section):
+    """A phase of the motion: its duration and its spline."""
+
     kind = Phase
-    duration: Duration = Field(alias="duration_s")
-    intervals: int = optional()
-    grading: float = optional()
+    duration: Duration = required(
+        "one number, or [shortest, longest] for the solver to choose [s]", "duration_s"
+    )
+    intervals: int = optional("of the spline, at least 6: more make the motion freer, and the solve longer")
+    grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
+
+
+class Swing(PhaseSection):
+    """Wind-up and strike, from rest to contact."""
+
+
+class Follow(PhaseSection):
+    """From the state that the impact leaves behind to rest."""
 
 
 class Collision(Section):
-    """`compression`, `restitution`: lengths of their collocation elements, as fractions; `stages` in each.
+    """How the collision is modelled and discretized."""
 
-    `model`: "dynamics", or an impact without duration, to compare with: "rigid", "virtual mass".
-    """
+    collision: Literal["dynamics", "rigid", "virtual mass"] = optional(
+        '"dynamics": the whole equation of motion; or an impact without duration, to compare with', "model"
+    )
+    coefficient_of_restitution: Restitution = optional('of the model "rigid"')
+    contact_duration: Duration = optional(
+        "[shortest, longest] of each of compression and restitution [s]", "duration_s"
+    )
+    collision_stages: Literal[2, 3] = optional("Radau IIA stages of an element", "stages")
+    compression: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
+    restitution: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
 
-    collision: Literal["dynamics", "rigid", "virtual mass"] = optional("model")
-    coefficient_of_restitution: Restitution = optional()
-    contact_duration: Duration = optional("duration_s")
-    collision_stages: Literal[2, 3] = optional("stages")
-    compression: Fractions = optional()
-    restitution: Fractions = optional()
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return _of_problem(cls) | dict(zip(ELEMENTS, ImpactProblem.collision_elements, strict=True))
 
 
 class ScenarioSection(Section):
+    """What else may happen, and has to be survived with the same swing."""
+
     kind = Scenario
-    name: str
-    mass: Positive = optional()
-    stiffness: Positive = optional()
-    damping: NotNegative = optional()
-    missing: bool = optional()
-    brake_after: Positive = optional("brake_after_s")
-    torque: Positive = optional()
-    cone_margin: NotNegative = optional("cone_margin_m")
-    capture_margin: NotNegative = optional("capture_margin_m")
+    name: str = required("what reports call it")
+    mass: Positive = optional("of the target, as a factor of the expected one")
+    stiffness: Positive = optional("of the contact, as a factor")
+    damping: NotNegative = optional("of the contact, as a factor")
+    missing: bool = optional("there is nothing to hit")
+    brake_after: Positive = optional(
+        "when a robot that has felt nothing goes on to a stop planned for that [s]",
+        "brake_after_s",
+    )
+    torque: Positive = optional("fraction of each joint's limit in the collision")
+    cone_margin: NotNegative = optional(
+        "from each sole's centre of pressure to its edges in the collision [m]", "cone_margin_m"
+    )
+    capture_margin: NotNegative = optional(
+        "from the capture point to the support polygon's edges, after it [m]", "capture_margin_m"
+    )
 
 
 class Objective(Section):
-    smoothness: NotNegative = optional()
-    wrench_price: NotNegative = optional()
-    return_price: NotNegative = optional()
+    """Prices that only make the optimum unique, and its end natural."""
+
+    smoothness: NotNegative = optional("of accelerations [N s per (rad/s^2)^2 s]")
+    wrench_price: NotNegative = optional("of the soles' wrenches")
+    return_price: NotNegative = optional("of ending away from the start posture [N s per rad^2]")
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return _of_problem(cls)
 
 
 class Weighted(Section):
-    weight: float = optional()
+    """A quantity that counts in what is maximized."""
+
+    weight: float = optional("what one unit of it is worth [N s a unit]")
 
 
 class Impulse(Weighted):
+    """The impulse to the target."""
+
     kind = objectives.Impulse
 
 
 class PeakForce(Weighted):
+    """The largest contact force; a weight below zero keeps it small."""
+
     kind = objectives.PeakForce
 
 
 class TargetEnergy(Weighted):
+    """What the target holds at separation, or has used up in what it was hit for."""
+
     kind = objectives.TargetEnergy
 
 
 class Penetration(Weighted):
+    """The deepest penetration; a weight below zero keeps it small."""
+
     kind = objectives.Penetration
 
 
 class AngularMomentum(Weighted):
+    """Cost: angular momentum after contact, squared."""
+
     kind = objectives.AngularMomentum
 
 
 class Effort(Weighted):
+    """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints."""
+
     kind = objectives.Effort
 
 
 class Objectives(Section):
     """What is maximized; if there are any, only those that are given."""
 
-    impulse: Impulse = optional()
-    peak_force: PeakForce = optional()
-    target_energy: TargetEnergy = optional()
-    penetration: Penetration = optional()
-    angular_momentum: AngularMomentum = optional()
-    effort: Effort = optional()
+    impulse: Impulse = optional("")
+    peak_force: PeakForce = optional("")
+    target_energy: TargetEnergy = optional("")
+    penetration: Penetration = optional("")
+    angular_momentum: AngularMomentum = optional("")
+    effort: Effort = optional("")
 
 
-class TorqueLimit(Section):
-    kind = terms.TorqueLimit
-    fraction: Fraction = optional()
-    collision: Fraction = optional()
+def _sqp_keys() -> dict[str, Any]:
+    """A key for each option but the time limit, as the options' own docstring describes it."""
+    said = attribute_docs(SQPOptions)
+    hints = get_type_hints(SQPOptions)
+    return {name: (hints[name], optional(said[name])) for name in hints if name != "time_limit"}
 
 
-class VelocityLimit(Section):
-    kind = terms.VelocityLimit
-    fraction: Fraction = optional()
-
-
-class PositionLimit(Section):
-    kind = terms.PositionLimit
-    margin: NotNegative = optional("margin_rad")
-
-
-class ContactWrenchCone(Section):
-    kind = terms.ContactWrenchCone
-    friction: Positive = optional()
-    margin: NotNegative = optional("margin_m")
-    collision_margin: NotNegative = optional("collision_margin_m")
-    minimum_force: NotNegative = optional("minimum_force_N")
-
-
-class Balance(Section):
-    kind = terms.Balance
-    capture_margin: NotNegative = optional("capture_margin_m")
-    vertical_speed: NotNegative = optional("vertical_speed_m_s")
-    angular_momentum: NotNegative = optional("angular_momentum_N_m_s")
-
-
-class Incidence(Section):
-    kind = terms.Incidence
-    speed: NotNegative = optional("speed_m_s")
-
-
-class LegExtension(Section):
-    kind = terms.LegExtension
-    minimum: Fraction = optional()
-
-
-class Shape(Section):
-    kind = Capsule
-    frame: str
-    radius: NotNegative = Field(alias="radius_m")
-    start: Vector = optional("start_m")
-    end: Vector = optional("end_m")
-
-
-class Pair(Section):
-    first: Shape
-    second: Shape
-
-    def build(self) -> tuple[Any, Any]:
-        return self.first.build(), self.second.build()
-
-
-class TorqueRate(Section):
-    kind = extra_terms.TorqueRate
-    limit: PerJoint = Field(alias="limit_N_m_s")
-
-
-class SelfCollision(Section):
-    kind = extra_terms.SelfCollision
-    pairs: list[Pair] = optional()
-    margin: NotNegative = optional("margin_m")
-
-    def build(self) -> Any:
-        pairs = None if self.pairs is None else tuple(pair.build() for pair in self.pairs)
-        return self.kind(**{**self.given(), "pairs": pairs})
-
-
-class KeepOut(Section):
-    kind = extra_terms.KeepOut
-    shapes: list[Shape]
-    size: Vector = optional("size_m")
-    margin: NotNegative = optional("margin_m")
-
-    def build(self) -> Any:
-        return self.kind(**{**self.given(), "shapes": tuple(shape.build() for shape in self.shapes)})
-
-
-class HandOrientation(Section):
-    kind = extra_terms.HandOrientation
-    axis: UnitVector
-    direction: UnitVector = optional()
-    angle: Positive = optional("angle_rad")
-
-
-class Gaze(Section):
-    kind = extra_terms.Gaze
-    frame: str
-    axis: UnitVector
-    angle: Positive = optional("angle_rad")
-    since: NotNegative = optional()
-
-
-class HitRegion(Section):
-    kind = extra_terms.HitRegion
-    radius: Positive = optional("radius_m")
-    size: Point2 = optional("size_m")
-
-
-class HitCone(Section):
-    kind = extra_terms.HitCone
-    angle: Positive = optional("angle_rad")
-
-
-class Terms(Section):
-    torque_limit: TorqueLimit = optional()
-    velocity_limit: VelocityLimit = optional()
-    position_limit: PositionLimit = optional()
-    contact_wrench_cone: ContactWrenchCone = optional()
-    balance: Balance = optional()
-    incidence: Incidence = optional()
-    leg_extension: LegExtension = optional()
-    torque_rate: TorqueRate = optional()
-    self_collision: SelfCollision = optional()
-    keep_out: KeepOut = optional()
-    hand_orientation: HandOrientation = optional()
-    gaze: Gaze = optional()
-    hit_region: HitRegion = optional()
-    hit_cone: HitCone = optional()
-
-
-_SQP_KEYS: dict[str, Any] = {
-    name: (hint, optional()) for name, hint in get_type_hints(SQPOptions).items() if name != "time_limit"
-}
-SQP: Any = create_model("SQP", __base__=Section, **_SQP_KEYS)
+SQP: Any = create_model("SQP", __base__=Section, __doc__="Options of the SQP.", **_sqp_keys())
 SQP.kind = SQPOptions
 
 
-class Solver(Section):
-    name: Literal["ipopt", "sqp"] = optional()
-    time_limit: Positive = optional("time_limit_s")
-    ipopt: IpoptOptions = optional()
-    sqp: SQP = optional()
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """What a file's [solver] section says.
 
-
-class SoleSection(Section):
-    kind = Sole
-    name: str
-    frame: str
-    polygon: list[Point2] = Field(alias="polygon_m")
-
-
-class StrikerSection(Section):
-    kind = Striker
-    name: str
-    frame: str
-    point: Vector = Field(alias="point_m")
-
-
-class ToolSection(Section):
-    kind = Tool
-    name: str
-    frame: str
-    mass: Positive = Field(alias="mass_kg")
-    center: Vector = Field(alias="center_m")
-    inertia: Vector = Field(alias="inertia_kg_m2")
-    head: Vector = Field(alias="head_m")
-
-
-class RobotSection(Section):
-    """A preset with changes, or a URDF; files are relative to the problem file.
-
-    A preset keeps its own strikers beside the section's. A tool's inertia is its diagonal.
+    name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
     """
 
-    preset: Preset = optional()
-    urdf: str = optional()
-    srdf: str = optional()
-    name: str = optional()
-    floating: bool = optional()
-    locked: dict[str, float] = optional("locked_rad")
-    armature: PerJoint = optional("armature_kg_m2")
-    kp: PerJoint = optional("kp_N_m_rad")
-    kd: PerJoint = optional("kd_N_m_s_rad")
-    torque_limit: PerJoint = optional("torque_limit_N_m")
-    velocity_limit: PerJoint = optional("velocity_limit_rad_s")
-    position_limit: dict[str, Range] = optional("position_limit_rad")
-    soles: list[SoleSection] = optional()
-    strikers: list[StrikerSection] = optional()
-    tools: list[ToolSection] = optional()
-    postures: dict[str, dict[str, float]] = optional("postures_rad")
+    name: str = "sqp"
+    time_limit: float | None = None
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _one_source(self) -> RobotSection:
-        if ("preset" in self.model_fields_set) == ("urdf" in self.model_fields_set):
-            raise ValueError("give either preset or urdf")
-        return self
+    def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
+        """What `solve` and its like take of a solver; given ones go before the file's."""
+        chosen = self.name if solver is None else solver
+        limit = self.time_limit if time_limit is None else time_limit
+        return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
 
-    def make(self, folder: Path) -> Robot:
-        """The robot; relative files are in `folder`."""
-        options = self.given()
-        for file in ("urdf", "srdf"):
-            if file in options:
-                options[file] = folder / options[file]
-        if "soles" in options:
-            options["soles"] = [sole.build() for sole in self.soles]
-        if "position_limit" in options:
-            options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
-        strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
-        tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
-        if "urdf" in options:
-            robot = Robot.from_urdf(options.pop("urdf"), **options)
-        else:
-            robot = load_robot(options.pop("preset"), **options)
-        for striker in strikers:
-            robot = robot.with_striker(striker)
-        for tool in tools:
-            robot = robot.with_tool(tool)
-        return robot
+
+class Solver(Section):
+    """Which solver, and its options."""
+
+    name: Literal["ipopt", "sqp"] = optional("of the solver")
+    time_limit: Positive = optional("after which its best iterate is kept [s]", "time_limit_s")
+    ipopt: IpoptOptions = optional("IPOPT's own options by name")
+    sqp: SQP = optional("")
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return {"name": SolverSettings.name}
 
 
 class File(Section):
     """A whole problem file; its [target] and [contact] are of a kind (`with_kinds`)."""
 
     problem: Problem
-    robot: RobotSection = optional()
+    robot: RobotSection = optional("")
     target: Target
     contact: Contact
-    stance: Stance = optional()
-    swing: PhaseSection = optional()
-    follow: PhaseSection = optional()
-    collision: Collision = optional()
-    scenarios: list[ScenarioSection] = optional()
-    objective: Objective = optional()
-    objectives: Objectives = optional()
-    terms: Terms = optional()
-    solver: Solver = optional()
+    stance: Stance = optional("")
+    swing: Swing = optional("")
+    follow: Follow = optional("")
+    collision: Collision = optional("")
+    scenarios: list[ScenarioSection] = optional("")
+    objectives: Objectives = optional("")
+    objective: Objective = optional("")
+    terms: Terms = optional("")
+    solver: Solver = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset that [problem] names."""
-        return self.robot.make(folder) if self.robot is not None else load_robot(self.problem.robot)
+        section = RobotSection(preset=self.problem.robot) if self.robot is None else self.robot
+        return section.make(folder)
 
     def make_stance(self, robot: Robot) -> Stances:
         """What [stance] says of a robot; InputError for what it cannot stand on."""
@@ -380,6 +277,13 @@ class File(Section):
         stance.soles(robot)
         return stance
 
+    def make_start(self, robot: Robot) -> NDArray[np.float64]:
+        """The posture (nq,) to start from; InputError for one that the robot cannot have."""
+        start = self.problem.start
+        return (
+            robot.posture(start) if isinstance(start, str) else robot.check_configuration(start, name="start")
+        )
+
     def arguments(self) -> dict[str, Any]:
         """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""
         out = {name: value for name, value in self.problem.given().items() if name != "robot"}
@@ -388,8 +292,8 @@ class File(Section):
         out |= self.objective.given() if self.objective else {}
         if self.collision is not None:
             given = self.collision.given()
-            first, second = ImpactProblem.collision_elements
-            elements = given.pop("compression", first), given.pop("restitution", second)
+            usual = zip(ELEMENTS, ImpactProblem.collision_elements, strict=True)
+            elements = [given.pop(name, lengths) for name, lengths in usual]
             if "contact_duration" in given:
                 given["contact_duration"] = tuple(given["contact_duration"])
             out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}

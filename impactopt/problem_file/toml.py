@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,13 +27,18 @@ def read_toml(text: str) -> dict[str, Any]:
     return dict(_tomllib.loads(text))
 
 
-def write_toml(data: Mapping[str, Any], comment: Callable[[Place], str] = lambda place: "") -> str:
+def write_toml(
+    data: Mapping[str, Any],
+    comment: Callable[[Place], str] = lambda place: "",
+    hidden: Callable[[Place], Mapping[str, Any]] = lambda place: {},
+) -> str:
     """Data as TOML that `read_toml` gives back exactly; numbers keep all their digits.
 
     comment : of a key or a table at a place, "" for none; a key's stands behind it, a table's above.
+    hidden : keys of the table at a place that are shown, but as comments.
     """
     lines: list[str] = []
-    _write_table(lines, dict(data), (), comment)
+    _Writer(lines, comment, hidden).table(data, ())
     return "\n".join(lines).strip("\n") + "\n"
 
 
@@ -47,32 +53,39 @@ def plain_value(value: Any) -> Any:
     return value
 
 
-def _write_table(
-    lines: list[str], table: Mapping[str, Any], place: Place, comment: Callable[[Place], str]
-) -> None:
-    tables = {key: value for key, value in table.items() if isinstance(value, Mapping)}
-    lists = {key: value for key, value in table.items() if _is_list_of_tables(value)}
-    for key, value in table.items():
-        if key not in tables and key not in lists:
-            line, said = f"{_key(key)} = {_value(value)}", comment((*place, key))
-            lines.append(f"{line:<{_COMMENTS_FROM}} # {said}" if said else line)
-    for key, value in tables.items():
-        inner = (*place, key)
-        # a table of tables alone needs no line of its own
-        if not value or not all(isinstance(v, Mapping) or _is_list_of_tables(v) for v in value.values()):
-            _write_header(lines, f"[{_dotted(inner)}]", comment(inner))
-        _write_table(lines, value, inner, comment)
-    for key, value in lists.items():
-        inner = (*place, key)
-        for i, entry in enumerate(value):
-            _write_header(lines, f"[[{_dotted(inner)}]]", comment(inner) if i == 0 else "")
-            for name, item in entry.items():
-                line, said = f"{_key(name)} = {_value(item)}", comment((*inner, i, name))
-                lines.append(f"{line:<{_COMMENTS_FROM}} # {said}" if said else line)
+@dataclass(frozen=True)
+class _Writer:
+    lines: list[str]
+    comment: Callable[[Place], str]
+    hidden: Callable[[Place], Mapping[str, Any]]
+
+    def table(self, table: Mapping[str, Any], place: Place) -> None:
+        below = {key: value for key, value in table.items() if _is_table(value) or _is_list_of_tables(value)}
+        self._keys({key: value for key, value in table.items() if key not in below}, place)
+        for key, value in below.items():
+            inner = (*place, key)
+            if isinstance(value, list):
+                for i, entry in enumerate(value):
+                    self._header(f"[[{_dotted(inner)}]]", self.comment(inner) if i == 0 else "")
+                    self._keys(entry, (*inner, i))
+                continue
+            # a table of tables alone needs no line of its own
+            if not value or not all(_is_table(v) or _is_list_of_tables(v) for v in value.values()):
+                self._header(f"[{_dotted(inner)}]", self.comment(inner))
+            self.table(value, inner)
+
+    def _keys(self, table: Mapping[str, Any], place: Place) -> None:
+        shown = [("", key, value) for key, value in table.items()]
+        for mark, key, value in [*shown, *(("# ", *item) for item in self.hidden(place).items())]:
+            line, said = f"{mark}{_key(key)} = {_value(value)}", self.comment((*place, key))
+            self.lines.append(f"{line:<{_COMMENTS_FROM}} # {said}" if said else line)
+
+    def _header(self, header: str, comment: str) -> None:
+        self.lines.extend(["", *([f"# {comment}"] if comment else []), header])
 
 
-def _write_header(lines: list[str], header: str, comment: str) -> None:
-    lines += ["", *([f"# {comment}"] if comment else []), header]
+def _is_table(value: Any) -> bool:
+    return isinstance(value, Mapping)
 
 
 def _is_list_of_tables(value: Any) -> bool:

@@ -188,7 +188,7 @@ class Collisions:
                 robot=robot,
                 striker=content.problem.striker,
                 stance=content.make_stance(robot),
-                start=content.problem.start,
+                start=content.make_start(robot),
                 folder=self.folder,
             )
         return self._bodies[key]

@@ -62,13 +62,13 @@ class States:
 class ContactStates:
     """States at contact of one robot on one stance.
 
-    start : posture that reaches begin from.  folder : where a result's relative path begins.
+    start : posture (nq,) that reaches begin from.  folder : where a result's relative path begins.
     """
 
     robot: Robot
     striker: str
     stance: Stance
-    start: str
+    start: Array
     folder: Path
     _postures: dict[Any, Posture | str] = field(init=False, repr=False, default_factory=dict)
     _compiled: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
@@ -88,8 +88,7 @@ class ContactStates:
         return self._postures[key]
 
     def _reach(self, point: tuple[float, ...]) -> Posture | str:
-        robot = self.robot
-        q = robot.posture(self.start)
+        robot, q = self.robot, self.start
         coordinates = StanceCoordinates(robot, self.stance.soles(robot), q)
         try:
             q = reach(coordinates, self.striker, np.array(point), q)

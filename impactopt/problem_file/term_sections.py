@@ -1,0 +1,187 @@
+"""The sections below [terms]: what a plan must respect."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from impactopt import extra_terms, terms
+from impactopt.problem_file.section import Section, optional, required
+from impactopt.problem_file.values import (
+    CaptureMargin,
+    Fraction,
+    NotNegative,
+    NotNegativeOrAny,
+    PerJoint,
+    Point2,
+    Positive,
+    Restitution,
+    UnitVector,
+    Vector,
+)
+from impactopt.shapes import Capsule
+
+
+class TorqueLimit(Section):
+    """|torque| is at most a fraction of each joint's limit: the rest is the servo's."""
+
+    kind = terms.TorqueLimit
+    fraction: Fraction = optional("of the limit, in swing and follow-through")
+    collision: Fraction = optional("of the limit, while in contact")
+
+
+class VelocityLimit(Section):
+    """|joint velocity| is at most a fraction of each joint's limit."""
+
+    kind = terms.VelocityLimit
+    fraction: Fraction = optional("of the limit")
+
+
+class PositionLimit(Section):
+    """Joints stay inside their limits of position."""
+
+    kind = terms.PositionLimit
+    margin: NotNegative = optional("from each limit [rad]", "margin_rad")
+
+
+class ContactWrenchCone(Section):
+    """Each sole's wrench lies in the cone of its corners: centre of pressure, friction and torsion."""
+
+    kind = terms.ContactWrenchCone
+    friction: Positive = optional("coefficient that the soles may use")
+    margin: NotNegative = optional("from the centre of pressure to the sole's edges [m]", "margin_m")
+    collision_margin: NotNegative = optional("the same, while in contact [m]", "collision_margin_m")
+    minimum_force: NotNegative = optional("that each sole keeps on the ground [N]", "minimum_force_N")
+
+
+class Balance(Section):
+    """What the impact may leave behind, so that the robot stays up; inf: any."""
+
+    kind = terms.Balance
+    capture_margin: CaptureMargin = optional(
+        'from the capture point to the support polygon\'s edges [m]; "anywhere": none is asked',
+        "capture_margin_m",
+    )
+    vertical_speed: NotNegativeOrAny = optional("of the centre of mass [m/s]", "vertical_speed_m_s")
+    angular_momentum: NotNegativeOrAny = optional(
+        "about each axis through the centre of mass [N m s]", "angular_momentum_N_m_s"
+    )
+
+
+class Incidence(Section):
+    """No glancing blow: the striking point's speed across the normal at contact is bounded."""
+
+    kind = terms.Incidence
+    speed: NotNegativeOrAny = optional("along each of two tangents [m/s]; inf: any", "speed_m_s")
+
+
+class LegExtension(Section):
+    """Held legs stay away from a straight knee."""
+
+    kind = terms.LegExtension
+    minimum: Restitution = optional("of the start posture's leg determinant; 0 would be a straight knee")
+
+
+class Shape(Section):
+    """A sphere, or with an end a capsule, on a frame of the robot."""
+
+    kind = Capsule
+    frame: str = required("of the robot")
+    radius: NotNegative = required("[m]", "radius_m")
+    start: Vector = optional("of its axis in the frame [m]", "start_m")
+    end: Vector = optional("of its axis [m]; left out: a sphere about the start", "end_m")
+
+
+class Pair(Section):
+    """Two shapes that stay apart."""
+
+    first: Shape = required("one of them")
+    second: Shape = required("the other")
+
+    def build(self) -> tuple[Any, Any]:
+        return self.first.build(), self.second.build()
+
+
+class TorqueRate(Section):
+    """|d torque/dt| is bounded, from node to node of swing and follow-through."""
+
+    kind = extra_terms.TorqueRate
+    limit: PerJoint = required("of all joints, or by joint [N m/s]", "limit_N_m_s")
+
+
+class SelfCollision(Section):
+    """Pairs of shapes on the robot stay apart in swing and follow-through."""
+
+    kind = extra_terms.SelfCollision
+    pairs: list[Pair] = optional("what stays apart; left out: the hand that strikes, torso and thighs")
+    margin: NotNegative = optional("between the shapes [m]", "margin_m")
+
+    def build(self) -> Any:
+        pairs = None if self.pairs is None else tuple(pair.build() for pair in self.pairs)
+        return self.kind(**{**self.given(), "pairs": pairs})
+
+
+class KeepOut(Section):
+    """Shapes on the robot stay out of the target before contact."""
+
+    kind = extra_terms.KeepOut
+    shapes: list[Shape] = required("what stays out")
+    size: Vector = optional(
+        "across, up, deep, of a box that is the target [m]; left out: all behind its face", "size_m"
+    )
+    margin: NotNegative = optional("between shapes and target [m]", "margin_m")
+
+    def build(self) -> Any:
+        return self.kind(**{**self.given(), "shapes": tuple(shape.build() for shape in self.shapes)})
+
+
+class HandOrientation(Section):
+    """The hand looks some way at contact."""
+
+    kind = extra_terms.HandOrientation
+    axis: UnitVector = required("unit vector in the striker's frame")
+    direction: UnitVector = optional("where it looks, in the world; left out: along the normal")
+    angle: Positive = optional("between the two, at most [rad]", "angle_rad")
+
+
+class Gaze(Section):
+    """A frame, such as the head's, looks at the hit point in the swing."""
+
+    kind = extra_terms.Gaze
+    frame: str = required("of the robot")
+    axis: UnitVector = required("unit vector in the frame: the way it looks")
+    angle: Positive = optional("off the hit point, at most [rad]", "angle_rad")
+    since: NotNegative = optional("fraction of the swing from which it holds")
+
+
+class HitRegion(Section):
+    """The hit point is anywhere in a disc or a rectangle about `point_m`; give one of the keys."""
+
+    kind = extra_terms.HitRegion
+    radius: Positive = optional("of the disc [m]", "radius_m")
+    size: Point2 = optional("of the rectangle, across and up [m]", "size_m")
+
+
+class HitCone(Section):
+    """The striking point's velocity at contact is near the normal; in place of `incidence`."""
+
+    kind = extra_terms.HitCone
+    angle: Positive = optional("between the two, at most [rad]", "angle_rad")
+
+
+class Terms(Section):
+    """What the plan must respect; of these, torque_limit to leg_extension hold if left out too."""
+
+    torque_limit: TorqueLimit = optional("")
+    velocity_limit: VelocityLimit = optional("")
+    position_limit: PositionLimit = optional("")
+    contact_wrench_cone: ContactWrenchCone = optional("")
+    balance: Balance = optional("")
+    incidence: Incidence = optional("")
+    leg_extension: LegExtension = optional("")
+    torque_rate: TorqueRate = optional("")
+    self_collision: SelfCollision = optional("")
+    keep_out: KeepOut = optional("")
+    hand_orientation: HandOrientation = optional("")
+    gaze: Gaze = optional("")
+    hit_region: HitRegion = optional("")
+    hit_cone: HitCone = optional("")

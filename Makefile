@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-EXTRAS := robots,validate,qp,dev
+EXTRAS := robots,validate,qp,sweep,cluster,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help

@@ -89,6 +89,7 @@ _EXPORTS = {
     "robot_names": "presets",
     "solve": "planner",
     "standin": "presets",
+    "sweep": "sweeps",
     "striking_velocity": "cases",
     "talos": "presets",
     "write_problem": "problem_file",

@@ -1,26 +1,45 @@
 """The same function for many inputs, on several processes; a process that dies costs its own input only.
 
 Processes are spawned, not forked: a fork copies the locks that CasADi's and BLAS's threads hold, not the
-threads. Each gets what all inputs share once, when it starts.
+threads. Each gets what all inputs share once, when it starts, and ends with the process that started it,
+however that ends.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import multiprocessing
+import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from impactopt.errors import InputError
 
-__all__ = ["map_on_workers"]
+__all__ = ["Died", "each_on_workers", "map_on_workers"]
 
 _Shared = TypeVar("_Shared")
 _Input = TypeVar("_Input")
 _Output = TypeVar("_Output")
+
+STARTS = 3  # that may fail one after another, if it was a signal that ended them
+_LINUX = sys.platform.startswith("linux")
+_PR_SET_PDEATHSIG = 1  # of its prctl
+
+
+@dataclass(frozen=True, kw_only=True)
+class Died:
+    """In place of a result: the exit code of the input's last process (-9: SIGKILL), and how many had it."""
+
+    code: int
+    tries: int
 
 
 def map_on_workers(
@@ -45,76 +64,128 @@ def map_on_workers(
     ------
     InputError : the processes do not start.
     """
-    done = 0
     results: dict[int, _Output] = {}
-
-    def keep(index: int, result: _Output) -> None:
-        nonlocal done
-        results[index], done = result, done + 1
+    found: Iterable[tuple[int, _Output | Died]]
+    if workers == 1:
+        found = ((index, function(shared, given)) for index, given in enumerate(inputs))
+    else:
+        found = each_on_workers(function, shared, enumerate(inputs), workers=min(workers, len(inputs)))
+    for done, (index, result) in enumerate(found, start=1):
+        results[index] = crashed(result.code) if isinstance(result, Died) else result
         if progress is not None:
             progress(done, len(inputs))
+    return [results[k] for k in range(len(inputs))]
 
-    if workers == 1:
-        for index, given in enumerate(inputs):
-            keep(index, function(shared, given))
-        return [results[k] for k in range(len(inputs))]
 
+def each_on_workers(
+    function: Callable[[_Shared, _Input], _Output],
+    shared: _Shared,
+    inputs: Iterable[tuple[int, _Input]],
+    *,
+    workers: int,
+    again: Callable[[Died], bool] | None = None,
+) -> Iterator[tuple[int, _Output | Died]]:
+    """Indices and results as they come, in any order; inputs are taken one by one, when a process is free.
+
+    function : as of `map_on_workers`.  workers : processes, 1 or more.
+    again : whether an input whose process died is tried once more; None: never.
+
+    Closing the iterator ends the processes.
+
+    Raises
+    ------
+    InputError : the processes do not start.
+    """
     context = multiprocessing.get_context("spawn")
-    waiting = list(enumerate(inputs))[::-1]
+    source, back = iter(inputs), list[_Task]()
     crew: list[_Worker] = []
+    failed = 0
+
+    def task() -> _Task | None:
+        if back:
+            return back.pop()
+        given = next(source, None)
+        return None if given is None else _Task(*given)
+
     try:
-        for _ in range(min(workers, len(inputs))):
-            crew.append(_Worker(context, function, shared))
-        while crew:
+        waiting = task()
+        while waiting is not None or crew:
+            # as many as there are inputs, at most; each is given its input when it says that it is ready
+            while waiting is not None and len(crew) < workers:
+                crew.append(_Worker(context, function, shared, waiting))
+                waiting = task()
             pipes: Any = wait([worker.pipe for worker in crew])
             for worker in [w for w in crew if w.pipe in pipes]:
                 try:
                     index, result = worker.pipe.recv()
                 except (EOFError, OSError):
                     crew.remove(worker)
-                    code = worker.end()
-                    if worker.at is None:
-                        raise InputError(
-                            f"the worker processes do not start (exit code {code}); put the call of your "
-                            'script under `if __name__ == "__main__":`, or ask for workers=1'
-                        ) from None
-                    keep(worker.at, crashed(code))
-                    if waiting:
-                        crew.append(_Worker(context, function, shared))
+                    code, mine = worker.end(), worker.task
+                    if not worker.ready:
+                        failed += 1
+                        if code >= 0 or failed >= STARTS:
+                            raise InputError(
+                                f"the worker processes do not start (exit code {code}); put the call of your "
+                                'script under `if __name__ == "__main__":`, or ask for workers=1'
+                            ) from None
+                        back.append(mine)
+                    else:
+                        mine.tries += 1
+                        died = Died(code=code, tries=mine.tries)
+                        if again is not None and again(died):
+                            back.append(mine)
+                        else:
+                            yield mine.index, died
+                    waiting = task() if waiting is None else waiting
                     continue
-                if index is not None:
-                    keep(index, result)
-                if waiting:
-                    worker.give(*waiting.pop())
+                if index is None:
+                    failed = 0
+                    worker.give()
+                    continue
+                if waiting is not None:
+                    worker.task, waiting = waiting, task()
+                    worker.give()
                 else:
                     crew.remove(worker)
                     worker.end()
+                yield index, result
     finally:
         for worker in crew:
             worker.end()
-    return [results[k] for k in range(len(inputs))]
+
+
+@dataclass(kw_only=False)
+class _Task:
+    """An input, and how many processes died of it."""
+
+    index: int
+    given: Any
+    tries: int = 0
 
 
 class _Worker:
-    """A process and the pipe to it; ``at`` is the index of the input that it has, None before its first."""
+    """A process, the pipe to it, and its input; ``ready`` once it has said so."""
 
-    def __init__(self, context: Any, function: Any, shared: Any) -> None:
-        self.at: int | None = None
+    def __init__(self, context: Any, function: Any, shared: Any, task: _Task) -> None:
+        self.task, self.ready = task, False
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, function, shared), daemon=True)
+        self.process = context.Process(
+            target=_serve, args=(theirs, function, shared, os.getpid()), daemon=True
+        )
         with _interrupts_held_back():
             self.process.start()
         theirs.close()  # so that its end is seen here
 
-    def give(self, index: int, given: Any) -> None:
-        self.at = index
-        self.pipe.send((index, given))
+    def give(self) -> None:
+        """Hand it its input; that it has died in the meantime shows when its answer is read."""
+        self.ready = True
+        with contextlib.suppress(OSError):
+            self.pipe.send((self.task.index, self.task.given))
 
     def end(self) -> int:
         """End the process; its exit code."""
         self.pipe.close()
-        if self.at is None or self.process.is_alive():
-            self.process.join(0.2)  # it ends by itself where it waits for input, or is dead already
+        self.process.join(0.2)  # it ends by itself where it waits for input, or is dead already
         if self.process.is_alive():
             self.process.terminate()
         self.process.join()
@@ -134,7 +205,8 @@ def _interrupts_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(pipe: Connection, function: Callable[[Any, Any], Any], shared: Any) -> None:
+def _serve(pipe: Connection, function: Callable[[Any, Any], Any], shared: Any, parent: int) -> None:
+    _end_with(parent)
     try:
         pipe.send((None, None))  # ready
         while True:
@@ -142,3 +214,19 @@ def _serve(pipe: Connection, function: Callable[[Any, Any], Any], shared: Any) -
             pipe.send((index, function(shared, given)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # nobody asks any more
+
+
+def _end_with(parent: int) -> None:
+    """Let this process end when its parent does, even if that is killed while this one computes."""
+    if _LINUX:  # the kernel does it, in the middle of compiled code too
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it was gone before
+            os._exit(1)
+        return
+    process: Any = multiprocessing.parent_process()
+
+    def watch() -> None:
+        wait([process.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -26,6 +26,7 @@ from impactopt._command_options import (
 )
 from impactopt._drive_command import drive
 from impactopt._strike_command import strike
+from impactopt._sweep_command import sweep
 from impactopt._validate_command import validate
 from impactopt.bench.command import app as bench_app
 from impactopt.plain_errors import plain_errors
@@ -133,6 +134,7 @@ def solve(
 app.command()(strike)
 app.command()(validate)
 app.command()(drive)
+app.command()(sweep)
 app.command()(reproduce)
 
 

@@ -51,6 +51,8 @@ _NOT_IN_GRAPHS = frozenset(
         "__init__",
         "__main__",
         "_standin",
+        "_sweep_command",
+        "_workers",
         "baseline",
         "bench",
         "cases",

@@ -232,6 +232,8 @@ def write_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     try:
         with open(temporary, "wb") as file:
             write(file)
+            file.flush()
+            os.fsync(file.fileno())  # a name that is there before its content would be an empty file
         os.replace(temporary, path)
     except BaseException as error:
         with contextlib.suppress(OSError):

@@ -42,7 +42,15 @@ LAYERS = (
     ("problem_file", "output", "replay", "sweeps"),
     ("plotting", "report", "screen"),
     ("plain_errors", "bench", "reproduce"),
-    ("_command_options", "_strike_command", "_validate_command", "_drive_command", "cli", "__main__"),
+    (
+        "_command_options",
+        "_strike_command",
+        "_validate_command",
+        "_drive_command",
+        "_sweep_command",
+        "cli",
+        "__main__",
+    ),
 )
 RANK = {room: rank for rank, room in enumerate(room for layer in LAYERS for room in layer)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.

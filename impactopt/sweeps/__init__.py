@@ -1,1 +1,18 @@
-"""Many cases of one problem."""
+"""Sweeps: many cases of one problem, done by many workers, and none of them lost.
+
+* definition.py   sweep files; design.py: grids, lists and draws
+* units.py        what goes to a worker, and what comes back
+* grains.py       from a case's settings to its row; evaluate.py: on a worker; alarm.py: in time
+* collisions.py   rows of collisions in compiled code: at_contact.py, collision_keys.py, states.py, scene.py,
+                  measures.py
+* engines.py      who does the units
+* journal.py      finished units on disk; store.py: the directory; table.py: the result
+* tally.py        progress
+* running.py      all of it together
+"""
+
+from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
+from impactopt.sweeps.running import SweepResult, sweep
+from impactopt.sweeps.tally import Progress
+
+__all__ = ["Progress", "Sweep", "SweepResult", "read_sweep_file", "sweep", "sweep_from_data"]

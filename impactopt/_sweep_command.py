@@ -1,0 +1,127 @@
+"""The command `impactopt sweep`: many cases of one problem."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from impactopt._command_options import NOT_SOLVED, AsJson, Quiet
+from impactopt.plain_errors import plain_errors
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from impactopt.sweeps import Progress, SweepResult
+
+BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewritten
+
+
+def sweep(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The sweep file; see docs/sweeps.md.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Where results go, and are found again.")
+    ],
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port: its workers do it."),
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Do every case of a sweep file, and write one table of them: DIR/table.parquet.
+
+    Each finished case is on disk at once: after Ctrl-C, a kill or a power cut the same command goes on. A
+    case that fails is a row with its reason. Exit code: 0 done, 1 no case has a usable result, 2 bad input.
+    """
+    interrupted = f"interrupted; what is finished is in {out}, and the same command goes on from there"
+    with plain_errors(interrupted) as console:
+        from impactopt.sweeps import sweep as run
+
+        with _Screen(console, quiet=quiet) as screen:
+            result = run(
+                file, out, workers=workers, scheduler=scheduler, report=screen.say, progress=screen.progress
+            )
+        if as_json:
+            typer.echo(json.dumps(result.summary()))
+        else:
+            _show(result)
+        if result.failed == result.done:
+            raise typer.Exit(NOT_SOLVED)
+
+
+class _Screen:
+    """Lines about what is going on, and a live bar; where there is no terminal, a line now and then."""
+
+    def __init__(self, console: Console, *, quiet: bool) -> None:
+        self._console, self._quiet, self._last = console, quiet, -BETWEEN
+        self._live = None
+        if console.is_terminal and not quiet:
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+            from rich.progress import Progress as Bar
+
+            parts = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+            self._live = Bar(*parts, console=console, transient=True)
+            self._task = self._live.add_task("starting", total=None)
+
+    def __enter__(self) -> _Screen:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def say(self, text: str) -> None:
+        if not self._quiet:
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def progress(self, now: Progress) -> None:
+        text = f"{now.rate:.3g} a second, {_time(now.remaining)} left"
+        if now.failed:
+            text += f", {now.failed} failed"
+        if now.best is not None:
+            text += f", best {now.best:.2f} N s (case {now.best_case})"
+        if self._live is not None:
+            self._live.update(self._task, completed=now.done, total=now.cases, description=text)
+        elif time.perf_counter() - self._last >= BETWEEN:
+            self._last = time.perf_counter()
+            self.say(f"{now.done} of {now.cases}, {text}")
+
+
+def _show(result: SweepResult) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
+    rows = {
+        "without a usable result": str(result.failed),
+        "there from before": str(result.resumed),
+        "this run": f"{_time(result.seconds)}, {result.rate_per_second:.3g} cases a second",
+        "most memory of a worker": f"{result.peak_worker_mb:.0f} MB",
+    }
+    if result.best is not None:
+        rows["largest impulse"] = f"{result.best:.2f} N s, in case {result.best_case}"
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console = Console()
+    console.print(table)
+    for reason, count in result.reasons.items():
+        console.print(f"{count} x {reason}", markup=False, highlight=False)
+    console.print(str(result.table), markup=False, highlight=False, soft_wrap=True)
+
+
+def _time(seconds: float) -> str:
+    if not seconds < float("inf"):
+        return "?"
+    hours, rest = divmod(round(seconds), 3600)
+    if not hours and rest < 60:
+        return f"{seconds:.3g} s"
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60} min {rest % 60} s"

@@ -1,0 +1,39 @@
+"""The time limit of a case that does not keep it by itself."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+__all__ = ["RANG", "Alarm"]
+
+RANG = -int(signal.SIGALRM)  # exit code of a process that it ended
+BUILDING = 900.0  # [s]: the longest that one step of building functions may take
+
+
+class Alarm:
+    """Ends this process where a case takes much longer than its time; news from the case put it off.
+
+    The kernel does, by SIGALRM: nothing else stops compiled code.
+
+    limit [s] : None for no alarm.  grace [s] : how much longer.
+    """
+
+    def __init__(self, limit: float | None, grace: float) -> None:
+        self._seconds = 0.0 if limit is None else limit + grace
+        self._set(self._seconds)
+
+    def building(self, line: str) -> None:
+        """A solve's `report`: functions may be compiled, which is no part of a case's time."""
+        self._set(max(BUILDING, self._seconds) if self._seconds else 0.0)
+
+    def iteration(self, record: Any) -> None:
+        """A solve's `callback`."""
+        self._set(self._seconds)
+
+    def off(self) -> None:
+        self._set(0.0)
+
+    @staticmethod
+    def _set(seconds: float) -> None:
+        signal.setitimer(signal.ITIMER_REAL, seconds)

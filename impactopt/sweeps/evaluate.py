@@ -1,0 +1,57 @@
+"""A unit's rows, on the worker that it went to: a process of one's own, or of a cluster."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from impactopt import __version__
+from impactopt.errors import InputError
+from impactopt.output import Record
+from impactopt.sweeps.alarm import Alarm
+from impactopt.sweeps.grains import GRAINS
+from impactopt.sweeps.units import Found, Unit, Work, failed_columns
+
+__all__ = ["evaluate"]
+
+
+def evaluate(work: Work, unit: Unit) -> Found:
+    """The rows of a unit; what goes wrong in a case is the reason in its row.
+
+    BLAS gets one thread, as the other cores are for other workers.
+
+    Raises
+    ------
+    InputError : this is not the version of impactopt that the sweep was begun with.
+    """
+    if work.version != __version__:
+        raise InputError(f"a worker has impactopt {__version__}, the sweep {work.version}; install the same")
+    threadpool_limits(1)
+    began, alarm = time.perf_counter(), Alarm(work.time_limit, work.grace)
+    records: Mapping[int, Record] = {}
+    try:
+        columns, records = GRAINS[work.grain](work, unit, alarm)
+    except InputError as error:
+        columns = failed_columns(unit.count, "refused", str(error))
+    except Exception as error:  # of whatever kind: it is this unit's alone
+        columns = failed_columns(unit.count, "error", f"{type(error).__name__}: {error}")
+    finally:
+        alarm.off()
+    seconds = np.full(unit.count, (time.perf_counter() - began) / unit.count)
+    return Found(columns={**columns, "seconds": seconds}, records=records, peak_mb=_peak_memory())
+
+
+def _peak_memory() -> float:
+    """The most that this process has had in memory [MB]."""
+    if sys.platform.startswith("linux"):  # getrusage counts what the parent had when it started this process
+        for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return float(line.split()[1]) / 1024
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20

@@ -1,0 +1,98 @@
+"""What a case is: a whole motion, a strike, or one collision of many; each from its settings to its row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from impactopt.output import Record, plain, record_of, record_of_strike
+from impactopt.planner import solve
+from impactopt.problem import ImpactProblem
+from impactopt.problem_file import ProblemFile, problem_file_from_data
+from impactopt.strike import optimize_strike
+from impactopt.sweeps.alarm import Alarm
+from impactopt.sweeps.units import Columns, Unit, Work
+
+__all__ = ["GRAINS"]
+
+Rows = tuple[Columns, Mapping[int, Record]]
+
+_PLAIN = (
+    "impulse_Ns",
+    "peak_force_N",
+    "contact_ms",
+    "hand_speed_m_s",
+    "duration_s",
+    "capture_margin_m",
+    "max_violation",
+    "iterations",
+    "solve_seconds",
+    "build_seconds",
+)
+_UNITS = {"N s": "_Ns", "N": "_N", "J": "_J", "m": "_m", "s": "_s", "(N m s)^2": "_N2m2s2"}
+
+
+def _solve(work: Work, unit: Unit, alarm: Alarm) -> Rows:
+    file = _file(work, unit)
+    problem = file.build()
+    solution = solve(
+        problem,
+        start=work.start,
+        starts=work.starts,
+        seed=work.seed,
+        report=alarm.building,
+        callback=alarm.iteration,
+        **_arguments(file, work),
+    )
+    # the record's summary says why a motion that was stopped early has none
+    record = record_of(solution, problem=file.text, problem_path=file.path)
+    return _row(record.summary, problem), {unit.first: record} if work.trajectories else {}
+
+
+def _strike(work: Work, unit: Unit, alarm: Alarm) -> Rows:
+    file = _file(work, unit)
+    problem = file.build()
+    solution = optimize_strike(
+        problem,
+        starts=work.starts,
+        seed=work.seed,
+        report=alarm.building,
+        callback=alarm.iteration,
+        **_arguments(file, work),
+    )
+    record = record_of_strike(solution, problem=file.text, problem_path=file.path)
+    return _row(record.summary, problem), {unit.first: record} if work.trajectories else {}
+
+
+GRAINS: dict[str, Callable[[Work, Unit, Alarm], Rows]] = {"solve": _solve, "strike": _strike}
+
+
+def _file(work: Work, unit: Unit) -> ProblemFile:
+    settings = {key: values[0] for key, values in unit.columns.items()}
+    return problem_file_from_data(work.data, where=work.path).changed(settings)
+
+
+def _arguments(file: ProblemFile, work: Work) -> dict[str, Any]:
+    own = file.solver.time_limit
+    limits = [seconds for seconds in (own, work.time_limit) if seconds is not None]
+    return file.solver.arguments(time_limit=min(limits, default=None))
+
+
+def _row(summary: Mapping[str, Any], problem: ImpactProblem) -> Columns:
+    """The numbers of a summary as columns, each named with its unit."""
+    usable = summary["status"] in ("solved", "acceptable") and "note" not in summary
+    row = {
+        "status": summary["status"],
+        "reason": "" if usable else " ".join(filter(None, (summary["message"], summary.get("note")))),
+    }
+    row |= {name: summary[name] for name in _PLAIN if name in summary}
+    row |= {f"target_{name}": value for name, value in (summary.get("target") or {}).items()}
+    row |= {f"torque_ratio_{phase}": x for phase, x in summary.get("torque_ratio", {}).items()}
+    row |= {f"zmp_margin_{phase}_m": x for phase, x in summary.get("zmp_margin_m", {}).items()}
+    units = {objective.name: _UNITS.get(objective.unit, "") for objective in problem.objectives}
+    for name, value in summary.get("objectives", {}).items():
+        row[f"objective_{name.replace(' ', '_')}{units[name]}"] = value
+    for scenario in summary.get("scenarios", ()):
+        name = str(scenario["name"]).replace(" ", "_")
+        row |= {f"{name}_{key}": x for key, x in scenario.items() if isinstance(x, (int, float))}
+    return {name: [value] for name, value in plain(row).items()}

@@ -1,0 +1,208 @@
+"""A sweep from its file to its table."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from impactopt.errors import InputError
+from impactopt.nlp.transcription import block_functions
+from impactopt.problem import ImpactProblem
+from impactopt.solution import versions
+from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
+from impactopt.sweeps.engines import on_processes
+from impactopt.sweeps.store import Store
+from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
+from impactopt.sweeps.tally import Progress, Tally
+from impactopt.sweeps.units import Unit, Work
+
+__all__ = ["SweepResult", "sweep"]
+
+TOGETHER = {"collision": 16384}  # cases in a unit; one of the other grains
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepResult:
+    """What came of a sweep.
+
+    cases : of the sweep.  done : rows in the table; failed : of these, without a usable result.  resumed :
+    of these, from runs before this one.  seconds : of this run, and rate_per_second : its cases.
+    peak_worker_mb : the most memory that a worker had, in any run [MB].  table : the Parquet file.
+    best, best_case : the largest impulse [N s] of usable rows, and where; None if there is none.
+    reasons : why rows have no usable result, and how often, most often first; numbers in them are left out.
+    """
+
+    cases: int
+    done: int
+    failed: int
+    resumed: int
+    seconds: float
+    rate_per_second: float
+    peak_worker_mb: float
+    table: Path
+    best: float | None = None
+    best_case: int | None = None
+    reasons: Mapping[str, int] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """As `impactopt sweep --json` prints it."""
+        names = ("cases", "done", "failed", "resumed", "seconds", "rate_per_second", "peak_worker_mb")
+        return {**{name: getattr(self, name) for name in names}, "table": str(self.table)}
+
+
+def sweep(
+    source: Sweep | Mapping[str, Any] | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    report: Callable[[str], None] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> SweepResult:
+    """Do every case of a sweep and write one table; done again, it goes on where it was ended.
+
+    source : a sweep file, its data as tables, or what :func:`impactopt.sweeps.read_sweep_file` gave.
+    out : directory of the results: see `impactopt.sweeps.store`. Every finished case is on disk at once.
+    workers : processes; None: as many as there are cores. A script needs `if __name__ == "__main__":`.
+    report : told in words what is going on.  progress : told after every unit.
+
+    A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
+    finished, and is raised.
+
+    Raises
+    ------
+    InputError : the sweep or its problem is wrong; another process is at work in the directory, or it holds
+        another sweep; the disk is full; pyarrow is not installed.
+    """
+    tell = report if report is not None else _ignore
+    count = _cores() if workers is None else workers
+    if count < 1:
+        raise InputError(f"{count} workers; ask for at least 1")
+    pyarrow()
+    chosen = _read(source)
+    problem = chosen.problem.build()
+    store = Store(chosen, Path(out))
+    try:
+        return _run(chosen, problem, store, count, tell, progress)
+    finally:
+        store.close()
+
+
+def _run(
+    chosen: Sweep,
+    problem: ImpactProblem,
+    store: Store,
+    workers: int,
+    tell: Callable[[str], None],
+    progress: Callable[[Progress], None] | None,
+) -> SweepResult:
+    journal, together = store.journal, TOGETHER.get(chosen.grain, 1)
+    if journal.torn:
+        tell(f"the end of {journal.path} was torn, as when a run is killed; that unit is done again")
+    if journal.damaged:
+        tell(f"{journal.path} is damaged in {journal.damaged} places; the units there are done again")
+    tally = Tally(chosen.design.cases)
+    for entry in journal.read():
+        tally.add(entry.unit * together, entry.columns, entry.peak_mb)
+    tally.begin()
+    if tally.resumed:
+        tell(f"{tally.resumed} of {tally.cases} cases are there from before")
+    if tally.done < tally.cases and chosen.grain != "collision":
+        # here, so that it is done once, and said; workers find the functions on disk
+        block_functions(problem, problem.coordinates, tell)
+    left = _units(chosen, together, journal.units)
+    with contextlib.closing(on_processes(_work(chosen), left, workers=workers)) as found:
+        try:
+            for unit, result in found:
+                store.keep(unit.index, result)
+                tally.add(unit.first, result.columns, result.peak_mb)
+                if progress is not None:
+                    progress(tally.progress())
+        except KeyboardInterrupt:
+            found.close()
+            _write(chosen, problem, store, together, tally)
+            raise
+    _write(chosen, problem, store, together, tally)
+    now = tally.progress()
+    return SweepResult(
+        cases=tally.cases,
+        done=tally.done,
+        failed=tally.failed,
+        resumed=tally.resumed,
+        seconds=now.seconds,
+        rate_per_second=now.rate,
+        peak_worker_mb=tally.peak_mb,
+        table=store.table,
+        best=tally.best,
+        best_case=tally.best_case,
+        reasons=dict(tally.reasons.most_common()),
+    )
+
+
+def _read(source: Sweep | Mapping[str, Any] | str | os.PathLike[str]) -> Sweep:
+    if isinstance(source, Sweep):
+        return source
+    return sweep_from_data(source) if isinstance(source, Mapping) else read_sweep_file(source)
+
+
+def _work(chosen: Sweep) -> Work:
+    return Work(
+        data=chosen.problem.data,
+        path=chosen.problem.path,
+        grain=chosen.grain,
+        seed=chosen.seed,
+        start=chosen.start,
+        starts=chosen.starts,
+        time_limit=chosen.time_limit,
+        trajectories=chosen.trajectories,
+    )
+
+
+def _units(chosen: Sweep, together: int, finished: set[int]) -> Iterator[Unit]:
+    """Those that are left, in their order."""
+    cases = chosen.design.cases
+    for index in range(-(-cases // together)):
+        if index not in finished:
+            first, last = index * together, min((index + 1) * together, cases)
+            columns = chosen.design.columns(first, last)
+            yield Unit(index=index, first=first, count=last - first, columns=columns)
+
+
+def _write(chosen: Sweep, problem: ImpactProblem, store: Store, together: int, tally: Tally) -> None:
+    """The table of all that is finished."""
+
+    def parts() -> Iterator[Part]:
+        for entry in store.journal.read():
+            first = entry.unit * together
+            count = len(entry.columns["reason"])
+            yield first, {**chosen.design.columns(first, first + count), **entry.columns}
+
+    kinds: dict[str, str] = {}
+    for axis in chosen.design.axes:
+        merge_kinds(kinds, {axis.key: axis.values})
+    metadata = {
+        "name": chosen.name,
+        "grain": chosen.grain,
+        "cases": str(tally.cases),
+        "done": str(tally.done),
+        "sweep_hash": chosen.hash,
+        "problem_hash": problem.hash,
+        "versions": json.dumps(versions()),
+        "sweep": chosen.text or json.dumps(chosen.content),
+        "problem": chosen.problem.text,
+    }
+    write_table(store.table, parts(), {**kinds, **tally.kinds}, metadata)
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _ignore(text: str) -> None:
+    pass

@@ -1,0 +1,87 @@
+"""What a sweep has come to so far: how many, how fast, the best, and how long it will take."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from impactopt.sweeps.table import merge_kinds
+from impactopt.sweeps.units import Columns
+
+__all__ = ["Progress", "Tally"]
+
+BEST = "impulse_Ns"
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """Cases of the sweep, done, failed among these, and resumed from runs before.
+
+    seconds : since this run began.  rate : its cases a second.  remaining [s] : at this rate; nan at first.
+    best [N s], best_case : the largest impulse of usable rows; None if there is none.
+    """
+
+    cases: int
+    done: int
+    failed: int
+    resumed: int
+    seconds: float
+    rate: float
+    remaining: float
+    best: float | None
+    best_case: int | None
+
+
+class Tally:
+    """Counts rows as they come.
+
+    kinds : of the columns' values, for the table.  reasons : how often each came, numbers left out.
+    """
+
+    def __init__(self, cases: int) -> None:
+        self.cases, self.done, self.failed, self.resumed = cases, 0, 0, 0
+        self.peak_mb = 0.0
+        self.best: float | None = None
+        self.best_case: int | None = None
+        self.kinds: dict[str, str] = {}
+        self.reasons: Counter[str] = Counter()
+        self._began = time.perf_counter()
+
+    def begin(self) -> None:
+        """What has come so far is from runs before; this one begins now."""
+        self.resumed, self._began = self.done, time.perf_counter()
+
+    def add(self, first: int, columns: Columns, peak_mb: float) -> None:
+        """Count rows: of cases from `first` on."""
+        good = np.array([reason == "" for reason in columns["reason"]])
+        self.done += len(good)
+        self.failed += int((~good).sum())
+        self.reasons.update(_NUMBER.sub("...", reason) for reason in columns["reason"] if reason)
+        self.peak_mb = max(self.peak_mb, peak_mb)
+        merge_kinds(self.kinds, columns)
+        found = np.array([np.nan if x is None else x for x in columns.get(BEST, ())], dtype=float)
+        if found.size and np.isfinite(found[good]).any():
+            at = int(np.nanargmax(np.where(good, found, np.nan)))
+            if self.best is None or found[at] > self.best:
+                self.best, self.best_case = float(found[at]), first + at
+
+    def progress(self) -> Progress:
+        """How it stands now."""
+        seconds, fresh = time.perf_counter() - self._began, self.done - self.resumed
+        rate = fresh / seconds if seconds > 0 else 0.0
+        return Progress(
+            cases=self.cases,
+            done=self.done,
+            failed=self.failed,
+            resumed=self.resumed,
+            seconds=seconds,
+            rate=rate,
+            remaining=(self.cases - self.done) / rate if rate > 0 else float("nan"),
+            best=self.best,
+            best_case=self.best_case,
+        )

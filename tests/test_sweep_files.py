@@ -1,0 +1,180 @@
+"""Sweep files: which cases they mean, and what is said of mistakes."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+
+from impactopt.errors import InputError
+from impactopt.sweeps import Sweep, read_sweep_file, sweep_from_data
+from impactopt.sweeps.design import Axis, Design, Draws, Span
+
+
+def sweep(**tables: Any) -> Sweep:
+    return sweep_from_data({"sweep": {"problem": "arm_planar"}, **tables})
+
+
+def cases(chosen: Sweep) -> list[tuple[Any, ...]]:
+    columns = chosen.design.columns(0, chosen.design.cases)
+    return list(zip(*columns.values(), strict=True))
+
+
+# ---------------------------------------------------------------- cases
+def test_a_grid_is_every_combination_the_last_key_fastest() -> None:
+    log = {"from": 1e4, "to": 1e6, "count": 3, "scale": "log"}
+    found = sweep(grid={"target.mass": [0.05, 0.1], "contact": {"stiffness_N_m": log}})
+    assert list(found.design.columns(0, 1)) == ["target.mass_kg", "contact.stiffness_N_m"]
+    np.testing.assert_allclose(cases(found), list(product([0.05, 0.1], [1e4, 1e5, 1e6])), rtol=1e-12)
+
+
+def test_a_list_is_read_side_by_side_and_draws_go_fastest() -> None:
+    found = sweep(
+        grid={"contact.damping": [100.0, 200.0]},
+        list={
+            "target.mass": [0.05, 0.1, 0.2],
+            "problem.point": [[0.7, 0, 0.75], [0.65, 0, 0.75], [0.6, 0, 0.75]],
+        },
+        draw={"method": "random", "count": 4, "over": {"target.resistance": {"from": 400, "to": 800}}},
+    )
+    assert found.design.cases == 2 * 3 * 4
+    for k, (damping, mass, point, resistance) in enumerate(cases(found)):
+        row = k // 4 % 3
+        assert (damping, mass, point[0]) == (
+            [100.0, 200.0][k // 12],
+            [0.05, 0.1, 0.2][row],
+            [0.7, 0.65, 0.6][row],
+        )
+        assert resistance == cases(found)[k % 4][3]
+    some = found.design.columns(7, 11)
+    assert list(zip(*some.values(), strict=True)) == cases(found)[7:11]
+
+
+@pytest.mark.parametrize("method", ["random", "sobol", "latin hypercube"])
+@pytest.mark.parametrize("count", [1, 48, 64])
+def test_draws_are_in_range_and_of_the_seed(method: str, count: int) -> None:
+    over = {"a": Span(first=2.0, last=8.0), "b": Span(first=1e-3, last=1e3, scale="log"), "c": ["x", "y"]}
+    draws = {seed: Draws(method=method, count=count, seed=seed, over=over).columns() for seed in (0, 1)}
+    again = Draws(method=method, count=count, seed=0, over=over).columns()
+    a, b, c = (axis.values for axis in draws[0])
+    assert len(a) == len(b) == len(c) == count
+    assert np.min(a) >= 2 and np.max(a) <= 8 and np.min(b) >= 1e-3 and np.max(b) <= 1e3
+    assert set(c) <= {"x", "y"}
+    np.testing.assert_array_equal(a, again[0].values)
+    assert not np.array_equal(a, draws[1][0].values)
+
+
+def test_sobol_and_latin_hypercubes_are_spread_better_than_chance() -> None:
+    over = {name: Span(first=0.0, last=1.0) for name in "abc"}
+
+    def discrepancy(method: str) -> float:
+        axes = Draws(method=method, count=128, seed=3, over=over).columns()
+        return float(qmc.discrepancy(np.column_stack([axis.values for axis in axes])))
+
+    assert discrepancy("sobol") < discrepancy("latin hypercube") < discrepancy("random")
+    # one point in each of so many equal parts, on every side
+    axes = Draws(method="latin hypercube", count=50, seed=0, over=over).columns()
+    for axis in axes:
+        assert sorted((np.asarray(axis.values) * 50).astype(int)) == list(range(50))
+
+
+def test_spans_end_where_they_say_and_may_go_down() -> None:
+    assert Span(first=3.0, last=1.0).spread(3).tolist() == [3.0, 2.0, 1.0]
+    third = Span(first=0.1, last=0.3, scale="log").at(np.linspace(0, 1, 1001))
+    assert third.min() == 0.1 and third.max() == 0.3
+
+
+def test_nothing_varied_is_one_case_and_whole_numbers_stay_whole() -> None:
+    assert Design().cases == 1 and Design().columns(0, 1) == {}
+    values = Design(grid=[Axis(key="k", values=np.array([8, 12]))]).columns(0, 2)["k"]
+    assert [type(v) for v in np.asarray(values).tolist()] == [int, int]
+
+
+# ---------------------------------------------------------------- files
+TEXT = """\
+[sweep]
+problem = "arm.toml"
+grain = "strike"
+seed = 3
+
+[grid]
+target.mass_kg = [0.05, 0.1]  # dots or quotes
+"contact.damping" = [100.0]
+"""
+
+
+def written(folder: Path, text: str = TEXT) -> Path:
+    from impactopt.problem_file.names import problem_file
+
+    (folder / "arm.toml").write_bytes(problem_file("arm_planar").read_bytes())
+    (folder / "sweep.toml").write_text(text, encoding="utf-8")
+    return folder / "sweep.toml"
+
+
+def message(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_sweep_file(path)
+    return str(caught.value)
+
+
+def test_a_file_names_its_problem_relative_to_itself(tmp_path: Path) -> None:
+    found = read_sweep_file(written(tmp_path))
+    assert (found.name, found.grain, found.seed) == ("sweep", "strike", 3)
+    assert cases(found) == [(0.05, 100.0), (0.1, 100.0)]
+    assert found.problem.path == tmp_path / "arm.toml"
+
+
+def test_all_mistakes_are_told_with_their_lines(tmp_path: Path) -> None:
+    text = TEXT.replace('grain = "strike"', 'grain = "strik"\nworkers = 2')
+    said = message(written(tmp_path, text))
+    assert "line 3, [sweep] grain: 'strik' is unknown (did you mean 'strike'?)" in said
+    assert "line 4, [sweep] workers: unknown key" in said
+
+
+def test_keys_and_values_are_the_problem_files(tmp_path: Path) -> None:
+    bad = TEXT.replace("[0.05, 0.1]", "[0.05, -1.0]").replace("contact.damping", "contact.dampin")
+    said = message(written(tmp_path, bad))
+    assert "line 8, [grid] contact.dampin: " in said and "did you mean 'damping" in said
+    said = message(written(tmp_path, TEXT.replace("[0.05, 0.1]", "[0.05, -1.0]")))
+    assert "line 7, [grid] target.mass_kg: with target.mass_kg = -1.0: " in said
+    assert said.endswith("give a number > 0")
+
+
+@pytest.mark.parametrize(
+    ("more", "wrong"),
+    [
+        ("[set]\ntarget.mas = 3.0", "has no key 'mas'"),
+        ("[list]\ntarget.mass = [1.0]", "line 11, [list] target.mass: is also given by grid.target.mass_kg"),
+        (
+            "[list]\ncontact.stiffness = [1e5, 2e5]\ntarget.resistance = [1.0]",
+            "1 values, but contact.stiffness_N_m has 2",
+        ),
+        ("[list]\ncontact.stiffness = 3", "[list] contact.stiffness: 3; give a list of values"),
+        ("[draw]\ncount = 3\n[draw.over]\n", "[draw.over]: empty"),
+        (
+            "[draw]\ncount = 3\nover.target.resistance = {from = -1.0, to = 3.0}",
+            "[draw.over] target.resistance: with",
+        ),
+        (
+            "[draw]\ncount = 3\nover.target.resistance = {from = 0.0, to = 3.0, scale = 'log'}",
+            "must be > 0 for a log",
+        ),
+        ("[draw]\ncount = 3\nover.target.resistance = {from = 1.0, count = 2}", "to: missing"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, more: str, wrong: str) -> None:
+    assert wrong in message(written(tmp_path, f"{TEXT}\n{more}\n"))
+
+
+def test_the_hash_is_of_what_is_done_not_of_how_it_is_written(tmp_path: Path) -> None:
+    first = read_sweep_file(written(tmp_path)).hash
+    assert read_sweep_file(written(tmp_path, f"# a comment\n{TEXT}")).hash == first
+    assert read_sweep_file(written(tmp_path, TEXT.replace("0.1]", "0.11]"))).hash != first
+    path = written(tmp_path)
+    problem = tmp_path / "arm.toml"
+    problem.write_text(problem.read_text().replace("mass_kg = 0.05", "mass_kg = 0.06"), encoding="utf-8")
+    assert read_sweep_file(path).hash != first

@@ -1,0 +1,180 @@
+"""Sweeps on processes of this machine: nothing finished is lost, and rows do not depend on accidents."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pyarrow.parquet as pq
+import pytest
+from sweep_workers import pools, slow, unlucky
+from typer.testing import CliRunner
+
+from impactopt._workers import Died, each_on_workers
+from impactopt.cli import app
+from impactopt.errors import InputError
+from impactopt.output import load_record
+from impactopt.sweeps import Progress, sweep, sweep_from_data
+from impactopt.sweeps.alarm import RANG
+from impactopt.sweeps.engines import on_processes
+from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.units import Unit, Work
+
+TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
+RESISTANCES = [500.0, 700.0, 9e3, 600.0]
+SWEEP = {
+    "sweep": {"problem": "arm_planar", "grain": "strike", "name": "nails"},
+    "grid": {"target.resistance": RESISTANCES},
+}
+
+
+def rows(table: Path) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(table).to_pylist()
+    return [{name: value for name, value in row.items() if name not in TIMES} for row in found]
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> list[dict[str, Any]]:
+    """The rows, one after the other in this process."""
+    chosen = sweep_from_data(SWEEP)
+    work = Work(data=chosen.problem.data, path=chosen.problem.path, grain="strike")
+    out = []
+    for case, value in enumerate(RESISTANCES):
+        unit = Unit(index=case, first=case, count=1, columns={"target.resistance_N": [value]})
+        columns = evaluate(work, unit).columns
+        row = {"case": case, "target.resistance_N": value}
+        out.append(row | {name: column[0] for name, column in columns.items() if name not in TIMES})
+    return out
+
+
+def test_a_worker_that_is_killed_costs_nothing_and_the_table_tells_all(
+    tmp_path: Path, undisturbed: list[dict[str, Any]]
+) -> None:
+    told: list[Progress] = []
+
+    def kill_one(now: Progress) -> None:
+        told.append(now)
+        if len(told) == 1:
+            victim = multiprocessing.active_children()[0]
+            assert victim.pid is not None
+            os.kill(victim.pid, signal.SIGKILL)
+
+    result = sweep(SWEEP, tmp_path / "out", workers=2, progress=kill_one)
+    assert rows(result.table) == undisturbed
+    assert (result.cases, result.done, result.failed, result.resumed) == (4, 4, 0, 0)
+    assert [now.done for now in told] == [1, 2, 3, 4] and told[-1].remaining == 0
+    best = max(undisturbed, key=lambda row: row["impulse_Ns"])
+    assert (result.best, result.best_case) == (best["impulse_Ns"], best["case"])
+    assert 50 < result.peak_worker_mb < 1000
+    assert multiprocessing.active_children() == []
+    schema = pq.read_schema(result.table)
+    assert schema.field("impulse_Ns").metadata[b"unit"] == b"N s"
+    said = {name.decode(): text.decode() for name, text in schema.metadata.items()}
+    chosen = sweep_from_data(SWEEP)
+    assert said["impactopt.problem_hash"] == chosen.problem.build().hash
+    assert said["impactopt.sweep_hash"] == chosen.hash
+    assert json.loads(said["impactopt.versions"])["casadi"]
+    assert json.loads(said["impactopt.units"])["target.resistance_N"] == "N"
+
+
+COMMAND = [sys.executable, "-m", "impactopt.cli", "sweep"]
+
+
+def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(
+    tmp_path: Path, undisturbed: list[dict[str, Any]]
+) -> None:
+    file, out = tmp_path / "nails.toml", tmp_path / "out"
+    values = ", ".join(map(str, RESISTANCES))
+    file.write_text(
+        f'[sweep]\nproblem = "arm_planar"\ngrain = "strike"\n[grid]\ntarget.resistance = [{values}]\n',
+        encoding="utf-8",
+    )
+    parent = subprocess.Popen(
+        [*COMMAND, str(file), "--out", str(out), "--workers", "2"], stderr=subprocess.PIPE, text=True
+    )
+    journal, until = out / "units.journal", time.monotonic() + 60
+    while not (journal.exists() and journal.stat().st_size) and time.monotonic() < until:
+        time.sleep(0.01)
+    workers = psutil.Process(parent.pid).children(recursive=True)
+    parent.kill()
+    parent.communicate()
+    _, alive = psutil.wait_procs(workers, timeout=5)
+    assert len(workers) >= 2 and alive == []
+    with open(journal, "ab") as torn:  # as if it had been killed in the middle of a record
+        torn.write(journal.read_bytes()[:100])
+    again = subprocess.run(
+        [*COMMAND, str(file), "--out", str(out), "--workers", "1", "--json"], capture_output=True, text=True
+    )
+    summary = json.loads(again.stdout)
+    names = ["cases", "done", "failed", "resumed", "seconds", "rate_per_second", "peak_worker_mb", "table"]
+    assert list(summary) == names
+    assert (summary["cases"], summary["done"], summary["failed"], again.returncode) == (4, 4, 0, 0)
+    assert 1 <= summary["resumed"] < 4
+    assert "was torn" in again.stderr and "are there from before" in again.stderr
+    assert rows(Path(summary["table"])) == undisturbed
+
+
+def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_path: Path) -> None:
+    points = [[0.7, 0.0, 0.75], [30.0, 0.0, 0.75]]
+    given = {
+        "sweep": {"problem": "arm_planar", "grain": "strike", "trajectories": True},
+        "grid": {"problem.point": points},
+    }
+    out = tmp_path / "out"
+    result = sweep(given, out, workers=1)
+    good, bad = rows(result.table)
+    assert (result.done, result.failed) == (2, 1)
+    assert good["problem.point_m"] == json.dumps(points[0]) and good["reason"] == ""
+    assert bad["status"] == "refused" and "reach" in bad["reason"] and bad["impulse_Ns"] is None
+    record = load_record(out / "cases" / "000000")
+    assert record.summary["impulse_Ns"] == good["impulse_Ns"]
+    assert "[0.7" in record.problem
+    assert not (out / "cases" / "000001").exists()
+    assert sum(result.reasons.values()) == 1
+
+
+# ---------------------------------------------------------------- workers
+def test_an_input_is_tried_again_so_often_and_no_more(tmp_path: Path) -> None:
+    found = each_on_workers(unlucky, tmp_path, enumerate(range(3)), workers=2, again=lambda d: d.tries < 3)
+    assert dict(found) == {0: Died(code=-signal.SIGKILL, tries=3), 1: 1, 2: 2}
+
+
+def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    began = time.perf_counter()
+    assert dict(each_on_workers(slow, 0.3, [(0, 0)], workers=1)) == {0: Died(code=RANG, tries=1)}
+    assert time.perf_counter() - began > 3 * 0.8 * 0.3
+    work = Work(data={}, path=Path("p"), grain="solve", time_limit=0.5)
+    units = [Unit(index=k, first=k, count=1, columns={}) for k in range(2)]
+    ends = [Died(code=RANG, tries=1), Died(code=-signal.SIGSEGV, tries=3)]
+    monkeypatch.setattr(
+        "impactopt.sweeps.engines.each_on_workers",
+        lambda *a, **k: zip(*[[0, 1], ends], strict=True) if list(a[2]) else None,
+    )
+    late, crashed = (found.columns for _, found in on_processes(work, units, workers=1))
+    assert late["reason"] == ["it took longer than 0.5 s and did not stop by itself"]
+    assert crashed["reason"] == ["its process died 3 times (killed by SIGSEGV)"]
+
+
+def test_workers_have_one_blas_thread() -> None:
+    assert dict(each_on_workers(pools, None, [(0, 0)], workers=1)) == {0: 1}
+
+
+def test_a_worker_of_another_version_is_refused() -> None:
+    work = Work(data={}, path=Path("p"), grain="solve", version="0.0.0")
+    with pytest.raises(InputError, match=r"the sweep 0\.0\.0; install the same"):
+        evaluate(work, Unit(index=0, first=0, count=1, columns={}))
+
+
+# ---------------------------------------------------------------- the command
+def test_a_bad_sweep_file_is_exit_code_2(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["sweep", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2 and "none.toml" in result.output
+    assert not (tmp_path / "out").exists()

@@ -24,8 +24,10 @@ from impactopt.errors import InputError
 from impactopt.output import load_record
 from impactopt.sweeps import Progress, sweep, sweep_from_data
 from impactopt.sweeps.alarm import RANG
+from impactopt.sweeps.collisions import collide_many
 from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.running import TOGETHER
 from impactopt.sweeps.units import Unit, Work
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
@@ -178,3 +180,46 @@ def test_a_bad_sweep_file_is_exit_code_2(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["sweep", str(tmp_path / "none.toml"), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2 and "none.toml" in result.output
     assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------- collisions
+def test_collisions_go_in_chunks_and_are_the_same_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(TOGETHER, "collision", 64)
+    over = {
+        "target.mass": {"from": 0.5, "to": 5.0},
+        "contact.stiffness": {"from": 1e4, "to": 1e5, "scale": "log"},
+        "at_contact.speed": {"from": 0.1, "to": 2.0},
+    }
+    given = {
+        "sweep": {
+            "problem": "arm7",
+            "grain": "collision",
+            "outputs": ["impulse_Ns", "peak_force_N", "contact_ms"],
+        },
+        "draw": {"method": "latin hypercube", "count": 150, "over": over},
+    }
+    result = sweep(given, tmp_path / "out", workers=2)
+    table = pq.read_table(result.table).to_pydict()
+    assert result.done == 150 and table["case"] == list(range(150))
+    columns = sweep_from_data(given).design.columns(0, 150)
+    for case in (0, 63, 64, 149):
+        one = collide_many(
+            "arm7", {key: [x[case]] for key, x in columns.items()}, outputs=given["sweep"]["outputs"]
+        )
+        assert one.pop("reason")[0] == table["reason"][case] == ""
+        for name, values in one.items():
+            assert table[name][case] == pytest.approx(values[0], rel=1e-12)
+        for key, x in columns.items():
+            assert table[key][case] == x[case]
+
+
+def test_what_collisions_do_not_have_is_said() -> None:
+    given = {"sweep": {"problem": "arm7", "grain": "collision", "starts": 2}, "grid": {"target.mass": [1.0]}}
+    with pytest.raises(InputError, match=r"\[sweep\] starts: collisions have none"):
+        sweep_from_data(given)
+    with pytest.raises(InputError, match=r"speed_m_s: missing"):
+        sweep_from_data({**given, "sweep": {"problem": "arm7", "grain": "collision"}})
+    with pytest.raises(InputError, match="of collisions only"):
+        sweep_from_data({"sweep": {"problem": "arm7", "outputs": ["impulse_Ns"]}})

@@ -1,6 +1,6 @@
 """Sweeps: many cases of one problem, done by many workers, and none of them lost.
 
-* definition.py   sweep files; design.py: grids, lists and draws
+* definition.py   sweep files: sections.py, varied.py; design.py: grids, lists and draws
 * units.py        what goes to a worker, and what comes back
 * grains.py       from a case's settings to its row; evaluate.py: on a worker; alarm.py: in time
 * collisions.py   rows of collisions in compiled code: at_contact.py, collision_keys.py, states.py, scene.py,

@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from impactopt import __version__
@@ -43,8 +42,9 @@ def evaluate(work: Work, unit: Unit) -> Found:
         columns = failed_columns(unit.count, "error", f"{type(error).__name__}: {error}")
     finally:
         alarm.off()
-    seconds = np.full(unit.count, (time.perf_counter() - began) / unit.count)
-    return Found(columns={**columns, "seconds": seconds}, records=records, peak_mb=_peak_memory())
+    if work.grain != "collision":
+        columns = {**columns, "seconds": [time.perf_counter() - began]}
+    return Found(columns=columns, records=records, peak_mb=_peak_memory())
 
 
 def _peak_memory() -> float:

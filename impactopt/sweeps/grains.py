@@ -11,6 +11,7 @@ from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile, problem_file_from_data
 from impactopt.strike import optimize_strike
 from impactopt.sweeps.alarm import Alarm
+from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.units import Columns, Unit, Work
 
 __all__ = ["GRAINS"]
@@ -64,7 +65,22 @@ def _strike(work: Work, unit: Unit, alarm: Alarm) -> Rows:
     return _row(record.summary, problem), {unit.first: record} if work.trajectories else {}
 
 
-GRAINS: dict[str, Callable[[Work, Unit, Alarm], Rows]] = {"solve": _solve, "strike": _strike}
+def _collide(work: Work, unit: Unit, alarm: Alarm) -> Rows:
+    global _kept
+    if _kept is None or _kept[0] != work:  # what rows share is made once a worker
+        file = problem_file_from_data(work.data, where=work.path)
+        keys, folder = tuple(unit.columns), work.folder
+        _kept = work, Collisions(file, work.at_contact, work.outputs, keys=keys, folder=folder)
+    rows = _kept[1](unit.columns, threads=1)
+    return {"reason": rows.pop("reason").tolist(), **rows}, {}
+
+
+_kept: tuple[Work, Collisions] | None = None
+GRAINS: dict[str, Callable[[Work, Unit, Alarm], Rows]] = {
+    "solve": _solve,
+    "strike": _strike,
+    "collision": _collide,
+}
 
 
 def _file(work: Work, unit: Unit) -> ProblemFile:

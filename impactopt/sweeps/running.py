@@ -16,6 +16,7 @@ from impactopt.problem import ImpactProblem
 from impactopt.solution import versions
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.engines import on_processes
+from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
 from impactopt.sweeps.tally import Progress, Tally
@@ -60,7 +61,6 @@ def sweep(
     out: str | os.PathLike[str],
     *,
     workers: int | None = None,
-    scheduler: str | None = None,
     report: Callable[[str], None] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> SweepResult:
@@ -112,11 +112,11 @@ def _run(
     tally.begin()
     if tally.resumed:
         tell(f"{tally.resumed} of {tally.cases} cases are there from before")
-    if tally.done < tally.cases and chosen.grain != "collision":
-        # here, so that it is done once, and said; workers find the functions on disk
-        block_functions(problem, problem.coordinates, tell)
+    work = _work(chosen)
+    if tally.done < tally.cases:
+        _compile(chosen, problem, work, tell)
     left = _units(chosen, together, journal.units)
-    with contextlib.closing(on_processes(_work(chosen), left, workers=workers)) as found:
+    with contextlib.closing(on_processes(work, left, workers=workers)) as found:
         try:
             for unit, result in found:
                 store.keep(unit.index, result)
@@ -150,6 +150,15 @@ def _read(source: Sweep | Mapping[str, Any] | str | os.PathLike[str]) -> Sweep:
     return sweep_from_data(source) if isinstance(source, Mapping) else read_sweep_file(source)
 
 
+def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, tell: Callable[[str], None]) -> None:
+    """Build functions here, so that it is done once, and said; workers find them on disk."""
+    if chosen.grain == "collision":
+        tell("building the collision (compiles for a minute the first time)")
+        evaluate(work, Unit(index=0, first=0, count=1, columns=chosen.design.columns(0, 1)))
+    else:
+        block_functions(problem, problem.coordinates, tell)
+
+
 def _work(chosen: Sweep) -> Work:
     return Work(
         data=chosen.problem.data,
@@ -160,6 +169,9 @@ def _work(chosen: Sweep) -> Work:
         starts=chosen.starts,
         time_limit=chosen.time_limit,
         trajectories=chosen.trajectories,
+        at_contact=chosen.at_contact,
+        outputs=chosen.outputs,
+        folder=chosen.path.parent,
     )
 
 

@@ -24,8 +24,9 @@ Columns = Mapping[str, Sequence[Any] | NDArray[Any]]
 class Work:
     """What all units of a sweep share.
 
-    data, path : of the problem's file with the sweep's [set].  grain, seed, start, starts, time_limit [s],
-    trajectories : as of `Sweep`.  grace [s] : after the time limit, until the worker is killed.
+    data, path : of the problem's file with the sweep's [set].  folder : of the sweep's file.
+    grain, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
+    grace [s] : after the time limit, until the worker is killed.
     version : of impactopt, which workers have to have too.
     """
 
@@ -37,6 +38,9 @@ class Work:
     starts: int = 1
     time_limit: float | None = None
     trajectories: bool = False
+    at_contact: Mapping[str, Any] = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+    folder: Path = Path()
     grace: float = GRACE
     version: str = __version__
 

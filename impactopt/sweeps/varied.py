@@ -1,0 +1,167 @@
+"""The keys that a sweep file varies, read against the problem's file that they are of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from impactopt.errors import InputError
+from impactopt.problem_file import ProblemFile
+from impactopt.problem_file.mistakes import Mistake, mistakes_of
+from impactopt.problem_file.toml import Place
+from impactopt.sweeps.design import Axis, Column, Span, column
+from impactopt.sweeps.sections import SpanSection
+
+__all__ = ["VariedKeys", "flat", "telling"]
+
+
+def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and what they hold; TOML's own dots make tables in tables."""
+    for key, what in table.items():
+        if isinstance(what, Mapping) and not what.keys() & {"from", "to"}:
+            yield from flat(what, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", what
+
+
+class VariedKeys:
+    """Reads the varied keys, and gathers what is wrong with them."""
+
+    def __init__(
+        self, base: ProblemFile, mistakes: list[Mistake], place: Callable[[Mapping[str, Any], str], Place]
+    ) -> None:
+        self._base, self._mistakes, self._place = base, mistakes, place
+        self._seen: dict[Place, Place] = {}  # by the problem's key, where it is in the sweep's file
+
+    def name(self, table: tuple[str, ...], key: str) -> str | None:
+        """The full name of a key of the problem's; None if it has none such, or if it is there twice."""
+        at = (*table, *key.split("."))
+        try:
+            place = self._place(self._base.data, key)
+        except InputError as error:
+            self._wrong(at, str(error))
+            return None
+        for other, there in self._seen.items():
+            if place[: len(other)] == other or other[: len(place)] == place:
+                self._wrong(at, f"is also given by {'.'.join(map(str, there))}")
+                return None
+        self._seen[place] = at
+        return ".".join(map(str, place))
+
+    def axis(self, table: str, key: str, what: Any) -> Axis | None:
+        name, at = self.name((table,), key), (table, *key.split("."))
+        if isinstance(what, Mapping):
+            section = self._span(at, what)
+            if section is None:
+                return None
+            if section.count is None:
+                self._wrong(at, "how many? give count")
+                return None
+            values: Column = _span_of(section).spread(section.count)
+        elif isinstance(what, Sequence) and not isinstance(what, str) and what:
+            values = column(what)
+        else:
+            self._wrong(at, f"{what!r}; give a list of values, or {{from, to, count}}")
+            return None
+        return None if name is None else Axis(key=name, values=values)
+
+    def drawn(self, key: str, what: Any) -> Span | Column | None:
+        at = ("draw", "over", *key.split("."))
+        if isinstance(what, Sequence) and not isinstance(what, str) and what:
+            return column(what)
+        if not isinstance(what, Mapping):
+            self._wrong(at, f"{what!r}; give {{from, to}}, or a list of values to choose from")
+            return None
+        section = self._span(at, what)
+        if section is not None and section.count is not None:
+            self._wrong(at, "count is that of [draw]; leave it out here")
+            return None
+        return None if section is None else _span_of(section)
+
+    def check_lengths(self, rows: Sequence[Axis]) -> None:
+        for one, two in combinations(rows, 2):
+            if len(one.values) != len(two.values):
+                text = f"{len(two.values)} values, but {one.key} has {len(one.values)}; they go side by side"
+                self._wrong(("list", *two.key.split(".")), text)
+                return
+
+    def check_values(
+        self, grid: Sequence[Axis], rows: Sequence[Axis], over: Mapping[str, Span | Column]
+    ) -> None:
+        """What the problem's file would refuse; each value with the first ones of the other keys."""
+        alone = {axis.key: telling(axis.values) for axis in grid}
+        alone |= {
+            k: [what.first, what.last] if isinstance(what, Span) else telling(what)
+            for k, what in over.items()
+        }
+        first = {key: values[0] for key, values in alone.items()}
+        first |= {axis.key: axis.values[0] for axis in rows}
+        if not self._base_takes(first):
+            # which of them it is shows alone, or else it is how they go together
+            alone_accepted = [self._accepted({key: value}, key) for key, value in first.items()]
+            if all(alone_accepted):
+                self._accepted(first, next(iter(first)))
+            return
+        for key, values in alone.items():
+            for value in values[1:]:
+                if not self._accepted({**first, key: value}, key):
+                    break
+        for k in _telling_rows(rows):
+            if not self._accepted({**first, **{axis.key: axis.values[k] for axis in rows}}, rows[0].key):
+                break
+
+    def _accepted(self, settings: Mapping[str, Any], key: str) -> bool:
+        """Whether the problem's file takes these values; if not, that is the mistake of one of the keys."""
+        try:
+            self._base.changed(settings)
+        except InputError as error:
+            reason = str(error).removeprefix(f"{self._base.path}, as set, ")
+            places = {".".join(map(str, place)): at for place, at in self._seen.items()}
+            self._wrong(places[key], f"with {key} = {settings[key]}: {reason}")
+            return False
+        return True
+
+    def _base_takes(self, settings: Mapping[str, Any]) -> bool:
+        try:
+            self._base.changed(settings)
+        except InputError:
+            return False
+        return True
+
+    def _span(self, at: Place, what: Mapping[str, Any]) -> SpanSection | None:
+        try:
+            section = SpanSection.model_validate(what)
+        except ValidationError as error:
+            for mistake in mistakes_of(error, SpanSection):
+                self._wrong((*at, *mistake.place), mistake.text)
+            return None
+        if section.scale == "log" and not (section.first > 0 and section.last > 0):
+            self._wrong(at, f"from {section.first:g} to {section.last:g}: both must be > 0 for a log scale")
+            return None
+        return section
+
+    def _wrong(self, at: Place, text: str) -> None:
+        self._mistakes.append(Mistake(place=at, sections=2 if at[:2] == ("draw", "over") else 1, text=text))
+
+
+def _span_of(section: SpanSection) -> Span:
+    return Span(first=section.first, last=section.last, scale=section.scale)
+
+
+def telling(values: Column) -> list[Any]:
+    """Of numbers the first, the least and the largest, as ranges are intervals; all values of other kinds."""
+    if isinstance(values, np.ndarray):
+        return [values[0].item(), values.min().item(), values.max().item()]
+    return list(values)
+
+
+def _telling_rows(rows: Sequence[Axis]) -> list[int]:
+    """Which rows of the list to look at, as of `telling`."""
+    if not all(isinstance(axis.values, np.ndarray) for axis in rows):
+        return list(range(len(rows[0].values)))
+    numbers = [np.asarray(axis.values) for axis in rows]
+    return sorted({int(k) for x in numbers for k in (x.argmin(), x.argmax())})

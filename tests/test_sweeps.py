@@ -188,9 +188,9 @@ def test_collisions_go_in_chunks_and_are_the_same_one_by_one(
 ) -> None:
     monkeypatch.setitem(TOGETHER, "collision", 64)
     over = {
-        "target.mass": {"from": 0.5, "to": 5.0},
-        "contact.stiffness": {"from": 1e4, "to": 1e5, "scale": "log"},
-        "at_contact.speed": {"from": 0.1, "to": 2.0},
+        "target.mass": {"from": 0.05, "to": 1.0},
+        "contact.stiffness": {"from": 1e5, "to": 1e6, "scale": "log"},
+        "at_contact.speed": {"from": 0.1, "to": 1.0},
     }
     given = {
         "sweep": {

@@ -7,52 +7,60 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from impactopt.problem_file.mistakes import Mistake
-from impactopt.problem_file.section import Section, optional
+from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import Positive
 
 __all__ = ["File", "Grain", "SpanSection", "of_other_grains"]
 
 Grain = Literal["solve", "strike", "collision"]
 AtLeastOne = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0)]
 
 
 class SweepSection(Section):
-    problem: str
-    name: str = ""
-    grain: Grain = "solve"
-    seed: Annotated[int, Field(ge=0)] = 0
-    start: Literal["reach", "strike"] = "reach"
-    starts: AtLeastOne = 1
-    time_limit: Positive = optional("time_limit_s")
-    trajectories: bool = False
-    outputs: Annotated[tuple[str, ...], Field(strict=False)] = ("impulse_Ns", "peak_force_N")
+    """What a case is, and of which problem."""
+
+    problem: str = required("a problem's name, or a file beside this one")
+    name: str = Field(default="", description="what reports call the sweep")
+    grain: Grain = Field(default="solve", description="a whole motion, the blow alone, or one collision")
+    seed: Seed = Field(default=0, description="of the draws, and of solves from several starts")
+    start: Literal["reach", "strike"] = Field(default="reach", description="of solves: where they start from")
+    starts: AtLeastOne = Field(default=1, description="of solves and strikes: so many, the best is kept")
+    time_limit: Positive = optional("of the solver in each case [s]", "time_limit_s")
+    trajectories: bool = Field(default=False, description="keep the result of each case whole")
+    outputs: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        default=("impulse_Ns", "peak_force_N"), description="of collisions: the columns of the table"
+    )
 
 
 class SpanSection(Section):
-    first: float = Field(alias="from")
-    last: float = Field(alias="to")
-    count: AtLeastOne | None = optional()
-    scale: Literal["linear", "log"] = "linear"
+    """Numbers from one to another."""
+
+    first: float = required("the first", "from")
+    last: float = required("the last, included", "to")
+    count: AtLeastOne | None = optional("so many; not of those that are drawn")
+    scale: Literal["linear", "log"] = Field(default="linear", description="equal steps, or equal factors")
 
 
 class DrawSection(Section):
-    method: Literal["random", "sobol", "latin hypercube"] = "sobol"
-    count: AtLeastOne
-    over: dict[str, Any]
+    """Points drawn over ranges."""
+
+    method: Literal["random", "sobol", "latin hypercube"] = Field(default="sobol", description="how")
+    count: AtLeastOne = required("so many")
+    over: dict[str, Any] = required("by key, a range or a list to choose from")
 
 
 class File(Section):
-    """A sweep file; keys below [set], [grid], [list] and [draw.over] are the problem file's.
-
-    at_contact : of collisions, `impactopt.sweeps.at_contact`; what it leaves open can be varied too.
-    """
+    """A sweep file; keys below [set], [grid], [list] and [draw.over] are the problem file's."""
 
     sweep: SweepSection
-    at_contact: dict[str, Any] = Field(default_factory=dict)
-    set: dict[str, Any] = Field(default_factory=dict)
-    grid: dict[str, Any] = Field(default_factory=dict)
-    list: dict[str, Any] = Field(default_factory=dict)
-    draw: DrawSection = optional()
+    at_contact: dict[str, Any] = Field(
+        default_factory=dict, description="of collisions: the state at contact"
+    )
+    set: dict[str, Any] = Field(default_factory=dict, description="the same in every case")
+    grid: dict[str, Any] = Field(default_factory=dict, description="every combination")
+    list: dict[str, Any] = Field(default_factory=dict, description="read side by side")
+    draw: DrawSection = optional("what is drawn")
 
 
 def of_other_grains(content: File) -> list[Mistake]:

@@ -28,6 +28,10 @@ def sweep(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port: its workers do it."),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -41,7 +45,9 @@ def sweep(
         from impactopt.sweeps import sweep as run
 
         with _Screen(console, quiet=quiet) as screen:
-            result = run(file, out, workers=workers, report=screen.say, progress=screen.progress)
+            result = run(
+                file, out, workers=workers, scheduler=scheduler, report=screen.say, progress=screen.progress
+            )
         if as_json:
             typer.echo(json.dumps(result.summary()))
         else:

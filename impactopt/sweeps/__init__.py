@@ -5,7 +5,7 @@
 * grains.py       from a case's settings to its row; evaluate.py: on a worker; alarm.py: in time
 * collisions.py   rows of collisions in compiled code: at_contact.py, collision_keys.py, states.py, scene.py,
                   measures.py
-* engines.py      who does the units
+* engines.py      processes that do the units; cluster.py: Dask workers that do
 * journal.py      finished units on disk; store.py: the directory; table.py: the result
 * tally.py        progress
 * running.py      all of it together

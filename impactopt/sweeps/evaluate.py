@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import sys
+import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ from impactopt.sweeps.units import Found, Unit, Work, failed_columns
 
 __all__ = ["evaluate"]
 
+_ONE_AT_A_TIME = threading.Lock()  # in a Dask worker of several threads: the alarm is the process's
+
 
 def evaluate(work: Work, unit: Unit) -> Found:
     """The rows of a unit; what goes wrong in a case is the reason in its row.
@@ -31,6 +34,11 @@ def evaluate(work: Work, unit: Unit) -> Found:
     """
     if work.version != __version__:
         raise InputError(f"a worker has impactopt {__version__}, the sweep {work.version}; install the same")
+    with _ONE_AT_A_TIME:
+        return _evaluate(work, unit)
+
+
+def _evaluate(work: Work, unit: Unit) -> Found:
     threadpool_limits(1)
     began, alarm = time.perf_counter(), Alarm(work.time_limit, work.grace)
     records: Mapping[int, Record] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,18 @@ from impactopt.errors import InputError
 from impactopt.nlp.transcription import block_functions
 from impactopt.problem import ImpactProblem
 from impactopt.solution import versions
+from impactopt.sweeps.cluster import connected, on_cluster
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
 from impactopt.sweeps.tally import Progress, Tally
-from impactopt.sweeps.units import Unit, Work
+from impactopt.sweeps.units import Found, Unit, Work
 
 __all__ = ["SweepResult", "sweep"]
 
+Engine = Generator[tuple[Unit, Found], None, None]
 TOGETHER = {"collision": 16384}  # cases in a unit; one of the other grains
 
 
@@ -61,6 +63,8 @@ def sweep(
     out: str | os.PathLike[str],
     *,
     workers: int | None = None,
+    scheduler: str | None = None,
+    client: Any = None,
     report: Callable[[str], None] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> SweepResult:
@@ -69,6 +73,9 @@ def sweep(
     source : a sweep file, its data as tables, or what :func:`impactopt.sweeps.read_sweep_file` gave.
     out : directory of the results: see `impactopt.sweeps.store`. Every finished case is on disk at once.
     workers : processes; None: as many as there are cores. A script needs `if __name__ == "__main__":`.
+    scheduler : address of a Dask scheduler, tcp://host:port, whose workers do the cases; client : or a
+        `distributed.Client`. Workers need this version of impactopt, one thread each, and to see the files
+        that the problem's file names.
     report : told in words what is going on.  progress : told after every unit.
 
     A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
@@ -80,15 +87,23 @@ def sweep(
         another sweep; the disk is full; pyarrow is not installed.
     """
     tell = report if report is not None else _ignore
-    count = _cores() if workers is None else workers
-    if count < 1:
-        raise InputError(f"{count} workers; ask for at least 1")
+    if sum(x is not None for x in (workers, scheduler, client)) > 1:
+        raise InputError("give one of workers, scheduler and client: a cluster brings its own workers")
+    if workers is not None and workers < 1:
+        raise InputError(f"{workers} workers; ask for at least 1")
     pyarrow()
     chosen = _read(source)
     problem = chosen.problem.build()
     store = Store(chosen, Path(out))
     try:
-        return _run(chosen, problem, store, count, tell, progress)
+        with contextlib.nullcontext(client) if scheduler is None else connected(scheduler) as cluster:
+
+            def engine(work: Work, units: Iterator[Unit]) -> Engine:
+                if cluster is not None:
+                    return on_cluster(work, units, cluster, tell)
+                return on_processes(work, units, workers=_cores() if workers is None else workers)
+
+            return _run(chosen, problem, store, engine, tell, progress)
     finally:
         store.close()
 
@@ -97,7 +112,7 @@ def _run(
     chosen: Sweep,
     problem: ImpactProblem,
     store: Store,
-    workers: int,
+    engine: Callable[[Work, Iterator[Unit]], Engine],
     tell: Callable[[str], None],
     progress: Callable[[Progress], None] | None,
 ) -> SweepResult:
@@ -116,7 +131,7 @@ def _run(
     if tally.done < tally.cases:
         _compile(chosen, problem, work, tell)
     left = _units(chosen, together, journal.units)
-    with contextlib.closing(on_processes(work, left, workers=workers)) as found:
+    with contextlib.closing(engine(work, left)) as found:
         try:
             for unit, result in found:
                 store.keep(unit.index, result)
@@ -162,7 +177,7 @@ def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, tell: Callable[[
 def _work(chosen: Sweep) -> Work:
     return Work(
         data=chosen.problem.data,
-        path=chosen.problem.path,
+        path=chosen.problem.path.resolve(),
         grain=chosen.grain,
         seed=chosen.seed,
         start=chosen.start,
@@ -171,7 +186,7 @@ def _work(chosen: Sweep) -> Work:
         trajectories=chosen.trajectories,
         at_contact=chosen.at_contact,
         outputs=chosen.outputs,
-        folder=chosen.path.parent,
+        folder=chosen.path.parent.resolve(),
     )
 
 

@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+BROWSER := $(VENV)/.browser
 EXTRAS := robots,validate,qp,sweep,cluster,dev
 ARGS   ?=
 
@@ -41,7 +42,13 @@ demo: $(STAMP) ## plan a TALOS punch, replay it in full dynamics, put pictures a
 	@echo "== planning a punch (the first run compiles the robot's functions, up to two minutes)"
 	@$(BIN)/impactopt solve problems/punch.toml --out results/punch --baseline $(ARGS)
 
-test: $(STAMP) ## run the tests (ARGS='-k robot' for some of them)
+# Only tests open pages in a browser.
+$(BROWSER): $(STAMP)
+	@echo "== installing a browser for the tests of pages: some 180 MB"
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet --editable '.[browser]'
+	@touch $@
+
+test: $(STAMP) $(BROWSER) ## run the tests (ARGS='-k robot' for some of them)
 	@echo "== running the tests (the first run compiles functions)"
 	@$(BIN)/python -m pytest $(ARGS)
 

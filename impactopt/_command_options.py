@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -35,3 +36,20 @@ def check_time_limit(seconds: float | None) -> None:
     """BadParameter if it is none."""
     if seconds is not None and not seconds > 0:
         raise typer.BadParameter(f"{seconds:g}; give seconds > 0", param_hint="--time-limit")
+
+
+def command_line(context: typer.Context) -> str:
+    """The command as it was given, for the record: its name, arguments, and options that were set."""
+    words = ["impactopt", str(context.info_name)]
+    for parameter in context.command.params:
+        name, value = str(parameter.name), context.params[str(parameter.name)]
+        source = context.get_parameter_source(name)
+        if source is None or source.name != "COMMANDLINE":
+            continue
+        if isinstance(value, bool):
+            words.append((parameter.opts if value else parameter.secondary_opts)[0])
+            continue
+        option = max(parameter.opts, key=len)
+        words += [option] if option.startswith("-") else []
+        words.append(str(value.value if isinstance(value, enum.Enum) else value))
+    return shlex.join(words)

@@ -18,11 +18,13 @@ from impactopt._command_options import (
     Starts,
     TimeLimit,
     check_time_limit,
+    command_line,
 )
 from impactopt.plain_errors import plain_errors
 
 
 def strike(
+    context: typer.Context,
     file: ProblemPath,
     out: Annotated[
         Path | None,
@@ -63,6 +65,7 @@ def strike(
             )
             progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
         record = record_of_strike(solution, problem=read.text, problem_path=read.path)
+        record.summary["command"] = command_line(context)
         written = [] if directory is None else save_record(record, directory)
         if as_json:
             typer.echo(json.dumps(record.summary, indent=2))

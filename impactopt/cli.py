@@ -23,8 +23,10 @@ from impactopt._command_options import (
     Starts,
     TimeLimit,
     check_time_limit,
+    command_line,
 )
 from impactopt._drive_command import drive
+from impactopt._show_command import show
 from impactopt._strike_command import strike
 from impactopt._sweep_command import sweep
 from impactopt._validate_command import validate
@@ -76,6 +78,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command()
 def solve(
+    context: typer.Context,
     file: ProblemPath,
     out: Annotated[
         Path | None,
@@ -122,6 +125,7 @@ def solve(
             )
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
             record = _record(solution, read, validate, progress)
+            record.summary["command"] = command_line(context)
             if baseline:
                 progress.say("looking for the hardest minimum-jerk reach inside the same limits")
                 record.summary["baseline"] = _baseline(problem)
@@ -133,6 +137,7 @@ def solve(
 
 app.command()(strike)
 app.command()(validate)
+app.command()(show)
 app.command()(drive)
 app.command()(sweep)
 app.command()(reproduce)

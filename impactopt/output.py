@@ -54,8 +54,8 @@ class Record:
         corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
         by field, `reference_*` (`impactopt.plan.Trajectory`) and, of a plan with a brake, `missed_*`,
         `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
-        `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without positions and
-        torques), `solver_*` (`SolverResult`), `history_*` (its iterations).
+        `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without velocities
+        and torques), `solver_*` (`SolverResult`), `history_*` (its iterations).
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
@@ -153,8 +153,8 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
 
 
 def replay_arrays(replay: Any) -> dict[str, Any]:
-    """What a record keeps of a `Simulation` on free soles: forces and the soles' motion, by `replayed_*`."""
-    left_out = {"q", "v", "demand", "torque"}
+    """What a record keeps of a `Simulation` on free soles: motion and forces, by `replayed_*`."""
+    left_out = {"v", "demand", "torque"}
     kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
     return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}
 

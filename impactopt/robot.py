@@ -43,6 +43,7 @@ class Robot:
     postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
         the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
     source : what it was made from, None where that was a model in Python.
+    urdf : file whose visual shapes a picture shows, None for simple ones.
 
     Raises
     ------
@@ -63,6 +64,7 @@ class Robot:
     strikers: Mapping[str, Striker] = field(default_factory=dict)
     postures: Mapping[str, Array] = field(default_factory=dict)
     source: Source | None = None
+    urdf: str | None = None
 
     def __post_init__(self) -> None:
         checks.check_joint_types(self.model)
@@ -103,14 +105,15 @@ class Robot:
 
         Parameters
         ----------
-        path, srdf : the files. Meshes are not read.
+        path, srdf : the files. Meshes are read by who draws the robot only.
         name : the URDF's own name when left out.
         floating : with a free-flyer at the root; else the root link is fixed to the world.
         locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
         options : as of `from_model`.
         """
         model = build.read_urdf(path, srdf, floating=floating)
-        robot = cls.from_model(build.lock_joints(model, locked), name=name or model.name, **options)
+        model = build.lock_joints(model, locked)
+        robot = cls.from_model(model, name=name or model.name, **{"urdf": path, **options})
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, **options}
         return dataclasses.replace(robot, source=Source(urdf=fspath(path), options=given))
 
@@ -130,6 +133,7 @@ class Robot:
         soles: Sequence[Sole] = (),
         strikers: Sequence[Striker] = (),
         postures: Mapping[str, Mapping[str, float] | ArrayLike] | None = None,
+        urdf: str | PathLike[str] | None = None,
     ) -> Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
 
@@ -148,6 +152,7 @@ class Robot:
         soles, strikers : as they are.
         postures : by name: (nq,) configurations, or joint angles [rad] by name on top of the model's posture
             of that name (an SRDF's), or else of zero. The model's other postures are kept.
+        urdf : file whose visual shapes a picture shows.
         """
         model = model.copy()
         checks.check_joint_types(model)
@@ -174,6 +179,7 @@ class Robot:
             upper=upper,
             soles=tuple(soles),
             strikers=build.by_name("striker", strikers),
+            urdf=None if urdf is None else str(urdf),
         )
         build.by_name("sole", soles)
         return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
 from rich.table import Table
 
 from impactopt.program import IterationRecord
+from impactopt.result_rows import PHASES, Row, number_row, replay_columns, result_columns, result_rows
 
 __all__ = [
     "Progress",
@@ -25,7 +25,6 @@ __all__ = [
     "violation_table",
 ]
 
-PHASES = ("swing", "collision", "follow")
 PHASES_OF_STRIKE = ("contact", "collision")
 QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
 
@@ -80,22 +79,21 @@ class Progress:
 
 def result_table(summary: Mapping[str, Any]) -> Table:
     """Planned beside simulated, and beside the replay on free soles; what is outside its limit is marked."""
-    columns = {"planned": summary, "simulated": summary.get("simulated", {})}
-    return _table(summary, {**columns, "free soles": _by_phase(summary.get("replayed", {}))})
+    return _table(summary, result_columns(summary))
 
 
 def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
     """A replay beside the plan; `report` as in `impactopt validate --json`."""
-    name = "free soles" if report["engine"] == "mujoco" else "held soles"
-    return _table(summary, {"planned": summary, name: _by_phase(report)})
+    return _table(summary, replay_columns(report, summary))
 
 
 def strike_table(summary: Mapping[str, Any]) -> Table:
     """The planned blow; `summary` as of a :class:`impactopt.StrikeSolution`."""
     table = _table(summary, {"planned": summary}, PHASES_OF_STRIKE)
-    if "capture_margin_m" in summary:
-        margin = summary["capture_margin_m"]
-        _row(table, "capture point's margin after contact [mm]", [margin], 1, scale=1e3, least=-1e-6)
+    margin = [summary.get("capture_margin_m")]
+    row = number_row("capture point's margin after contact [mm]", margin, 1, scale=1e3, least=-1e-6)
+    if row is not None:
+        _add(table, row)
     return table
 
 
@@ -111,86 +109,21 @@ def starts_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _by_phase(report: Mapping[str, Any]) -> dict[str, Any]:
-    """A report with its numbers by phase, named as in a summary."""
-    names = {"zmp_margin_m": "zmp_margin_by_phase_m", "torque_ratio": "torque_ratio_by_phase"}
-    return {**report, **{name: report.get(other) or {} for name, other in names.items()}} if report else {}
-
-
 def _table(
-    summary: Mapping[str, Any], sources: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
+    summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
 ) -> Table:
-    """A column for each source that says something; the first is the plan's."""
-    columns = {name: source for name, source in sources.items() if source and "error" not in source}
     table = Table(title=escape(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
     table.add_column("")
     for name in columns:
         table.add_column(name, justify="right")
-    for label, key, digits in (
-        ("impulse [N s]", "impulse_Ns", 2),
-        ("peak force [N]", "peak_force_N", 0),
-        ("contact time [ms]", "contact_ms", 1),
-        ("hand speed at contact [m/s]", "hand_speed_m_s", 3),
-    ):
-        _row(table, label, [source.get(key) for source in columns.values()], digits)
-    _outcome(table, [source.get("target") or {} for source in columns.values()])
-    for label, key, digits, scale, least, most in (
-        ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
-        ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
-    ):
-        for phase in phases:
-            values = [source.get(key, {}).get(phase) for source in columns.values()]
-            _row(table, f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
-    replays = list(columns.values())[1:]
-    for label, key, digits in (
-        ("least normal force [N]", "min_normal_force_N", 0),
-        ("largest slip of a sole [mm]", "sole_slip_mm", 2),
-        ("largest lift of a sole [mm]", "sole_lift_mm", 2),
-        ("impulse error [%]", "impulse_error_pct", 2),
-    ):
-        _row(table, label, [None, *(source.get(key) for source in replays)], digits, first="")
-    if any(source.get("standing") is not None for source in replays):
-        _stands(table, replays)
+    for row in result_rows(columns, phases):
+        _add(table, row)
     return table
 
 
-def _outcome(table: Table, targets: Sequence[Mapping[str, Any]]) -> None:
-    """What the blow has brought the target, where that is known."""
-    _row(table, "speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
-    _row(table, "driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
-    broken = [target.get("broken") for target in targets]
-    if any(value is not None for value in broken):
-        table.add_row("the board breaks", *("-" if b is None else "yes" if b else "no" for b in broken))
-
-
-def _stands(table: Table, replays: Sequence[Mapping[str, Any]]) -> None:
-    words = {True: "yes", False: "[bold red]! no[/]", None: "-"}
-    table.add_row("stands at the end", "", *(words[source.get("standing")] for source in replays))
-
-
-def _row(
-    table: Table,
-    label: str,
-    values: Sequence[float | None],
-    digits: int,
-    *,
-    scale: float = 1.0,
-    least: float = -np.inf,
-    most: float = np.inf,
-    first: str | None = None,
-) -> None:
-    """A row where some column has a number; `first` instead of the first one."""
-    if all(value is None for value in values):
-        return
-    cells = [_cell(v, digits, scale=scale, good=v is None or least <= v <= most) for v in values]
-    table.add_row(escape(label), *([first, *cells[1:]] if first is not None else cells))
-
-
-def _cell(value: float | None, digits: int, *, scale: float = 1.0, good: bool = True) -> str:
-    if value is None:
-        return "-"
-    text = f"{scale * value:.{digits}f}"
-    return text if good else f"[bold red]! {text}[/]"
+def _add(table: Table, row: Row) -> None:
+    cells = (cell.text if cell.good else f"[bold red]! {cell.text}[/]" for cell in row.cells)
+    table.add_row(escape(row.label), *cells)
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:

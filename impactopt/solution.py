@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -102,6 +104,29 @@ class Solution(Solved):
         if engine == "mujoco" and self.plan.brake is not None:
             options.setdefault("missed", self.missed_trajectory)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
+
+    def animate(self, *, simulation: Any | None = None, replay: Any | None = None) -> Any:
+        """The motion in 3D, in a notebook or as a file: ``solution.animate().save("punch.html")``.
+
+        simulation, replay : as of :func:`impactopt.animate`.
+        """
+        # by the public name: pages come after solutions in the order of imports
+        from impactopt import animate
+
+        return animate(self, simulation=simulation, replay=replay)
+
+    def report(
+        self, path: str | PathLike[str], *, simulation: Any | None = None, replay: Any | None = None
+    ) -> Path:
+        """Write the page of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`.
+
+        Raises
+        ------
+        InputError : it cannot be written, or its name does not end in .html.
+        """
+        from impactopt import report_page
+
+        return Path(report_page(self, simulation=simulation, replay=replay).save(path))
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""

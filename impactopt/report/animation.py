@@ -1,0 +1,72 @@
+"""A motion in three dimensions, as a page of its own or in a notebook."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from impactopt.errors import InputError
+from impactopt.output import Record, write_file
+from impactopt.problem import ImpactProblem
+from impactopt.report.page import html_page
+from impactopt.report.stage import stage_of
+
+__all__ = ["Animation", "animation_of"]
+
+BODY = '<main><div id="trouble"></div><div id="animation"></div></main>'
+HEIGHT = 620  # pixels, in a notebook
+
+
+@dataclass(frozen=True)
+class Animation:
+    """A page with the moving robot, contact force, ZMP, support polygon and centre of mass.
+
+    A notebook shows it where it is the value of a cell.  html : the whole page; it needs no network.
+    """
+
+    html: str
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write it as one HTML file.
+
+        Raises
+        ------
+        InputError : it cannot be written, or its name does not end in .html.
+        """
+        return save_page(self.html, Path(path))
+
+    def _repr_html_(self) -> str:
+        """A frame of its own, so that the notebook's styles and scripts stay apart from its."""
+        return (
+            f'<iframe srcdoc="{escape(self.html)}" title="animation" width="100%" height="{HEIGHT}" '
+            'style="border: 0" allow="fullscreen"></iframe>'
+        )
+
+
+def animation_of(record: Record, problem: ImpactProblem) -> Animation:
+    """The record's motions: planned, and those of engines that it has.
+
+    Raises
+    ------
+    InputError : the record holds no motion.
+    """
+    if not record.completed:
+        raise InputError("this result holds no motion to show: the solve ended before there was one")
+    header, arrays = stage_of(record, problem)
+    name = str(record.summary.get("problem", {}).get("name", "")) or "motion"
+    return Animation(html_page(title=name, kind="alone", body=BODY, header=header, arrays=arrays))
+
+
+def save_page(html: str, path: Path) -> Path:
+    """Write a page; its folder is there already.
+
+    Raises
+    ------
+    InputError : it cannot be written, or its name does not end in .html.
+    """
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"a page is HTML: give {path.name!r} the ending .html")
+    write_file(path, lambda file: file.write(html.encode()))
+    return path

@@ -1,0 +1,295 @@
+"""What a report plots: for each chart a description and the arrays that it names."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.output import Record
+from impactopt.support import margin
+from impactopt.validation.result import centre_of_pressure
+
+__all__ = ["charts_of", "thinned"]
+
+Array = NDArray[np.float64]
+Arrays = dict[str, NDArray[Any]]
+BUCKETS = 500  # of a history; of each its ends, and its least and largest value are kept
+NEAR = (0.01, 0.03)  # [s] before and after contact that the force is shown over at first
+# label, prefix in a record, style; the styles are those of style.css
+SOURCES = (
+    ("planned", "reference", "planned"),
+    ("simulated", "simulated", "simulated"),
+    ("free soles", "replayed", "free"),
+)
+OTHERS = ("one", "two")  # styles of what is no motion
+
+
+def charts_of(record: Record) -> tuple[list[dict[str, Any]], Arrays]:
+    """Descriptions, in the order of the page, and arrays by name."""
+    arrays: Arrays = {}
+    charts: list[dict[str, Any] | None] = []
+    if record.completed:
+        present = [s for s in SOURCES if f"{s[1]}_time" in record.arrays]
+        charts += [
+            _force(record, arrays, present),
+            _speed(record, arrays, present),
+            _zmp_margin(record, arrays, present),
+            _zmp_path(record, arrays, present),
+            _torque_ratio(record, arrays),
+            _joint(record, arrays, "torque", "torque", "torque [N m]"),
+            _joint(record, arrays, "angle", "angle", "angle [rad]"),
+            _soles(record, arrays),
+        ]
+    charts += _convergence(record, arrays)
+    return [chart for chart in charts if chart is not None], arrays
+
+
+def thinned(time: Array, *columns: Array) -> list[Array]:
+    """Time (k,) and columns at fewer instants: of each bucket its ends, and where a column is least and most.
+
+    Source: U. Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB 2014: lines
+    through these look as through all.
+    """
+    if len(time) <= 4 * BUCKETS:
+        return [time, *columns]
+    edges = np.linspace(0, len(time), BUCKETS + 1).astype(int)
+    kept = {*edges[:-1].tolist(), *(edges[1:] - 1).tolist()}
+    for low, high in pairwise(edges.tolist()):
+        for column in columns:
+            part = column[low:high]
+            if np.isfinite(part).any():
+                kept |= {low + int(np.nanargmin(part)), low + int(np.nanargmax(part))}
+            if not np.isfinite(part).all():  # where a history has a gap, so has its picture
+                kept.add(low + int(np.argmin(np.isfinite(part))))
+    chosen = np.array(sorted(kept))
+    return [time[chosen], *(column[chosen] for column in columns)]
+
+
+def _bands(record: Record) -> list[list[float]]:
+    """When the plan is in contact, grey in every chart."""
+    return [[float(record.arrays[f"reference_contact_{which}"]) for which in ("start", "end")]]
+
+
+def _chart(title: str, unit: str, series: list[dict[str, Any]], **rest: Any) -> dict[str, Any]:
+    return {"kind": "lines", "title": title, "x": "time [s]", "y": unit, "series": series, **rest}
+
+
+def _series(arrays: Arrays, name: str, label: str, style: str, time: Array, values: Array) -> dict[str, Any]:
+    x, y = thinned(time, values)
+    arrays |= {f"{name}_x": x, f"{name}_y": y}
+    return {"label": label, "style": style, "x": f"{name}_x", "y": f"{name}_y"}
+
+
+def _force(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]:
+    a, series = record.arrays, []
+    for label, prefix, style in present:
+        time, force = (a[f"{prefix}_time"], a.get(f"{prefix}_force"))
+        if force is None:
+            time, force = _at_contact(record, a["collision_force"], 0.0)
+        series.append(_series(arrays, f"force_{style}", label, style, time, force))
+    start, end = _bands(record)[0]
+    view = [max(0.0, start - NEAR[0]), end + NEAR[1]]
+    return _chart("Force on the target", "force [N]", series, bands=_bands(record), view=view, include=[0.0])
+
+
+def _at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array, Array]:
+    """A history of the planned collision, and one value for all time before and after."""
+    a = record.arrays
+    start, end, last = (float(a[f"reference_{n}"]) for n in ("contact_start", "contact_end", "end"))
+    time = np.concatenate([[0.0, start], start + a["collision_time"], [end, last]])
+    return time, np.concatenate([[otherwise] * 2, values, [otherwise] * 2])
+
+
+def _speed(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]:
+    a = record.arrays
+    time, speed = _at_contact(record, a["collision_target_speed"], np.nan)
+    series = [_series(arrays, "speed_plan", "target, planned", "planned", time, speed)]
+    for label, prefix, style in present:
+        if f"{prefix}_hand_speed" in a:
+            time = a[f"{prefix}_time"]
+            series.append(
+                _series(arrays, f"speed_{style}", f"hand, {label}", style, time, a[f"{prefix}_hand_speed"])
+            )
+    start, end = _bands(record)[0]
+    view = [max(0.0, start - 0.2), end + 0.2]
+    return _chart(
+        "Speed of hand and target along the normal", "speed [m/s]", series, bands=_bands(record), view=view
+    )
+
+
+def _grounds(record: Record, prefix: str) -> tuple[Array, Array]:
+    """Time and the ground's wrench (k, 6) about the origin; in the planned collision that of its model."""
+    a = record.arrays
+    time = a[f"{prefix}_time"]
+    if prefix != "reference":
+        return time, a[f"{prefix}_sole_ground"].sum(axis=1)
+    keep, ground = a["reference_phase"] != 1, a["collision_ground"]
+    if not len(ground):
+        return time[keep], a["reference_ground"][keep]
+    inside = float(a["reference_contact_start"]) + a["collision_time"][-len(ground) :]
+    order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
+    return np.concatenate([time[keep], inside])[order], np.concatenate([a["reference_ground"][keep], ground])[
+        order
+    ]
+
+
+def _zmp_margin(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any] | None:
+    if not len(record.arrays["polygon"]):
+        return None
+    series = []
+    for label, prefix, style in present:
+        time, wrench = _grounds(record, prefix)
+        inside = 1e3 * margin(record.arrays["polygon"], centre_of_pressure(wrench))
+        series.append(_series(arrays, f"margin_{style}", label, style, time, inside))
+    note = "Distance of the zero-moment point from the support polygon's nearest edge; below 0 it is outside."
+    limits = [{"y": 0.0, "text": "edge"}]
+    return _chart(
+        "ZMP margin",
+        "margin [mm]",
+        series,
+        bands=_bands(record),
+        include=[0.0],
+        limits=limits,
+        note=note,
+        height=300,
+    )
+
+
+def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any] | None:
+    polygon = record.arrays["polygon"]
+    if not len(polygon):
+        return None
+    series = []
+    for label, prefix, style in present:
+        time, wrench = _grounds(record, prefix)
+        t, x, y = thinned(time, *centre_of_pressure(wrench).T)
+        points, name = np.column_stack([x, y]), f"zmp_{style}"
+        arrays |= {name: points, f"{name}_time": t, f"{name}_margin": 1e3 * margin(polygon, points)}
+        series.append(
+            {"label": label, "style": style, "xy": name, "time": f"{name}_time", "margin": f"{name}_margin"}
+        )
+    soles = [name for name in record.arrays if name.startswith("sole_")]
+    arrays |= {f"ground_{name}": record.arrays[name] for name in ("polygon", *soles)}
+    return {
+        "kind": "ground",
+        "title": "ZMP in the support polygon",
+        "x": "y, to the right [m]",
+        "y": "x, forward [m]",
+        "series": series,
+        "polygon": "ground_polygon",
+        "soles": [f"ground_{name}" for name in soles],
+        "height": 300,
+        "note": "From above; drag to move. The dots are where the ZMP is at the time of the animation.",
+    }
+
+
+def _torque(record: Record) -> list[tuple[str, str, Array, Array]]:
+    """Label, style, time, torque (k, n) [N m] of the plan and of the simulation's demand."""
+    a = record.arrays
+    time, torque, phase = a["reference_time"], a["reference_torque"], a["reference_phase"]
+    hit = a["collision_torque"]
+    if len(hit) == len(a["collision_time"]) and len(a["collision_ground"]):
+        keep = phase != 1
+        inside = float(a["reference_contact_start"]) + a["collision_time"]
+        order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
+        time = np.concatenate([time[keep], inside])[order]
+        torque = np.concatenate([torque[keep], hit])[order]
+    out = [("planned", "planned", time, torque)]
+    if record.simulated:
+        out.append(("simulated", "simulated", a["simulated_time"], a["simulated_demand"]))
+    return out
+
+
+def _torque_ratio(record: Record, arrays: Arrays) -> dict[str, Any]:
+    series = []
+    for label, style, time, torque in _torque(record):
+        ratio = np.abs(torque / record.arrays["torque_limit"]).max(axis=1)
+        series.append(_series(arrays, f"ratio_{style}", label, style, time, ratio))
+    limits = [{"y": 1.0, "text": "limit"}]
+    return _chart(
+        "Torque demand over limit",
+        "torque / limit",
+        series,
+        bands=_bands(record),
+        include=[0.0, 1.0],
+        limits=limits,
+        note="Of the joint that is nearest to its limit.",
+    )
+
+
+def _joint(record: Record, arrays: Arrays, which: str, title: str, unit: str) -> dict[str, Any]:
+    """One joint's history, which the reader chooses; at first that with the torque nearest to its limit."""
+    a, series = record.arrays, []
+    limit = a["torque_limit"]
+    for label, style, time, torque in _torque(record):
+        values = torque
+        if which == "angle":
+            prefix = "reference" if style == "planned" else "simulated"
+            time, values = a[f"{prefix}_time"], a[f"{prefix}_angle"]
+        chosen = np.unique(np.linspace(0, len(time) - 1, 2 * BUCKETS).astype(int))
+        near = np.abs(time - float(a["reference_contact_start"])) < 0.1
+        chosen = np.union1d(chosen, np.flatnonzero(near)[:: max(1, int(near.sum()) // BUCKETS)])
+        arrays |= {f"{which}_{style}_x": time[chosen], f"{which}_{style}": values[chosen]}
+        series.append({"label": label, "style": style, "x": f"{which}_{style}_x", "y": f"{which}_{style}"})
+    worst = np.abs(_torque(record)[0][3] / limit).max(axis=0).argmax()
+    lines = (
+        [{"values": limit, "text": "limit"}, {"values": -limit, "text": "limit"}] if which == "torque" else []
+    )
+    return _chart(
+        f"One joint's {title}",
+        unit,
+        series,
+        kind="joint",
+        bands=_bands(record),
+        joints=[str(name).removesuffix("_joint").replace("_", " ") for name in a["joints"]],
+        joint=int(worst),
+        lines=lines,
+    )
+
+
+def _soles(record: Record, arrays: Arrays) -> dict[str, Any] | None:
+    prefix = "replayed" if record.replayed else "simulated"
+    a = record.arrays
+    names = a.get(f"{prefix}_soles", [n.removeprefix("sole_") for n in a if n.startswith("sole_")])
+    if f"{prefix}_sole_ground" not in a or not len(names):
+        return None
+    series = [
+        _series(
+            arrays,
+            f"load_{k}",
+            str(name).replace("_", " "),
+            OTHERS[k % len(OTHERS)],
+            a[f"{prefix}_time"],
+            a[f"{prefix}_sole_ground"][:, k, 2],
+        )
+        for k, name in enumerate(names)
+    ]
+    how = "on free soles" if record.replayed else "on held soles"
+    return _chart(
+        f"Normal force on each sole, simulated {how}",
+        "force [N]",
+        series,
+        bands=_bands(record),
+        include=[0.0],
+    )
+
+
+def _convergence(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
+    a = record.arrays
+    if "history_iteration" not in a:
+        return []
+    iteration = a["history_iteration"].astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        digits = {name: np.log10(a[f"history_{name}"]) for name in ("max_violation", "kkt")}
+    series = []
+    for name, label, style in zip(("max_violation", "kkt"), ("violation", "optimality"), OTHERS, strict=True):
+        y = np.where(np.isfinite(digits[name]), digits[name], np.nan)
+        if np.isfinite(y).any():
+            series.append(_series(arrays, f"history_{name}", label, style, iteration, y))
+    if not series:
+        return []
+    chart = _chart("Convergence of the solver", "largest error", series, log=True, timed=False)
+    return [{**chart, "x": "iteration"}]

@@ -1,0 +1,177 @@
+"""A result as one page: its numbers, planned beside simulated, plots, the motion, and how it was made."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from impactopt.output import Record
+from impactopt.problem import ImpactProblem
+from impactopt.report.animation import save_page
+from impactopt.report.charts import charts_of
+from impactopt.report.page import html_page
+from impactopt.report.stage import stage_of
+from impactopt.result_rows import result_columns, result_rows
+
+__all__ = ["Report", "report_of"]
+
+NARROW = "\u202f"  # between a number and its unit: no line ends there
+
+
+@dataclass(frozen=True)
+class Report:
+    """A page; `save` writes it.  html : all of it; it needs no network."""
+
+    html: str
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write it as one HTML file.
+
+        Raises
+        ------
+        InputError : it cannot be written, or its name does not end in .html.
+        """
+        return save_page(self.html, Path(path))
+
+
+def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
+    """The record as a page; with the animation, if the problem is given and there is a motion."""
+    charts, arrays = charts_of(record)
+    header: dict[str, Any] = {}
+    if problem is not None and record.completed:
+        header, solids = stage_of(record, problem)
+        arrays |= solids
+    title = str(record.summary.get("problem", {}).get("name", "")) or "result"
+    body = "\n".join(part for part in _body(record, title, animated=bool(header)) if part)
+    page = html_page(
+        title=title, kind="report", body=body, header={**header, "charts": charts}, arrays=arrays
+    )
+    return Report(page)
+
+
+def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:
+    s = record.summary
+    about = " · ".join(
+        str(s["problem"][key]) for key in ("robot", "striker") if s.get("problem", {}).get(key)
+    )
+    yield f'<header><h1>{escape(title)}</h1><span class="sub">{escape(about)}</span>'
+    yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
+    yield '<div id="trouble"></div>'
+    notes = (s.get("note"), s.get("simulated", {}).get("error"), s.get("baseline", {}).get("error"))
+    for note in filter(None, notes):
+        yield f'<p class="note">{escape(str(note))}</p>'
+    yield _cards(s)
+    heading = "Planned beside simulated" if len(result_columns(s)) > 1 else "Planned"
+    table = f'<section class="card" aria-label="numbers"><h3>{heading}</h3>{_table(s)}</section>'
+    if animated:
+        yield '<div class="top"><section class="card" id="animation" aria-label="animation"></section>'
+        yield f"{table}</div>"
+    else:
+        yield table
+    yield '<h2>Histories</h2><div id="charts"></div>'
+    yield _violations(s)
+    yield '<h2>How it was made</h2><div class="made"><div>'
+    yield _text(
+        "problem", "The problem", record.problem or "It was made in Python: there is no problem file."
+    )
+    yield "</div><div>"
+    yield _text(
+        "command", "The command", str(s.get("command") or "It was made in Python, by impactopt.solve.")
+    )
+    yield f'<section class="card"><h3>The solve</h3>{_pairs(_solve(s))}</section>'
+    yield f'<section class="card"><h3>The model</h3>{_pairs(s.get("problem", {}))}</section>'
+    yield f'<section class="card"><h3>Versions</h3>{_pairs(s.get("versions", {}))}</section>'
+    yield "</div></div></main>"
+    yield "<footer><main>Made by impactopt. This file holds all that it shows and needs no network."
+    yield "</main></footer>"
+
+
+def _cards(s: Mapping[str, Any]) -> str:
+    """The numbers that matter most, with what the most faithful replay says of them."""
+    replay: Mapping[str, Any] = s.get("replayed") or s.get("simulated") or {}
+    cards = []
+
+    def card(value: str, what: str, kind: str = "") -> None:
+        cards.append(
+            f'<div class="card"><b class="{kind}">{escape(value)}</b><span>{escape(what)}</span></div>'
+        )
+
+    seconds = f"{s.get('solve_seconds') or 0.0:.1f}{NARROW}s"
+    spent = f"{s.get('solver', '')}, {s.get('iterations', 0)} iterations, {seconds}"
+    card(str(s.get("status", "?")), spent, "good" if s.get("status") == "solved" else "bad")
+    if s.get("impulse_Ns") is not None:
+        error = replay.get("impulse_error_pct")
+        beside = "" if error is None else f", {error:+.1f}{NARROW}% when replayed"
+        card(f"{s['impulse_Ns']:.2f} N s", f"planned impulse{beside}")
+    if s.get("peak_force_N") is not None:
+        card(f"{s['peak_force_N']:.0f} N", f"planned peak force, over {s['contact_ms']:.0f}{NARROW}ms")
+    if s.get("hand_speed_m_s") is not None:
+        card(f"{s['hand_speed_m_s']:.2f} m/s", "speed of the hand at contact")
+    margins = s.get("zmp_margin_m")
+    if isinstance(margins, Mapping) and margins:
+        least = 1e3 * min(margins.values())
+        card(f"{least:.0f} mm", "least planned ZMP margin", "" if least >= 0 else "bad")
+    standing = s.get("replayed", {}).get("standing")
+    if standing is not None:
+        card("stands" if standing else "falls", "replayed on free soles", "good" if standing else "bad")
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _table(s: Mapping[str, Any]) -> str:
+    columns = result_columns(s)
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in columns)
+    rows = []
+    for row in result_rows(columns):
+        cells = "".join(
+            f"<td>{escape(cell.text)}</td>" if cell.good else f'<td class="bad">! {escape(cell.text)}</td>'
+            for cell in row.cells
+        )
+        rows.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+    table = f"<thead><tr><td></td>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
+    return f'<div class="scroll" tabindex="0"><table>{table}</table></div>'
+
+
+def _violations(s: Mapping[str, Any]) -> str:
+    if not s.get("violations"):
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{escape(str(v["row"]))}</th><td>{escape(str(v["by"]))}</td></tr>'
+        for v in s["violations"]
+    )
+    table = f'<div class="card scroll"><table><tbody>{rows}</tbody></table></div>'
+    return f"<h2>What is not met, worst first</h2>{table}"
+
+
+def _solve(s: Mapping[str, Any]) -> dict[str, Any]:
+    out = {name: s[name] for name in ("solver", "message", "iterations") if name in s}
+    for name, what in (("solve_seconds", "solving"), ("build_seconds", "building")):
+        if s.get(name) is not None:
+            out[what] = f"{s[name]:.2f} s"
+    if s.get("max_violation") is not None:
+        out["largest violation"] = f"{s['max_violation']:.1e}"
+    out |= {f"objective: {name}": f"{value:.4g}" for name, value in s.get("objectives", {}).items()}
+    return out
+
+
+def _text(name: str, title: str, text: str) -> str:
+    return (
+        f'<section class="card"><div class="head"><h3>{escape(title)}</h3>'
+        f'<button data-copy="{name}" aria-label="copy: {escape(title)}">copy</button></div>'
+        f'<pre id="{name}" tabindex="0">{escape(text)}</pre></section>'
+    )
+
+
+def _pairs(pairs: Mapping[str, Any]) -> str:
+    def shown(value: Any) -> str:
+        return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+    rows = "".join(
+        f'<tr><th scope="row">{escape(str(name))}</th><td>{escape(shown(value))}</td></tr>'
+        for name, value in pairs.items()
+        if value not in (None, [], "")
+    )
+    return f'<div class="scroll"><table class="pairs"><tbody>{rows}</tbody></table></div>'

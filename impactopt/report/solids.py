@@ -1,0 +1,124 @@
+"""Solids as triangles, and how to make do with fewer of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Solid", "box", "cylinder", "joined", "rounded_box", "simplified", "sphere"]
+
+Array = NDArray[np.float64]
+TO_MEAN = 1e-3  # how much a simplified vertex is drawn to the mean of those that it stands for
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solid:
+    """A surface: vertices (n, 3) [m] and triangles (m, 3), indices counter-clockwise seen from outside."""
+
+    vertices: Array
+    triangles: NDArray[np.intp]
+
+    def moved(self, rotation: Array, translation: Array) -> Solid:
+        """In the frame in which it is so placed."""
+        return Solid(vertices=self.vertices @ rotation.T + translation, triangles=self.triangles)
+
+
+def joined(solids: Sequence[Solid]) -> Solid:
+    """All of them as one."""
+    counts = np.cumsum([0, *(len(s.vertices) for s in solids)])
+    return Solid(
+        vertices=np.concatenate([s.vertices for s in solids]),
+        triangles=np.concatenate([s.triangles + n for s, n in zip(solids, counts[:-1], strict=True)]),
+    )
+
+
+def box(sides: ArrayLike) -> Solid:
+    """Of these sides (3,) [m], about the origin."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    triangles = [t for a, b, c, d in quads for t in ([a, b, c], [a, c, d])]
+    return Solid(vertices=signs * np.asarray(sides) / 2, triangles=np.array(triangles))
+
+
+def rounded_box(sides: ArrayLike) -> Solid:
+    """The superellipsoid |x/a|^6 + |y/b|^6 + |z/c|^6 = 1 in a box of these sides (3,) [m]."""
+    round_ = sphere(1.0, sides=24)
+    size = (np.abs(round_.vertices) ** 6).sum(axis=1) ** (1 / 6)
+    return Solid(vertices=round_.vertices / size[:, None] * np.asarray(sides) / 2, triangles=round_.triangles)
+
+
+def cylinder(radius: float, length: float, *, tip: float = 1.0, sides: int = 20) -> Solid:
+    """Along z about the origin [m]; tip: the radius of its upper end over that of its lower one."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
+    up = np.array([0.0, 0.0, length / 2])
+    vertices = np.concatenate([radius * ring - up, radius * tip * ring + up, [-up, up]])
+    k, n = np.arange(sides), (np.arange(sides) + 1) % sides
+    bottom, top = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
+    rows = ((k, n, n + sides), (k, n + sides, k + sides), (n, k, bottom), (k + sides, n + sides, top))
+    return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(row) for row in rows]))
+
+
+def sphere(radius: float, *, sides: int = 16) -> Solid:
+    """About the origin, radius [m]."""
+    rings, angle = sides // 2, 2 * np.pi * np.arange(sides) / sides
+    polar = np.pi * np.arange(1, rings) / rings
+    grid = np.stack(
+        [
+            np.outer(np.sin(polar), np.cos(angle)),
+            np.outer(np.sin(polar), np.sin(angle)),
+            np.outer(np.cos(polar), np.ones(sides)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    vertices = radius * np.concatenate([grid, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+    k, n = np.arange(sides), (np.arange(sides) + 1) % sides
+    north, south, last = np.full(sides, len(grid)), np.full(sides, len(grid) + 1), (rings - 2) * sides
+    rows = [(north, k, n), (south, last + n, last + k)]
+    for r in range(rings - 2):
+        a, b = r * sides, (r + 1) * sides
+        rows += [(a + k, b + k, b + n), (a + k, b + n, a + n)]
+    return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(row) for row in rows]))
+
+
+def simplified(solid: Solid, cell: float) -> Solid:
+    """One vertex in each cube of side `cell` [m], where it is nearest to the planes of all triangles there.
+
+    Source: vertex clustering with quadric error; P. Lindstrom, "Out-of-core simplification of large polygonal
+    models", SIGGRAPH 2000, 259-262. Least squares, drawn a little to the mean so that flat parts have one
+    solution too.
+    """
+    v, t = solid.vertices, solid.triangles
+    cube = np.floor((v - v.min(axis=0)) / cell).astype(np.int64)
+    sizes = cube.max(axis=0) + 1
+    _, label = np.unique((cube[:, 0] * sizes[1] + cube[:, 1]) * sizes[2] + cube[:, 2], return_inverse=True)
+    n = int(label.max()) + 1
+    mean = _sums(label, v, n) / np.bincount(label, minlength=n)[:, None]
+    a, b, c = (v[t[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    cells = label[t]
+    plane, offset = np.zeros((n, 9)), np.zeros((n, 3))
+    for k in range(3):
+        owner = cells[:, k]
+        away = ((a - mean[owner]) * normal).sum(axis=1)  # from the mean, where least squares is well scaled
+        plane += _sums(owner, (normal[:, :, None] * normal[:, None, :]).reshape(-1, 9), n)
+        offset += _sums(owner, away[:, None] * normal, n)
+    planes = plane.reshape(n, 3, 3)
+    size = np.trace(planes, axis1=1, axis2=2) + 1e-30
+    shift = np.linalg.solve(planes + (TO_MEAN * size)[:, None, None] * np.eye(3), offset[:, :, None])[:, :, 0]
+    vertices = mean + np.clip(shift, -cell / 2, cell / 2)
+    apart = (cells[:, 0] != cells[:, 1]) & (cells[:, 1] != cells[:, 2]) & (cells[:, 0] != cells[:, 2])
+    cells = cells[apart]
+    first = np.argmin(cells, axis=1)[:, None]
+    cells = np.take_along_axis(cells, (first + np.arange(3)) % 3, axis=1)
+    _, kept = np.unique((cells[:, 0] * n + cells[:, 1]) * n + cells[:, 2], return_index=True)
+    used, triangles = np.unique(cells[kept], return_inverse=True)
+    return Solid(vertices=vertices[used], triangles=triangles.reshape(-1, 3))
+
+
+def _sums(label: NDArray[np.intp], rows: Array, n: int) -> Array:
+    """(n, k) sums of rows (m, k) by label."""
+    return np.stack([np.bincount(label, weights=column, minlength=n) for column in rows.T], axis=1)

@@ -1,0 +1,150 @@
+"""What moves in an animation, at chosen instants: robot, target, force, ZMP and centre of mass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.output import Record
+from impactopt.problem import ImpactProblem
+from impactopt.validation.result import centre_of_pressure
+
+__all__ = ["AROUND", "Track", "tracks_of"]
+
+Array = NDArray[np.float64]
+AROUND = 0.05  # [s] before and after contact that are shown slowly
+FRAME, FINE = 1 / 30, 1 / 500  # [s] between instants, and around contact
+AFTER = 1.0  # [s] shown beyond the end of the planned motion
+FAR = 1.0  # [m] that a target that flies off is followed
+
+# name of each motion in a record, and the prefix of its arrays
+MOTIONS = (("planned", "reference"), ("simulated", "simulated"), ("free soles", "replayed"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track:
+    """One motion at k instants.
+
+    time (k,) [s]; places (k, joints, 7): each joint of the model in the world, position [m] and quaternion
+    x, y, z, w, the universe first; hand, mass (k, 3) [m]: striking point and centre of mass; force (k,) [N]
+    on the target, along its normal; travel (k,) [m] of the target along it; zmp (k, 2) [m] and ground (k, 3)
+    [N], the ground's force on the robot, nan where nothing presses or nothing is known of it. contact_start,
+    contact_end [s], nan without contact.
+    """
+
+    name: str
+    time: Array
+    places: Array
+    hand: Array
+    mass: Array
+    force: Array
+    travel: Array
+    zmp: Array
+    ground: Array
+    contact_start: float
+    contact_end: float
+
+
+def tracks_of(record: Record, problem: ImpactProblem) -> list[Track]:
+    """The planned motion, and those that the record has of engines.
+
+    The servo's reference coasts through contact; the planned robot does not. In contact it is drawn on the
+    cubic between the planned states before and after, whose ends and velocities are the plan's.
+    """
+    return [
+        _track(record, problem, name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays
+    ]
+
+
+def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Track:
+    a, robot = record.arrays, problem.robot
+    time = a[f"{prefix}_time"]
+    start, end = float(a[f"{prefix}_contact_start"]), float(a[f"{prefix}_contact_end"])
+    chosen = _instants(time, start, end, float(a["reference_end"]) + AFTER)
+    shown = time[chosen]
+    if prefix == "reference":
+        q = _planned(problem, record)(chosen)
+        wrench, force, speed = _predicted(record, chosen)
+    else:
+        q, force = a[f"{prefix}_q"][chosen], a[f"{prefix}_force"][chosen]
+        wrench, speed = a[f"{prefix}_sole_ground"].sum(axis=1)[chosen], a[f"{prefix}_target_speed"]
+    steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2
+    travel = np.concatenate([[0.0], np.cumsum(steps)])[chosen]
+    model = robot.model
+    data, striker = model.createData(), model.getFrameId(robot.striker(problem.striker).model_frame)
+    places, hand, mass = np.zeros((len(shown), model.njoints, 7)), [], []
+    for k, posture in enumerate(q):
+        pin.framesForwardKinematics(model, data, posture)
+        places[k] = [pin.SE3ToXYZQUAT(place) for place in data.oMi]
+        hand.append(np.array(data.oMf[striker].translation))
+        mass.append(np.array(pin.centerOfMass(model, data, posture)))
+    legged = len(a["polygon"]) > 0
+    return Track(
+        name=name,
+        time=shown,
+        places=places,
+        hand=np.array(hand),
+        mass=np.array(mass),
+        force=force,
+        travel=np.clip(travel, -FAR, FAR),
+        zmp=centre_of_pressure(wrench) if legged else np.full((len(shown), 2), np.nan),
+        ground=wrench[:, :3] if legged else np.full((len(shown), 3), np.nan),
+        contact_start=start,
+        contact_end=end,
+    )
+
+
+def _instants(time: Array, start: float, end: float, last: float) -> NDArray[np.intp]:
+    """Indices of what is shown: dense around contact, until `last` [s]."""
+    last = min(last, float(time[-1]))
+    grid = np.arange(0.0, last + FRAME / 2, FRAME)
+    if np.isfinite(start):
+        stop = min(end if np.isfinite(end) else start, last)
+        grid = np.union1d(grid, np.arange(start - AROUND, stop + AROUND, FINE))
+        grid = np.union1d(grid, [start, stop])
+    grid = grid.clip(0.0, last)
+    before, at = np.searchsorted(time, grid), np.searchsorted(time, grid, side="right") - 1
+    return np.unique(np.concatenate([before, at]).clip(0, len(time) - 1))  # both sides of a jump
+
+
+def _planned(problem: ImpactProblem, record: Record) -> Callable[[NDArray[np.intp]], Array]:
+    """Configurations (k, nq) of the plan at instants of its reference."""
+    a, model = record.arrays, problem.robot.model
+    time, phase, q, v = (a[f"reference_{name}"] for name in ("time", "phase", "q", "v"))
+    inside = np.flatnonzero(phase == 1)
+    if not len(inside):
+        return lambda chosen: np.asarray(q[chosen])
+    first, after = int(inside[0]), min(int(inside[-1]) + 1, len(time) - 1)
+    span = float(time[after] - time[first])
+    way = pin.difference(model, q[first], q[after])
+
+    def at(chosen: NDArray[np.intp]) -> Array:
+        rows = q[chosen].copy()
+        for k in np.flatnonzero(phase[chosen] == 1):
+            s = (time[chosen[k]] - time[first]) / span if span > 0 else 0.0
+            bend = s * (1 - s) * ((1 - s) * (span * v[first] - way) - s * (span * v[after] - way))
+            rows[k] = pin.integrate(model, q[first], s * way + bend)
+        return np.asarray(rows)
+
+    return at
+
+
+def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    """Ground wrench and force of the plan at the chosen instants, and the target's speed at all of them."""
+    a = record.arrays
+    time, phase, wrench = a["reference_time"], a["reference_phase"], a["reference_ground"][chosen].copy()
+    since = time - float(a["reference_contact_start"])
+    hit, ground = a["collision_time"], a["collision_ground"]
+    contact = phase[chosen] == 1
+    if len(ground):
+        at = hit[-len(ground) :]
+        wrench[contact] = np.column_stack([np.interp(since[chosen][contact], at, w) for w in ground.T])
+    force = np.where(contact, np.interp(since[chosen], hit, a["collision_force"]), 0.0)
+    speed = np.interp(since, hit, a["collision_target_speed"], left=0.0)
+    if "depth_m" in record.summary.get("target", {}):  # a nail stays in its wood
+        speed = np.where(since > hit[-1], 0.0, speed)
+    return wrench, force, speed

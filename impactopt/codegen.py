@@ -41,7 +41,7 @@ from impactopt.private_files import (
     write_atomically,
 )
 
-__all__ = ["NativeCode", "cache_directory", "cached", "library_path", "model_hash"]
+__all__ = ["NativeCode", "cache_directory", "cached", "compiled_library", "library_path", "model_hash"]
 
 Report = Callable[[str], None]
 
@@ -150,6 +150,26 @@ def cached(
         if functions is not None:
             return functions
         return _build_entry(directory, entry, name, build, compiler, tell)
+
+
+def compiled_library(name: str, code: str, *, level: str = _NATIVE_LEVEL) -> Path | None:
+    """The shared library of C code that is no CasADi function; None where no compiler can make it."""
+    compiler = find_compiler()
+    if compiler is None:
+        return None
+    try:
+        directory = private_directory(cache_directory())
+    except (UnsafePath, OSError):
+        directory = temporary_private_directory()
+    try:
+        with (
+            locked(directory / f"{_slug(name)}.lock", on_wait=lambda: None),
+            tempfile.TemporaryDirectory(dir=directory, prefix="tmp-") as scratch,
+        ):
+            return directory / _library(directory, Path(scratch), name, code, level, compiler)[0]
+    except (CompileError, OSError) as error:
+        warnings.warn(f"{name}: {error}; its work is done in Python", NoCompilerWarning, stacklevel=3)
+        return None
 
 
 def library_path(name: str, recipe: tuple[Any, ...], function: str) -> Path | None:

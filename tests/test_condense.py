@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_plans import biped_problem, transcribed
 
 from impactopt.nlp.start import first_iterate
+from impactopt.sqp.cholesky import BlockCholesky
+from impactopt.sqp.compiled import kernels
 from impactopt.sqp.condense import Condenser, Determined, Elimination, find_eliminations
+from impactopt.sqp.kernels import Kernels
 from impactopt.sqp.newton import NewtonSystem
-from impactopt.sqp.normal import NormalMatrix
+
+NONE = np.zeros(9, dtype=bool)
 
 
 def chained(seed, systems=4, own=2, shared=3):
@@ -38,44 +43,60 @@ def chained(seed, systems=4, own=2, shared=3):
     return sp.csc_array(J), H, [Elimination(numbers, numbers)], rng
 
 
-@given(seed=st.integers(0, 10**6), shift=st.sampled_from([0.0, 0.3]))
-@settings(max_examples=20, deadline=None)
-def test_the_condensed_step_is_the_whole_one(seed, shift):
+@pytest.fixture(params=[Kernels, kernels], ids=["numpy", "compiled"])
+def algebra(request):
+    return request.param()
+
+
+@given(seed=st.integers(0, 10**6), hard=st.booleans(), indefinite=st.booleans())
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_the_condensed_step_is_the_whole_one(algebra, seed, hard, indefinite):
     J, H, eliminations, rng = chained(seed)
-    n = J.shape[1]
+    m, n = J.shape
+    if indefinite:
+        H = sp.csc_array(H - 60 * sp.diags_array(1.0 * (np.arange(n) == n - 1)))
+    equal = np.zeros(m, dtype=bool)
+    equal[eliminations[0].rows.ravel()] = equal[m - 5] = True
     bounded = np.zeros(n, dtype=bool)
     bounded[[0, n - 1]] = True
-    c = Condenser(J, H, eliminations, bounded)
+    c = Condenser(J, H, eliminations, equal, bounded, algebra)
     assert c.bounded.tolist() == [0]
+    assert c.rows[c.equal].tolist() == [m - 5]
     gradient, residual = rng.normal(size=n), rng.normal(size=c.m)
-    weights = np.abs(rng.normal(size=c.rows.size))
-    system = c.condense(J, H, gradient, residual)
-    M = c.identity()
-    matrix = NormalMatrix(system.P, system.A, c.owner, None)
-    newton = NewtonSystem(matrix, np.zeros(0, dtype=int))
-    none = np.zeros(0, dtype=int)
-    assert newton.factor(system, lambda _: weights, np.zeros(c.free.size), none, c.identity)
-    assert newton.shift == 0.0
-    d, y = newton.solve(system.q, system.r, np.zeros(c.rows.size))
-    step = c.expand(d)
-    multipliers = c.multipliers(step, y, 0.0)
-    # the same, whole: equalities J_e d = -r_e, rows y = w (J d + r), stationarity
-    everything = np.vstack([J.toarray(), np.eye(n)[[0]]])
-    e, i = c.eliminated, c.rows
-    whole = np.block(
-        [
-            [H.toarray() + everything[i].T * weights @ everything[i], everything[e].T],
-            [everything[e], np.zeros((e.size,) * 2)],
-        ]
-    )
-    right = np.concatenate([-gradient - everything[i].T @ (weights * residual[i]), -residual[e]])
-    exact = np.linalg.solve(whole, right)
-    np.testing.assert_allclose(step, exact[:n], atol=1e-9 * (1 + np.abs(exact).max()))
-    np.testing.assert_allclose(multipliers[e], exact[n:], atol=1e-8 * (1 + np.abs(exact).max()))
-    Z = np.array([c.expand(column) - c.expand(0 * column) for column in np.eye(c.free.size)]).T
-    np.testing.assert_allclose(M.toarray(), Z.T @ Z, atol=1e-10 * np.abs(Z).max() ** 2)
-    pulled = rng.normal(size=n)
-    np.testing.assert_allclose(c.pull(pulled), Z.T @ pulled, atol=1e-10 * np.abs(Z).max())
+    weights, diagonal = 0.1 + rng.random(c.rows.size), rng.random(c.free.size)
+    newton = NewtonSystem(c, np.zeros(0, dtype=int), None, algebra)
+    assert newton.factor(J, H, diagonal, lambda _: weights.copy(), hard=hard)
+    step, y = newton.solve(gradient, residual)
+    # the same, whole: equalities J_e d = -r_e, other rows y = w (J d + r), stationarity
+    rows = np.vstack([J.toarray(), np.eye(n)[[0]]])
+    softness = np.zeros(c.m)
+    softness[c.rows] = 1.0 / weights
+    if hard:
+        softness[m - 5] = 0.0
+    whole = H.toarray() + newton.shift * np.eye(n)
+    whole[c.free, c.free] += diagonal
+    system = np.block([[whole, rows.T], [rows, -np.diag(softness)]])
+    exact = np.linalg.solve(system, -np.concatenate([gradient, residual]))
+    np.testing.assert_allclose(step, exact[:n], atol=1e-8 * (1 + np.abs(exact).max()))
+    np.testing.assert_allclose(y, exact[n:], atol=1e-8 * (1 + np.abs(exact).max()))
+    # inertia: as many negative eigenvalues as rows, however the Hessian curves
+    hard_rows = np.flatnonzero(softness == 0.0)
+    Z = la.null_space(rows[hard_rows])
+    soft = np.setdiff1d(np.arange(c.m), hard_rows)
+    reduced = Z.T @ (whole + rows[soft].T / softness[soft] @ rows[soft]) @ Z
+    assert np.linalg.eigvalsh(reduced).min() > 0.0
+
+
+def test_a_variable_that_is_held_does_not_move(algebra):
+    J, H, eliminations, rng = chained(3)
+    equal, bounded = np.zeros(J.shape[0], dtype=bool), np.zeros(J.shape[1], dtype=bool)
+    equal[eliminations[0].rows.ravel()] = True
+    c = Condenser(J, H, eliminations, equal, bounded, algebra)
+    newton = NewtonSystem(c, np.array([1]), np.arange(J.shape[1], dtype=float), algebra)
+    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.rows.size), hard=True)
+    step, _ = newton.solve(rng.normal(size=J.shape[1]), rng.normal(size=c.m))
+    assert step[c.free[1]] == 0.0
+    assert np.abs(step).min(initial=1.0, where=np.arange(step.size) != c.free[1]) > 0.0
 
 
 def test_rows_of_two_systems_are_refused():
@@ -83,14 +104,14 @@ def test_rows_of_two_systems_are_refused():
     H = sp.csc_array(np.eye(3))
     systems = np.array([[0], [1]])
     with pytest.raises(ValueError, match="row 2 touches two systems"):
-        Condenser(J, H, [Elimination(systems, systems)], np.zeros(3, dtype=bool))
+        Condenser(J, H, [Elimination(systems, systems)], np.ones(3, dtype=bool), NONE[:3], Kernels())
 
 
 def test_systems_that_the_hessian_couples_are_refused():
     J, H = sp.csc_array(np.eye(2)), sp.csc_array(np.ones((2, 2)))
     systems = np.array([[0], [1]])
     with pytest.raises(ValueError, match="couples"):
-        Condenser(J, H, [Elimination(systems, systems)], np.zeros(2, dtype=bool))
+        Condenser(J, H, [Elimination(systems, systems)], np.ones(2, dtype=bool), NONE[:2], Kernels())
 
 
 def test_variables_without_rows_of_their_own_stay_free():
@@ -101,36 +122,33 @@ def test_variables_without_rows_of_their_own_stay_free():
     assert (found.rows.tolist(), found.variables.tolist()) == ([[0]], [[1]])
 
 
-@given(seed=st.integers(0, 10**6), n=st.integers(1, 40), wide=st.integers(0, 2))
-@settings(max_examples=30, deadline=None)
-def test_the_bordered_band_against_dense_algebra(seed, n, wide):
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 150), wide=st.integers(0, 2))
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_the_factor_in_blocks_against_dense_algebra(algebra, seed, n, wide):
     rng = np.random.default_rng(seed)
-    rows = [np.bincount([k, (k + 1) % n], rng.normal(size=2), n) for k in range(n)]
-    for k in range(0, n - 6, 3):  # panels of neighbours, all of which may touch the wide ones
-        for _ in range(3):
-            row = np.zeros(n)
-            row[k : k + 6] = rng.normal(size=6)
-            row[:wide] = rng.normal(size=min(wide, n))
-            rows.append(row)
-    A = sp.csr_array(np.array(rows))
-    owner = np.array([-1] * n + [k // 3 for k in range(A.shape[0] - n)])
-    P = sp.csr_array(sp.diags_array(1.0 + rng.random(n)))
-    weights, diagonal = rng.random(A.shape[0]), rng.random(n)
-    matrix = NormalMatrix(P, A, owner, np.arange(n, dtype=float))
-    matrix.load(P, A)
-    none = np.zeros(0, dtype=int)
-    dense = P.toarray() + A.toarray().T * weights @ A.toarray() + np.diag(diagonal)
-    assert matrix.factor(matrix.weighed(weights), diagonal, none)
-    right = rng.normal(size=(n, 2))
-    np.testing.assert_allclose(matrix.solve(right), np.linalg.solve(dense, right), atol=1e-8)
-    np.testing.assert_allclose(matrix.solve(right[:, 0]), np.linalg.solve(dense, right[:, 0]), atol=1e-8)
-    assert not matrix.factor(matrix.weighed(weights), diagonal - 1e3, none)
-    held = np.array([0])
-    assert matrix.factor(matrix.weighed(weights), diagonal, held)
-    assert abs(matrix.solve(right[:, 0])[0]) < 1e-12
+    K = np.zeros((n, n))
+    for k in range(0, n, 3):  # neighbours touch each other, and a few touch all
+        at = np.unique(np.concatenate([np.arange(k, min(n, k + 6)), np.arange(min(wide, n))]))
+        rows = rng.normal(size=(at.size + 1, at.size))
+        K[np.ix_(at, at)] += rows.T @ rows
+    K += np.eye(n)
+    pattern = K != 0.0
+    i, j = np.nonzero(np.tril(pattern))
+    matrix = BlockCholesky(pattern, np.arange(n, dtype=float) if seed % 2 else None, algebra)
+
+    def values(dense):
+        out = np.zeros(matrix.size)
+        out[matrix.places(i, j)] = dense[i, j]
+        return out
+
+    assert matrix.factor(values(K))
+    right = rng.normal(size=(n, 3))
+    np.testing.assert_allclose(K @ matrix.solve(right), right, atol=1e-9 * np.linalg.cond(K))
+    np.testing.assert_allclose(K @ matrix.solve(right[:, 0]), right[:, 0], atol=1e-9 * np.linalg.cond(K))
+    assert not matrix.factor(values(K - 1.01 * np.linalg.eigvalsh(K)[-1] * np.eye(n)))
 
 
-def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one():
+def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra):
     t = transcribed(biped_problem())
     p = t.program
     rng = np.random.default_rng(0)
@@ -139,16 +157,19 @@ def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one():
     J, H = p.jacobian(x), p.hessian(x, 1.0, y)
     equal = p.g_lower == p.g_upper
     wanted = [Determined(*w) for w in p.determined if len(w[1])]
-    eliminations = find_eliminations(J, equal, wanted)
-    c = Condenser(J, H, eliminations, np.zeros(p.n, dtype=bool))
+    c = Condenser(J, H, find_eliminations(J, equal, wanted), equal, np.zeros(p.n, dtype=bool), algebra)
     assert c.eliminated.size == sum(w.variables.size for w in wanted)
-    left = np.flatnonzero(equal[c.rows])
-    assert left.size < 60  # of the hundreds there are
-    system = c.condense(J, H, p.gradient(x), rng.normal(size=p.m))
-    # what is left of a random step is what all rows and the Hessian make of it
-    step = rng.normal(size=c.free.size)
-    at_zero, d = c.expand(0 * step), c.expand(step)
-    np.testing.assert_allclose((J @ (d - at_zero))[c.eliminated], 0, atol=1e-7 * np.abs(d).max())
-    np.testing.assert_allclose(system.A @ step, (J @ (d - at_zero))[c.rows], atol=1e-7 * np.abs(d).max())
-    curvature = (d - at_zero) @ (H @ (d - at_zero))
-    assert step @ (system.P @ step) == pytest.approx(curvature, rel=1e-6)
+    assert c.equal.size < 60  # of the hundreds there are
+    newton = NewtonSystem(c, np.zeros(0, dtype=int), p.sequence, algebra)
+    weights = 10.0 ** rng.uniform(-6, 6, size=c.rows.size)
+    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
+    gradient, residual = p.gradient(x), 1e-3 * rng.normal(size=p.m)
+    d, multipliers = newton.solve(gradient, residual)
+    size = np.abs(multipliers).max()
+    dual = gradient + H @ d + newton.shift * d + J.T @ multipliers
+    np.testing.assert_allclose(dual, 0, atol=1e-9 * size)
+    off = (J @ d + residual)[equal]
+    np.testing.assert_allclose(off, 0, atol=1e-8 * np.abs(d).max())
+    soft = np.setdiff1d(c.rows, np.flatnonzero(equal))
+    expected = weights[~np.isin(c.rows, np.flatnonzero(equal))] * (J @ d + residual)[soft]
+    np.testing.assert_allclose(multipliers[soft], expected, atol=1e-9 * size)

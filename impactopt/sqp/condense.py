@@ -3,14 +3,13 @@
 A motion's program has thousands of variables that rows determine by themselves: leg joints follow from the
 base's pose by the closed legs, a sole's wrench from the equation of motion, a collision's motion from its
 beginning. An elimination names such rows and variables, system by system; all systems of one shape are
-treated at once. What is left is a Newton system in the free variables (Nocedal and Wright 2006, section 15.3:
-elimination of variables), with the same solution: nothing is approximated.
+treated together. What is left is a Newton system in the free variables (Nocedal and Wright 2006, section
+15.3: elimination of variables), with the same solution: nothing is approximated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +18,9 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from impactopt.program import Matrix, Vector
+from impactopt.sqp.kernels import Index, Kernels, Places, Products, Stage
 
-Index = npt.NDArray[np.intp]
-Stack = npt.NDArray[np.float64]  # (systems, rows, columns)
+Mask = npt.NDArray[np.bool_]
 
 
 class Elimination(NamedTuple):
@@ -41,9 +40,7 @@ class Determined(NamedTuple):
     variables: Index
 
 
-def find_eliminations(
-    jacobian: Matrix, equal: npt.NDArray[np.bool_], determined: Sequence[Determined]
-) -> list[Elimination]:
+def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determined]) -> list[Elimination]:
     """The eliminations for variables that a program says are determined by rows of their own.
 
     Each gets the first equality rows that touch it and are not taken yet; where there are not enough, or they
@@ -70,70 +67,35 @@ def find_eliminations(
     ]
 
 
-@dataclass
-class _Stage:
-    """Where the numbers of one elimination stand; values that are none point to the end.
+class _Touched(NamedTuple):
+    """What one system touches.
 
-    q, e : its rows and variables; t : other rows that these variables touch; c : variables that its rows
-    touch; h : those that the Hessian couples to e.
+    q, e : its rows and variables; t : other equality rows that these variables touch; c : variables that its
+    rows touch; u : c, and behind them those that only the Hessian couples to e.
     """
 
     q: Index
     e: Index
     t: Index
     c: Index
-    h: Index
-    qe: Index
-    qc: Index
-    te: Index
-    tc: Index
-    hee: Index
-    heh: Index
-    hcc: Index
-    hch: Index
-    hhc: Index
-
-
-class _Solved(NamedTuple):
-    """What going back needs: B^-1, X = B^-1 N, the step x0 = B^-1 r that meets the rows, values touched."""
-
-    inverse: Stack
-    X: Stack
-    x0: Stack
-    te: Stack
-    hee: Stack
-    heh: Stack
-    gradient: Stack
-
-
-@dataclass(frozen=True)
-class Condensed:
-    """The system in the free variables: Hessian P and gradient q, rows A d + r.
-
-    Attributes
-    ----------
-    P : csr (f, f); q: (f,).
-    A : csr (k, f); r : (k,), the rows' values after the step that meets the eliminated ones.
-    """
-
-    P: Matrix
-    q: Vector
-    A: Matrix
-    r: Vector
+    u: Index
 
 
 class Condenser:
     """Eliminates, for matrices whose patterns do not change.
 
-    Rows are those of the program, and behind them one for each eliminated variable that has a bound.
+    Rows are those of the program, and behind them one for each eliminated variable that has a bound. Those
+    that are no equalities are not eliminated from: they enter the Hessian, W = H + J' diag(w) J, before it.
 
     Attributes
     ----------
-    rows, free : numbers of the rows and variables that are left.
     eliminated : numbers of the rows that are gone.
+    rows, free : numbers of the rows and variables that are left.
+    equal : which of the rows left are equalities: numbers into `rows`.
     bounded : eliminated variables with a bound, each a row of its own from number m on.
-    m : number of rows with those of `bounded`.
-    owner : for each row that is left, which system touched it last; -1: none.
+    m, n : number of rows with those of `bounded`, and of variables.
+    pattern : which of the free variables W couples (f, f), once all is eliminated, with those that an
+        equality left touches.
     """
 
     def __init__(
@@ -141,237 +103,210 @@ class Condenser:
         jacobian: Matrix,
         hessian: Matrix,
         eliminations: Sequence[Elimination],
-        bounded: npt.NDArray[np.bool_],
+        equal: Mask,
+        bounded: Mask,
+        kernels: Kernels,
     ):
-        """Patterns of the Jacobian (m, n) and the Hessian (n, n), csc; bounded (n,): variables with a finite
-        bound."""
+        """Patterns of the Jacobian (m, n) and the Hessian (n, n), csc; equal (m,): which rows are equalities;
+        bounded (n,): variables with a finite bound.
+        """
         m, n = jacobian.shape
+        self._kernels = kernels
         gone = np.concatenate([np.zeros(0, np.intp), *[e.variables.ravel() for e in eliminations]])
-        self.eliminated = np.sort(
-            np.concatenate([np.zeros(0, np.intp), *[e.rows.ravel() for e in eliminations]])
-        )
+        taken = np.concatenate([np.zeros(0, np.intp), *[e.rows.ravel() for e in eliminations]])
+        self.eliminated = np.sort(taken)
         self.bounded = np.sort(gone[bounded[gone]])
-        self.m = m + self.bounded.size
-        self._n = n
-        rows = np.zeros((self.m, n), dtype=bool)
-        couples = np.zeros((n, n), dtype=bool)
-        J, H = jacobian.tocoo(), hessian.tocoo()
-        rows[J.row, J.col] = True
-        rows[m + np.arange(self.bounded.size), self.bounded] = True
-        couples[H.row, H.col] = True
-        np.fill_diagonal(couples, True)
-        systems = self._fill(rows, couples, eliminations)
-        filled, coupled = _numbered(rows), _numbered(couples)
-        self._sizes = filled.nnz, coupled.nnz
-        self._stages = [
-            _stage(e, found, filled, coupled) for e, found in zip(eliminations, systems, strict=True)
-        ]
-        left = np.ones(self.m, dtype=bool)
-        left[self.eliminated] = False
-        free = np.ones(n, dtype=bool)
-        free[gone] = False
+        self.m, self.n = m + self.bounded.size, n
+        left, free = np.ones(self.m, dtype=bool), np.ones(n, dtype=bool)
+        left[self.eliminated] = free[gone] = False
         self.rows, self.free = np.flatnonzero(left), np.flatnonzero(free)
-        self._own_jacobian = _places(filled, J.row, J.col)
-        self._own_bounds = _places(filled, m + np.arange(self.bounded.size), self.bounded)
-        self._own_hessian = _places(coupled, H.row, H.col)
-        self._diagonal = _places(coupled, np.arange(n), np.arange(n))
-        self._A = _submatrix(filled, self.rows, self.free)
-        self._P = _submatrix(coupled, self.free, self.free)
-        owner = np.full(self.m + 1, -1)
-        number = 0
-        for found in systems:
-            for _, _, t, _, _ in found:
-                owner[t] = number
-                number += 1
-        self.owner = owner[self.rows]
+        self._equations = np.flatnonzero(equal)
+        self.equal = np.searchsorted(self.rows, self._equations[left[self._equations]])
 
-    @staticmethod
-    def _fill(rows: Any, couples: Any, eliminations: Sequence[Elimination]) -> list[list[tuple[Any, ...]]]:
-        """Mark what becomes nonzero on the way, and find what each system touches."""
-        row_left, column_left = np.ones(rows.shape[0], dtype=bool), np.ones(rows.shape[1], dtype=bool)
-        out: list[list[tuple[Any, ...]]] = []
-        for q_all, e_all in eliminations:
-            row_left[q_all.ravel()] = False
-            column_left[e_all.ravel()] = False
-            found, touched = [], np.zeros(rows.shape[0], dtype=np.intp)
-            for q, e in zip(q_all, e_all, strict=True):
-                t = np.flatnonzero(rows[:, e].any(axis=1) & row_left)
-                c = np.flatnonzero(rows[q].any(axis=0) & column_left)
-                coupled = couples[e].any(axis=0)
-                h = np.flatnonzero(coupled & column_left)
-                if np.isin(np.setdiff1d(e_all, e), np.flatnonzero(coupled)).any():
-                    raise ValueError("the Hessian couples variables of two systems of one elimination")
-                touched[t] += 1
-                rows[np.ix_(t, c)] = rows[np.ix_(t, e)] = True
-                rows[np.ix_(q, e)] = couples[np.ix_(e, e)] = couples[np.ix_(c, c)] = True
-                couples[np.ix_(c, h)] = couples[np.ix_(h, c)] = True
-                found.append((q, e, t, c, h))
-            if (touched > 1).any():
-                raise ValueError(f"row {int(np.argmax(touched > 1))} touches two systems of one elimination")
-            out.append(found)
-        return out
+        number = np.full(m, -1)  # of an equality among them
+        number[self._equations] = np.arange(self._equations.size)
+        J, H = jacobian.tocoo(), hessian.tocoo()
+        mine = np.flatnonzero(number[J.row] >= 0)
+        own_rows, own_columns = number[J.row[mine]], J.col[mine]
+        touches = np.zeros((self._equations.size, n), dtype=bool)
+        touches[own_rows, own_columns] = True
+        groups = _by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations))
+        couples = np.eye(n, dtype=bool)
+        couples[H.row, H.col] = True
+        for columns, _, _ in groups:
+            couples[np.ix_(columns, columns)] = True
+        systems = _fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
+
+        p, c = np.nonzero(touches)
+        rows, none = _numbered(p, c, touches.shape)
+        i, j = np.nonzero(np.tril(couples))
+        pairs, nothing = _numbered(i, j, couples.shape)
+        pairs[j, i] = pairs[i, j]
+        self.J, self.W = np.zeros(none + 1), np.zeros(nothing + 1)
+        self._own_jacobian = rows[own_rows, own_columns], mine
+        lower = H.row >= H.col
+        self._own_hessian = pairs[H.row[lower], H.col[lower]], np.flatnonzero(lower)
+        self._diagonal = np.diagonal(pairs).copy()
+        self._products = [_products(pairs, *group) for group in groups]
+        self._stages = [_stage(found, rows, none, pairs, nothing) for found in systems]
+        self._left = number[self.rows[self.equal]]
+        part = sp.csr_array(touches[np.ix_(self._left, self.free)])
+        at = np.repeat(self._left, np.diff(part.indptr)), self.free[part.indices]
+        self._A = rows[at], part.indices, part.indptr
+        self.pattern = couples[np.ix_(self.free, self.free)]
+        for columns in np.split(part.indices, part.indptr[1:-1]):
+            self.pattern[np.ix_(columns, columns)] = True
+        place = np.full(n, -1)
+        place[self.free] = np.arange(self.free.size)
+        inside = (place[i] >= 0) & (place[j] >= 0)
+        self.at_free = np.flatnonzero(inside), place[i[inside]], place[j[inside]]
 
     # ------------------------------------------------------------------ numbers
-    def condense(self, jacobian: Matrix, hessian: Matrix, gradient: Vector, residual: Vector) -> Condensed:
-        """The system in the free variables.
-
-        jacobian, hessian : with the patterns given at first; gradient : (n,) of what the Hessian belongs to;
-        residual (m,) : what the rows, with those of `bounded`, are off by: an eliminated one is to become
-        zero.
+    def load(self, jacobian: Matrix, hessian: Matrix) -> None:
+        """Take new values, with the patterns given at first, and eliminate in the equalities.
 
         Raises
         ------
         LinAlgError : rows do not determine their variables.
         """
-        Jv = np.zeros(self._sizes[0] + 1)
-        Jv[self._own_jacobian], Jv[self._own_bounds] = jacobian.data, 1.0
-        self._gradient, self._solved = gradient, []
-        for a in self._stages:
-            te = Jv[a.te]
-            inverse = np.linalg.inv(Jv[a.qe])
-            X = inverse @ Jv[a.qc]
-            Jv[a.tc] -= te @ X
-            Jv[-1] = 0.0
-            none = np.zeros((*a.e.shape, 1))
-            self._solved.append(_Solved(inverse, X, none, te, none, none, none))
-        Hv = np.zeros(self._sizes[1] + 1)
-        Hv[self._own_hessian] = hessian.data
-        for i, own in enumerate(self._reduce(Hv)):
-            self._solved[i] = self._solved[i]._replace(hee=own[0], heh=own[1])
-        r, q = self.with_residual(residual)
-        A = sp.csr_array((Jv[self._A[0]], *self._A[1:]), shape=(self.rows.size, self.free.size))
-        return Condensed(self._symmetric(Hv), q, A, r)
+        self._jacobian, self._hessian = jacobian.data, hessian.data
+        self.J[:] = 0.0
+        to, where = self._own_jacobian
+        self.J[to] = jacobian.data[where]
+        for stage in self._stages:
+            self._kernels.eliminate(stage, self.J)
 
-    def identity(self) -> Matrix:
-        """What the identity in place of the Hessian becomes, for the Jacobian of the last `condense`: csr
-        (f, f)."""
-        values = np.zeros(self._sizes[1] + 1)
-        values[self._diagonal] = 1.0
-        for _ in self._reduce(values):
-            pass
-        return self._symmetric(values)
+    @property
+    def A(self) -> Matrix:
+        """Of the equalities left, by the free variables: csr (l, f)."""
+        where, *structure = self._A
+        return sp.csr_array((self.J[where], *structure), shape=(self._left.size, self.free.size))
 
-    def _reduce(self, Hv: Vector) -> Iterator[tuple[Stack, Stack]]:
-        """Eliminate in a Hessian's values; of each stage what coupled its variables to each other and to
-        others."""
-        for a, s in zip(self._stages, self._solved, strict=True):
-            hee, heh = Hv[a.hee], Hv[a.heh]
-            Xt = np.ascontiguousarray(s.X.swapaxes(1, 2))
-            cross = Xt @ -heh
-            _add(Hv, (a.hcc, a.hch, a.hhc), (Xt @ (hee @ s.X), cross, cross.swapaxes(1, 2)))
-            Hv[-1] = 0.0
-            yield hee, heh
+    def reduce(self, weights: Vector, diagonal: Vector) -> Vector:
+        """H + diag(diagonal) + J' diag(weights) J, and eliminated from: values at the places `at_free`.
 
-    def _symmetric(self, values: Vector) -> Matrix:
-        return sp.csr_array((values[self._P[0]], *self._P[1:]), shape=(self.free.size,) * 2)
+        weights (m,) of the rows: those of equalities play no part; diagonal (n,).
+        """
+        self.W[:] = 0.0
+        to, where = self._own_hessian
+        self.W[to] = self._hessian[where]
+        self.W[self._diagonal] += diagonal
+        bounds = self._diagonal[self.bounded]
+        self.W[bounds] += weights[self.m - self.bounded.size :]
+        self._kernels.add_products(self._products, self._jacobian, weights, self.W)
+        for stage in self._stages:
+            self._kernels.reduce(stage, self.W)
+        out: Vector = self.W[self.at_free[0]]
+        return out
 
-    def with_residual(self, residual: Vector) -> tuple[Vector, Vector]:
-        """r and q of the same system with another residual (m,): the factors stay."""
-        off, g = np.append(residual, 0.0), np.append(self._gradient, 0.0)
-        for i, (a, s) in enumerate(zip(self._stages, self._solved, strict=True)):
-            x0 = s.inverse @ off[a.q][..., None]
-            off[a.t] -= (s.te @ x0)[..., 0]
-            own = g[a.e][..., None]
-            to_c, to_h = s.X.swapaxes(1, 2) @ (own - s.hee @ x0), s.heh.swapaxes(1, 2) @ x0
-            _add(g, (a.c, a.h), (-to_c[..., 0], -to_h[..., 0]))
-            off[-1] = g[-1] = 0.0
-            self._solved[i] = s._replace(x0=x0, gradient=own)
-        return off[self.rows], g[self.free]
+    def forward(self, gradient: Vector, residual: Vector) -> tuple[Vector, Vector]:
+        """Gradient by the free variables (f,) and residual of the equalities left (l,), where the step meets
+        those eliminated.
+
+        gradient : (n,) of what belongs to W; residual (m,).
+        """
+        g, off = np.append(gradient, 0.0), np.append(residual[self._equations], 0.0)
+        for stage in self._stages:
+            self._kernels.forward(stage, g, off)
+        return g[self.free], off[self._left]
 
     def expand(self, step: Vector) -> Vector:
-        """The step of all variables (n,) for one of the free ones (f,)."""
-        d = np.zeros(self._n + 1)
+        """The step of all variables (n,) for one of the free ones (f,), after `forward`."""
+        d = np.zeros(self.n + 1)
         d[self.free] = step
-        for a, s in zip(self._stages[::-1], self._solved[::-1], strict=True):
-            d[a.e] = -(s.x0 + s.X @ d[a.c][..., None])[..., 0]
-            d[-1] = 0.0
+        for stage in reversed(self._stages):
+            self._kernels.expand(stage, d)
         return d[:-1]
 
-    def pull(self, gradient: Vector) -> Vector:
-        """The gradient (f,) by the free variables of what has one (n,) by all of them."""
-        g = np.append(gradient, 0.0)
-        for a, s in zip(self._stages, self._solved, strict=True):
-            _add(g, (a.c,), (-(s.X.swapaxes(1, 2) @ g[a.e][..., None])[..., 0],))
-            g[-1] = 0.0
-        return g[self.free]
+    def multipliers(self, dual: Vector, y: Vector) -> Vector:
+        """Multipliers of the eliminated rows.
 
-    def multipliers(self, step: Vector, y: Vector, shift: float) -> Vector:
-        """Multipliers (m,) of all rows for those of the rows left (k,) and the step of all variables (n,).
-
-        shift : of the Hessian's diagonal.
+        dual (n,) : gradient of the Lagrangian without the equalities; y (l,) : multipliers of those left.
         """
-        d, out = np.append(step, 0.0), np.zeros(self.m + 1)
-        out[self.rows] = y
-        for a, s in zip(self._stages[::-1], self._solved[::-1], strict=True):
-            own, others = d[a.e][..., None], d[a.h][..., None]
-            total = (
-                s.gradient
-                + shift * own
-                + s.hee @ own
-                + s.heh @ others
-                + s.te.swapaxes(1, 2) @ out[a.t][..., None]
-            )
-            out[a.q] = -(s.inverse.swapaxes(1, 2) @ total)[..., 0]
-            out[-1] = 0.0
-        return out[:-1]
+        v, out = np.append(dual, 0.0), np.zeros(self._equations.size + 1)
+        out[self._left] = y
+        own = [self._kernels.pull(stage, v) for stage in self._stages]
+        for stage, values in zip(reversed(self._stages), reversed(own), strict=True):
+            self._kernels.duals(stage, values, out)
+        everything = np.zeros(self.m)
+        everything[self._equations] = out[:-1]
+        return everything[self.eliminated]
 
 
-def _add(to: Vector, where: Sequence[Index], what: Sequence[Stack]) -> None:
-    """Add numbers, places may repeat."""
-    for index, values in zip(where, what, strict=True):
-        if len(index) == 1:  # one system: no place repeats, but for the last one, which holds none
-            to[index] += values
-        elif 8 * index.size < to.size:
-            np.add.at(to, index.ravel(), values.ravel())
-        else:
-            to += np.bincount(index.ravel(), values.ravel(), to.size)
-
-
-def _numbered(pattern: Any) -> Matrix:
-    """A pattern in csr, whose values are their places counted from 1, so that 0 is none."""
-    out = sp.csr_array(pattern, dtype=np.int64)
-    out.data[:] = np.arange(1, out.nnz + 1)
+# ---------------------------------------------------------------- patterns
+def _fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> list[list[_Touched]]:
+    """Mark what becomes nonzero on the way, and find what each system touches."""
+    row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
+    out = []
+    for q_all, e_all in eliminations:
+        row_left[q_all.ravel()] = False
+        column_left[e_all.ravel()] = False
+        found, touched = [], np.zeros(touches.shape[0], dtype=np.intp)
+        for q, e in zip(q_all, e_all, strict=True):
+            t = np.flatnonzero(touches[:, e].any(axis=1) & row_left)
+            c = np.flatnonzero(touches[q].any(axis=0) & column_left)
+            coupled = couples[e].any(axis=0)
+            u = np.concatenate([c, np.setdiff1d(np.flatnonzero(coupled & column_left), c)])
+            if np.isin(np.setdiff1d(e_all, e), np.flatnonzero(coupled)).any():
+                raise ValueError("the Hessian couples variables of two systems of one elimination")
+            touched[t] += 1
+            touches[np.ix_(t, c)] = touches[np.ix_(t, e)] = True
+            touches[np.ix_(q, e)] = couples[np.ix_(e, e)] = True
+            couples[np.ix_(c, u)] = couples[np.ix_(u, c)] = True
+            found.append(_Touched(q, e, t, c, u))
+        if (touched > 1).any():
+            raise ValueError(f"row {int(np.argmax(touched > 1))} touches two systems of one elimination")
+        out.append(found)
     return out
 
 
-def _stage(elimination: Elimination, systems: list[tuple[Any, ...]], rows: Matrix, couples: Matrix) -> _Stage:
-    """rows, couples : the filled patterns of Jacobian and Hessian, as of `_numbered`."""
-    (m, n), (k, r) = rows.shape, elimination.rows.shape
-    nt, nc, nh = (max(len(s[i]) for s in systems) for i in (2, 3, 4))
-    none, nothing = rows.nnz, couples.nnz
-    full = np.full
-    a = _Stage(
-        q=elimination.rows, e=elimination.variables, t=full((k, nt), m), c=full((k, nc), n), h=full((k, nh),
-        n), qe=full((k, r, r), none), qc=full((k, r, nc), none), te=full((k, nt, r), none), tc=full((k, nt,
-        nc), none), hee=full((k, r, r), nothing), heh=full((k, r, nh), nothing), hcc=full((k, nc, nc),
-        nothing), hch=full((k, nc, nh), nothing), hhc=full((k, nh, nc), nothing),
-    )  # fmt: skip
-    for i, (q, e, t, c, h) in enumerate(systems):
-        a.t[i, : t.size], a.c[i, : c.size], a.h[i, : h.size] = t, c, h
-        of_q, of_t = rows[q], rows[t]
-        a.qe[i], a.qc[i, :, : c.size] = _block(of_q, e, none), _block(of_q, c, none)
-        a.te[i, : t.size], a.tc[i, : t.size, : c.size] = _block(of_t, e, none), _block(of_t, c, none)
-        of_e, of_c = couples[e], couples[c]
-        a.hee[i], a.heh[i, :, : h.size] = _block(of_e, e, nothing), _block(of_e, h, nothing)
-        a.hcc[i, : c.size, : c.size] = _block(of_c, c, nothing)
-        a.hch[i, : c.size, : h.size] = _block(of_c, h, nothing)
-        a.hhc[i, : h.size, : c.size] = _block(couples[h], c, nothing)
-    return a
+def _by_pattern(jacobian: Matrix, rows: Index) -> list[tuple[Index, Index, Places]]:
+    """Columns, rows that touch just them, and where their values (rows, columns) stand in the data, csc."""
+    numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
+    by_rows = numbered.tocsr()
+    by_rows.sort_indices()
+    found: dict[bytes, list[tuple[int, Places]]] = {}
+    for i in rows:
+        part = slice(by_rows.indptr[i], by_rows.indptr[i + 1])
+        columns = by_rows.indices[part].astype(np.intp)
+        if columns.size:
+            found.setdefault(columns.tobytes(), []).append((i, by_rows.data[part].astype(np.int32)))
+    return [
+        (np.frombuffer(key, dtype=np.intp), np.array([i for i, _ in same]), np.array([at for _, at in same]))
+        for key, same in found.items()
+    ]
 
 
-def _block(rows: Matrix, columns: Index, none: int) -> Index:
-    """Places of a dense block's entries, `none` where the pattern has none."""
-    place = rows[:, columns].toarray() - 1
-    return np.where(place < 0, none, place)
+def _numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
+    """Places of the entries (i, j), counted from 0, in a matrix; the others have the number of all."""
+    out = np.full(shape, i.size, dtype=np.int32)
+    out[i, j] = np.arange(i.size)
+    return out, i.size
 
 
-def _places(pattern: Matrix, rows: Index, columns: Index) -> Index:
-    """Places of the entries (rows, columns)."""
-    key = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr)) * pattern.shape[1] + pattern.indices
-    return np.searchsorted(key, rows.astype(np.int64) * pattern.shape[1] + columns)
+def _products(pairs: Places, columns: Index, rows: Index, values: Places) -> Products:
+    i, j = np.tril_indices(columns.size)
+    return Products(rows=rows.astype(np.int32), values=values, to=pairs[columns[i], columns[j]])
 
 
-def _submatrix(pattern: Matrix, rows: Index, columns: Index) -> tuple[Index, Index, Index]:
-    """Of a submatrix in csr: places of its values, column indices and row starts."""
-    part = pattern[rows][:, columns].sorted_indices()
-    return part.data - 1, part.indices.astype(np.int32), part.indptr.astype(np.int32)
+def _stage(systems: list[_Touched], rows: Places, none: int, pairs: Places, nothing: int) -> Stage:
+    """rows, pairs : places of the entries of equalities and W, as of `_numbered`."""
+    (m, n), k, r = rows.shape, len(systems), systems[0].q.size
+    nt, nc = max(s.t.size for s in systems), max(s.c.size for s in systems)
+    nu = nc + max(s.u.size - s.c.size for s in systems)
+
+    def places(*shape: int, fill: int) -> Places:
+        return np.full((k, *shape), fill, dtype=np.int32)
+
+    q, e, t, u = places(r, fill=m), places(r, fill=n), places(nt, fill=m), places(nu, fill=n)
+    qe, qc, te, tc = (places(*s, fill=none) for s in ((r, r), (nc, r), (nt, r), (nt, nc)))
+    hee, heu, hcu = (places(*s, fill=nothing) for s in ((r, r), (nu, r), (nc, nu)))
+    for i, s in enumerate(systems):
+        c, own_t = slice(s.c.size), slice(s.t.size)
+        at = np.concatenate([np.arange(s.c.size), nc + np.arange(s.u.size - s.c.size)])
+        q[i], e[i], u[i, at], t[i, own_t] = s.q, s.e, s.u, s.t
+        qe[i], qc[i, c] = rows[np.ix_(s.q, s.e)].T, rows[np.ix_(s.q, s.c)].T
+        te[i, own_t], tc[i, own_t, c] = rows[np.ix_(s.t, s.e)], rows[np.ix_(s.t, s.c)]
+        hee[i], heu[i, at] = pairs[np.ix_(s.e, s.e)], pairs[np.ix_(s.u, s.e)]
+        hcu[i][np.ix_(np.arange(s.c.size), at)] = pairs[np.ix_(s.c, s.u)]
+    return Stage(q=q, e=e, t=t, u=u, qe=qe, qc=qc, te=te, tc=tc, hee=hee, heu=heu, hcu=hcu)

@@ -28,11 +28,11 @@ from impactopt.program import (
     stationarity,
 )
 from impactopt.sqp.barrier import Bounded
+from impactopt.sqp.compiled import kernels
 from impactopt.sqp.condense import Condenser, Determined, find_eliminations
 from impactopt.sqp.elastic import Elastic
 from impactopt.sqp.linesearch import Filter, Progress
 from impactopt.sqp.newton import NewtonSystem
-from impactopt.sqp.normal import NormalMatrix
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point, TimedProgram
 from impactopt.sqp.report import Report
@@ -50,12 +50,13 @@ _CHANGES = 12  # of what is aimed at, at most
 
 @dataclass
 class _Step:
-    """A Newton step: of all variables, the free ones and the slacks; the rows' new multipliers."""
+    """A Newton step: of all variables, the free ones, the slacks; new multipliers of rows left and gone."""
 
     d: Vector
     free: Vector
     slack: Vector
     y: Vector
+    gone: Vector
 
 
 class InteriorRun:
@@ -90,11 +91,14 @@ class InteriorRun:
         x = point.x
         moves = p.x_upper - p.x_lower > 1e-12
         bounded = (np.isfinite(p.x_lower) | np.isfinite(p.x_upper)) & moves
+        algebra = kernels()
         self._condenser = c = Condenser(
             point.jacobian,
             p.hessian(x, 1.0, np.zeros(p.m)),
             find_eliminations(point.jacobian, p.g_lower == p.g_upper, self._determined),
+            p.g_lower == p.g_upper,
             bounded,
+            algebra,
         )
         lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])
         upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
@@ -124,7 +128,7 @@ class InteriorRun:
         if not self._warm:
             for values in (self._x, self._s):
                 values.below, values.above = np.sign(values.below), np.sign(values.above)
-        self._newton: NewtonSystem | None = None
+        self._newton = NewtonSystem(c, self._held, self._sequence, algebra)
         self._elastic: Elastic | None = None
         self._filter: Filter | None = None
 
@@ -232,8 +236,8 @@ class InteriorRun:
         self._filter.remember(at, length, trial.phi)
         self._move(step, trial, length)
         words = [f"barrier {self._mu:.0e}, step {length:.2g}"]
-        if self._shift:
-            words.append(f"shift {self._shift:.0e}")
+        if self._newton.shift:
+            words.append(f"shift {self._newton.shift:.0e}")
         if corrections:
             words.append(f"{corrections} corrections")
         if self._elastic is not None:
@@ -248,9 +252,8 @@ class InteriorRun:
         if self._elastic is not None:
             part = dual = min(dual, self._elastic.longest_dual(step.y, self._y, keep))
             self._elastic.take(length, self._residual(trial.point, trial.slack)[self._condenser.rows])
-        gone = self._condenser.multipliers(step.d, step.y, self._shift)[self._condenser.eliminated]
         self._y = self._y + part * (step.y - self._y)
-        self._gone_y = self._gone_y + part * (gone - self._gone_y)
+        self._gone_y = self._gone_y + part * (step.gone - self._gone_y)
         x.move(trial.point.x[self._condenser.free], x.below + dual * below_x, x.above + dual * above_x, mu)
         s.move(trial.slack, s.below + dual * below_s, s.above + dual * above_s, mu)
         self.point = trial.point
@@ -266,21 +269,12 @@ class InteriorRun:
         return out
 
     def _step(self, residual: Vector) -> _Step | None:
-        point, c = self.point, self._condenser
+        point = self.point
         hessian = self.program.hessian(point.x, self._sigma, self.y)
-        try:
-            system = c.condense(point.jacobian, hessian, self._sigma * point.gradient, residual)
-        except np.linalg.LinAlgError:
-            return None
-        if self._newton is None:
-            sequence = None if self._sequence is None else self._sequence[c.free]
-            matrix = NormalMatrix(system.P, system.A, c.owner, sequence)
-            self._newton = NewtonSystem(matrix, self._held)
-        equal = self._equal if self._elastic is None else self._equal[:0]
-        found = self._newton.factor(system, self._weights, self._x.stiffness(), equal, c.identity)
-        if not found:
-            return None
-        return self._solve(system.q, system.r)
+        found = self._newton.factor(
+            point.jacobian, hessian, self._x.stiffness(), self._weights, hard=self._elastic is None
+        )
+        return self._solve(residual) if found else None
 
     def _weights(self, shift: float) -> Vector:
         """Of the rows (k,), and their offsets: of the slacks' barrier, shifted too, and of elastic rows."""
@@ -293,24 +287,20 @@ class InteriorRun:
             soft, self._offsets = soft + give, self._offsets + offset
         return np.divide(1.0, soft, out=np.zeros_like(soft), where=soft > 0.0)
 
-    def _solve(self, q: Vector, r: Vector) -> _Step:
-        """The step for a gradient and a residual of the condensed system; its matrix stays."""
-        assert self._newton is not None
+    def _solve(self, residual: Vector) -> _Step:
+        """The step for the rows' residual (m,); the matrix stays."""
+        c = self._condenser
+        q, r = self._sigma * self.point.gradient, residual.copy()
+        q[c.free] += self._x.slope(self._mu)
         if self._elastic is not None:
-            r = self._elastic.residual(r)
-        c, q = self._condenser, q + self._x.slope(self._mu)
-        if self._shift:
-            q = q + self._shift * c.pull(c.expand(np.zeros(c.free.size)))
-        free, y = self._newton.solve(q, r, self._offsets)
+            r[c.rows] = self._elastic.residual(r[c.rows])
+        r[c.rows] += self._offsets
+        d, everything = self._newton.solve(q, r)
+        y = everything[c.rows]
         slack = (y[self._unequal] - self._s.slope(self._mu)) / self._stiffness
         if self._elastic is not None:
             self._elastic.step(y, self._y, self._mu)
-        return _Step(c.expand(free), free, slack, y)
-
-    @property
-    def _shift(self) -> float:
-        """Of the Hessian's diagonal, in the last system."""
-        return 0.0 if self._newton is None else self._newton.shift
+        return _Step(d, d[c.free], slack, y, everything[c.eliminated])
 
     # ------------------------------------------------------------------ the line search
     @property
@@ -374,15 +364,13 @@ class InteriorRun:
             if not trial.point.finite:
                 break
             left = longest * left + self._residual(trial.point, trial.slack)
-            r, q = self._condenser.with_residual(left)
-            step = self._solve(q, r)
+            step = self._solve(left)
             trial = self._trial(step, self._longest(step))
             if self._accepts(at, longest, trial):
                 return (step, trial), k + 1
             if trial.theta > _WORSE * theta:
                 break
             theta = trial.theta
-        self._condenser.with_residual(residual)
         return None, 0
 
     def _give_way(self, residual: Vector) -> str | Status:

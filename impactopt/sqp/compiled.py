@@ -1,0 +1,203 @@
+"""The small dense algebra of condensed Newton systems, in C."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable, Sequence
+from importlib.resources import files
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cython_blas, cython_lapack
+
+from impactopt.codegen import compiled_library
+from impactopt.program import Vector
+from impactopt.sqp.kernels import Kernels, Panels, Places, Products, Stack, Stage
+
+_ROUTINES = (
+    (cython_blas, "dgemm"),
+    (cython_blas, "dgemv"),
+    (cython_blas, "dsyrk"),
+    (cython_blas, "dtrsm"),
+    (cython_lapack, "dgetrf"),
+    (cython_lapack, "dgetrs"),
+    (cython_lapack, "dpotrf"),
+)
+
+
+def kernels() -> Kernels:
+    """In C where there is a compiler, or else in NumPy."""
+    library = _library()
+    return Kernels() if library is None else CompiledKernels(library)
+
+
+@functools.cache
+def _library() -> Any:
+    source = files(f"{__package__}.native").joinpath("newton.c").read_text(encoding="utf-8")
+    path = compiled_library("newton", source)
+    if path is None:
+        return None
+    library = ctypes.CDLL(str(path))
+    pointers = (ctypes.c_void_p * len(_ROUTINES))(*[_pointer(*routine) for routine in _ROUTINES])
+    library.newton_setup(pointers)
+    return library
+
+
+def _pointer(module: Any, name: str) -> int:
+    """The address of one of SciPy's BLAS and LAPACK routines, which come in capsules for Cython's sake."""
+    api, capsule = ctypes.pythonapi, module.__pyx_capi__[name]
+    api.PyCapsule_GetName.restype, api.PyCapsule_GetName.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    api.PyCapsule_GetPointer.restype = ctypes.c_void_p
+    api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
+    return int(api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule)))
+
+
+_OF_STAGES = [
+    "q",
+    "e",
+    "t",
+    "u",
+    "qe",
+    "qc",
+    "te",
+    "tc",
+    "hee",
+    "heu",
+    "hcu",
+    "lu",
+    "pivots",
+    "X",
+    "T",
+    "H",
+    "G",
+    "x0",
+]
+_OF_PANELS = ("size", "height", "first", "below", "row_at", "start", "at")
+
+
+class _Stage(ctypes.Structure):
+    _fields_ = (
+        *[(name, ctypes.c_int64) for name in ("k", "r", "nt", "nc", "nu")],
+        *[(name, ctypes.c_void_p) for name in (*_OF_STAGES, "work")],
+    )
+
+
+class _Panels(ctypes.Structure):
+    _fields_ = ("count", ctypes.c_int64), *[(name, ctypes.c_void_p) for name in (*_OF_PANELS, "work")]
+
+
+class CompiledKernels(Kernels):
+    """In C."""
+
+    def __init__(self, library: Any):
+        self._c = library
+        self._made: WeakKeyDictionary[Any, tuple[Any, ...]] = WeakKeyDictionary()
+        self._lists: dict[int, tuple[Any, ...]] = {}
+
+    # ------------------------------------------------------------------ what C needs to know
+    def _of(self, thing: Any, make: Callable[[Any], tuple[Any, ...]]) -> Any:
+        """The structure for a stage or panels, made once; what it points to is kept with it."""
+        if thing not in self._made:
+            self._made[thing] = make(thing)
+        return ctypes.byref(self._made[thing][0])
+
+    @staticmethod
+    def _stage(a: Stage) -> tuple[Any, ...]:
+        k, nt, nc = a.tc.shape
+        r, nu = a.q.shape[1], a.u.shape[1]
+        work = np.zeros(max(nt * nc, r * nu + nc * nu, r + max(nt, nc, nu)) + 1)
+        arrays = [
+            getattr(a, name)
+            for name in [
+                "q",
+                "e",
+                "t",
+                "u",
+                "qe",
+                "qc",
+                "te",
+                "tc",
+                "hee",
+                "heu",
+                "hcu",
+                "lu",
+                "pivots",
+                "X",
+                "T",
+                "H",
+                "G",
+                "x0",
+            ]
+        ]
+        return _Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)]), work
+
+    @staticmethod
+    def _panels(p: Panels) -> tuple[Any, ...]:
+        size = p.size
+        rest = int((p.height - size).max(initial=0))
+        first = np.cumsum([0, *[len(b) for b in p.below]]).astype(np.int32)
+        below = np.concatenate([np.zeros(0, np.int32), *p.below])
+        work = np.zeros(rest * max(rest, p.start[-1]) + 1)
+        keep = size, p.height, first, below, p.row_at, p.start, p.at, work
+        return _Panels(size.size, *[x.ctypes.data for x in keep]), keep
+
+    def _groups(self, products: Sequence[Products]) -> tuple[Any, ...]:
+        key = id(products)
+        if key not in self._lists:
+            empty = [np.zeros(0, np.int32)]
+            parts = (
+                np.array([p.rows.size for p in products], dtype=np.int32),
+                np.array([p.values.shape[1] for p in products], dtype=np.int32),
+                np.concatenate(empty + [p.rows for p in products]),
+                np.concatenate(empty + [p.values.ravel() for p in products]),
+                np.concatenate(empty + [p.to for p in products]),
+            )
+            work = np.zeros(max([p.to.size for p in products], default=0) + 1)
+            self._lists[key] = products, parts, work
+        return self._lists[key]
+
+    # ------------------------------------------------------------------ the operations
+    def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
+        _, parts, work = self._groups(products)
+        groups = ctypes.c_int64(len(products))
+        self._c.newton_products(groups, *map(_at, parts), _at(values), _at(weights), _at(W), _at(work))
+
+    def eliminate(self, a: Stage, J: Vector) -> None:
+        if self._c.newton_eliminate(self._of(a, self._stage), _at(J), _last(J)):
+            raise np.linalg.LinAlgError("rows do not determine their variables")
+
+    def reduce(self, a: Stage, W: Vector) -> None:
+        self._c.newton_reduce(self._of(a, self._stage), _at(W), _last(W))
+
+    def forward(self, a: Stage, g: Vector, off: Vector) -> None:
+        self._c.newton_forward(self._of(a, self._stage), _at(g), _last(g), _at(off), _last(off))
+
+    def expand(self, a: Stage, d: Vector) -> None:
+        self._c.newton_expand(self._of(a, self._stage), _at(d))
+
+    def pull(self, a: Stage, v: Vector) -> Stack:
+        own = np.empty(a.e.shape)
+        self._c.newton_pull(self._of(a, self._stage), _at(v), _last(v), _at(own))
+        return own
+
+    def duals(self, a: Stage, own: Stack, y: Vector) -> None:
+        self._c.newton_duals(self._of(a, self._stage), _at(own), _at(y))
+
+    def factor(self, p: Panels, values: Vector) -> bool:
+        return not self._c.newton_cholesky(self._of(p, self._panels), _at(values))
+
+    def solve(self, p: Panels, values: Vector, x: Stack) -> Stack:
+        shape = (ctypes.c_int64(x.shape[0]), ctypes.c_int64(x.shape[1]))
+        self._c.newton_solve(self._of(p, self._panels), _at(values), _at(x), *shape)
+        return x
+
+
+def _at(array: npt.NDArray[Any] | Places) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _last(array: Vector) -> ctypes.c_int64:
+    return ctypes.c_int64(array.size - 1)

@@ -1,0 +1,1 @@
+"""C for the SQP's linear algebra."""

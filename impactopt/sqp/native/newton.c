@@ -1,0 +1,228 @@
+/* The small dense algebra of condensed Newton systems; kernels.py says what each function is for.
+
+   Matrices lie by columns, as BLAS and LAPACK want them: an array (k, a, b) of NumPy's is k matrices of b rows
+   and a columns. Places that are none point to one number behind the others, which is kept zero. */
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define EXPORT __attribute__((visibility("default")))
+
+typedef void gemm_t(char *, char *, int *, int *, int *, double *, double *, int *, double *, int *, double *,
+                    double *, int *);
+typedef void gemv_t(char *, int *, int *, double *, double *, int *, double *, int *, double *, double *, int *);
+typedef void syrk_t(char *, char *, int *, int *, double *, double *, int *, double *, double *, int *);
+typedef void trsm_t(char *, char *, char *, char *, int *, int *, double *, double *, int *, double *, int *);
+typedef void getrf_t(int *, int *, double *, int *, int *, int *);
+typedef void getrs_t(char *, int *, int *, double *, int *, int *, double *, int *, int *);
+typedef void potrf_t(char *, int *, double *, int *, int *);
+
+static gemm_t *gemm;
+static gemv_t *gemv;
+static syrk_t *syrk;
+static trsm_t *trsm;
+static getrf_t *getrf;
+static getrs_t *getrs;
+static potrf_t *potrf;
+static double one = 1.0, minus = -1.0, zero = 0.0, half = 0.5;
+static int unit = 1;
+
+EXPORT void newton_setup(void **f) {
+    gemm = (gemm_t *)f[0], gemv = (gemv_t *)f[1], syrk = (syrk_t *)f[2], trsm = (trsm_t *)f[3];
+    getrf = (getrf_t *)f[4], getrs = (getrs_t *)f[5], potrf = (potrf_t *)f[6];
+}
+
+/* One stage: k systems of r rows, nt other rows, nc and nu variables touched. */
+typedef struct {
+    int64_t k, r, nt, nc, nu;
+    int32_t *q, *e, *t, *u, *qe, *qc, *te, *tc, *hee, *heu, *hcu;
+    double *lu;
+    int32_t *pivots;
+    double *X, *T, *H, *G, *x0, *work;
+} stage;
+
+static void take(const double *from, const int32_t *at, int64_t count, double *to) {
+    for (int64_t i = 0; i < count; ++i) to[i] = from[at[i]];
+}
+
+/* ---------------------------------------------------------------- matrices */
+/* Rows of groups, one after the other: g rows over p columns; W's places of the products of two. */
+EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, const int32_t *rows,
+                            const int32_t *values, const int32_t *to, const double *J, const double *weights,
+                            double *W, double *work) {
+    for (int64_t k = 0; k < groups; ++k) {
+        int m = p[k];
+        memset(work, 0, sizeof(double) * m * (m + 1) / 2);
+        for (int row = 0; row < g[k]; ++row, values += m) {
+            double w = weights[*rows++], *out = work;
+            if (w == 0.0) continue;
+            double v[m];
+            take(J, values, m, v);
+            for (int i = 0; i < m; ++i) {
+                double s = w * v[i];
+                for (int j = 0; j <= i; ++j) *out++ += s * v[j];
+            }
+        }
+        for (int i = 0; i < m * (m + 1) / 2; ++i) W[*to++] += work[i];
+    }
+}
+
+EXPORT int newton_eliminate(stage *a, double *J, int64_t none) {
+    int r = a->r, nc = a->nc, nt = a->nt, info;
+    for (int64_t k = 0; k < a->k; ++k) {
+        double *lu = a->lu + k * r * r, *X = a->X + k * nc * r, *T = a->T + k * nt * r;
+        int32_t *pivots = a->pivots + k * r;
+        take(J, a->qe + k * r * r, r * r, lu);
+        take(J, a->qc + k * nc * r, nc * r, X);
+        take(J, a->te + k * nt * r, nt * r, T);
+        getrf(&r, &r, lu, &r, pivots, &info);
+        if (info) return info;
+        if (nc) getrs("N", &r, &nc, lu, &r, pivots, X, &r, &info);
+        if (!nt || !nc) continue;
+        gemm("T", "N", &nc, &nt, &r, &one, X, &r, T, &r, &zero, a->work, &nc);
+        const int32_t *to = a->tc + k * nt * nc;
+        for (int64_t i = 0; i < nt * nc; ++i) J[to[i]] -= a->work[i];
+        J[none] = 0.0;
+    }
+    return 0;
+}
+
+EXPORT void newton_reduce(stage *a, double *W, int64_t none) {
+    int r = a->r, nc = a->nc, nu = a->nu;
+    double *G = a->work, *C = G + r * nu;
+    for (int64_t k = 0; k < a->k; ++k) {
+        double *X = a->X + k * nc * r, *H = a->H + k * r * r, *own = a->G + k * nu * r;
+        take(W, a->hee + k * r * r, r * r, H);
+        take(W, a->heu + k * nu * r, nu * r, own);
+        for (int64_t i = 0; i < nu * r; ++i) G[i] = -own[i];
+        if (!nc) continue;
+        gemm("N", "N", &r, &nc, &r, &half, H, &r, X, &r, &one, G, &r);
+        gemm("T", "N", &nu, &nc, &r, &one, G, &r, X, &r, &zero, C, &nu);
+        for (int i = 0; i < nc; ++i) C[i * nu + i] *= 2.0;
+        const int32_t *to = a->hcu + k * nc * nu;
+        for (int64_t i = 0; i < nc * nu; ++i) W[to[i]] += C[i];
+        W[none] = 0.0;
+    }
+}
+
+/* ---------------------------------------------------------------- vectors */
+/* to[at] -= M' v for a matrix of r rows and n columns */
+static void pull(int r, int n, double *M, double *v, double *to, const int32_t *at, double *work) {
+    if (!n) return;
+    gemv("T", &r, &n, &one, M, &r, v, &unit, &zero, work, &unit);
+    for (int i = 0; i < n; ++i) to[at[i]] -= work[i];
+}
+
+EXPORT void newton_forward(stage *a, double *g, int64_t n, double *off, int64_t m) {
+    int r = a->r, nc = a->nc, nt = a->nt, nu = a->nu, info;
+    double *own = a->work, *work = own + r;
+    for (int64_t k = 0; k < a->k; ++k) {
+        double *x0 = a->x0 + k * r, *X = a->X + k * nc * r;
+        const int32_t *u = a->u + k * nu;
+        take(off, a->q + k * r, r, x0);
+        getrs("N", &r, &unit, a->lu + k * r * r, &r, a->pivots + k * r, x0, &r, &info);
+        pull(r, nt, a->T + k * nt * r, x0, off, a->t + k * nt, work);
+        take(g, a->e + k * r, r, own);
+        gemv("N", &r, &r, &minus, a->H + k * r * r, &r, x0, &unit, &one, own, &unit);
+        pull(r, nc, X, own, g, u, work);
+        pull(r, nu, a->G + k * nu * r, x0, g, u, work);
+        g[n] = off[m] = 0.0;
+    }
+}
+
+EXPORT void newton_expand(stage *a, double *d) {
+    int r = a->r, nc = a->nc;
+    double *own = a->work, *others = own + r;
+    for (int64_t k = 0; k < a->k; ++k) {
+        memcpy(own, a->x0 + k * r, sizeof(double) * r);
+        take(d, a->u + k * a->nu, nc, others);
+        if (nc) gemv("N", &r, &nc, &one, a->X + k * nc * r, &r, others, &unit, &one, own, &unit);
+        for (int i = 0; i < r; ++i) d[a->e[k * r + i]] = -own[i];
+    }
+}
+
+EXPORT void newton_pull(stage *a, double *v, int64_t n, double *own) {
+    int r = a->r, nc = a->nc;
+    for (int64_t k = 0; k < a->k; ++k, own += r) {
+        take(v, a->e + k * r, r, own);
+        pull(r, nc, a->X + k * nc * r, own, v, a->u + k * a->nu, a->work);
+        v[n] = 0.0;
+    }
+}
+
+EXPORT void newton_duals(stage *a, const double *own, double *y) {
+    int r = a->r, nt = a->nt, info;
+    double *sum = a->work, *others = sum + r;
+    for (int64_t k = 0; k < a->k; ++k) {
+        memcpy(sum, own + k * r, sizeof(double) * r);
+        take(y, a->t + k * nt, nt, others);
+        if (nt) gemv("N", &r, &nt, &one, a->T + k * nt * r, &r, others, &unit, &one, sum, &unit);
+        getrs("T", &r, &unit, a->lu + k * r * r, &r, a->pivots + k * r, sum, &r, &info);
+        for (int i = 0; i < r; ++i) y[a->q[k * r + i]] = -sum[i];
+    }
+}
+
+/* ---------------------------------------------------------------- the factor of what is left */
+/* Panels of a block Cholesky factor: `size` of each block, its `height`, where its panel begins in the values
+   (`at`); `below` lists the blocks of rows under the diagonal of each, from `first` on; row_at (count, count):
+   at which row of a panel a block begins. */
+typedef struct {
+    int64_t count;
+    const int32_t *size, *height, *first, *below, *row_at, *start;
+    const int64_t *at;
+    double *work;
+} panels;
+
+EXPORT int newton_cholesky(panels *p, double *values) {
+    int info;
+    for (int64_t k = 0; k < p->count; ++k) {
+        int own = p->size[k], h = p->height[k], rest = h - own;
+        double *panel = values + p->at[k], *under = panel + own;
+        potrf("L", &own, panel, &h, &info);
+        if (info) return info;
+        if (!rest) continue;
+        trsm("R", "L", "T", "N", &rest, &own, &one, panel, &h, under, &h);
+        syrk("L", "N", &rest, &own, &one, under, &h, &zero, p->work, &rest);
+        int32_t from = p->first[k], to = p->first[k + 1];
+        for (int32_t j = from; j < to; ++j) {
+            int column = p->below[j], left = p->row_at[column * p->count + k] - own;
+            for (int32_t i = j; i < to; ++i) {
+                int row = p->below[i], top = p->row_at[row * p->count + k] - own;
+                double *target = values + p->at[column] + p->row_at[row * p->count + column];
+                const double *source = p->work + (int64_t)left * rest + top;
+                for (int c = 0; c < p->size[column]; ++c)
+                    for (int l = 0; l < p->size[row]; ++l)
+                        target[(int64_t)c * p->height[column] + l] -= source[(int64_t)c * rest + l];
+            }
+        }
+    }
+    return 0;
+}
+
+/* x (n, columns), by columns, becomes K^-1 x; work: height x columns */
+EXPORT void newton_solve(panels *p, double *values, double *x, int64_t n, int64_t columns) {
+    int nx = n, nrhs = columns;
+    for (int64_t k = 0; k < p->count; ++k) {
+        int own = p->size[k], h = p->height[k], rest = h - own;
+        double *panel = values + p->at[k], *mine = x + p->start[k];
+        trsm("L", "L", "N", "N", &own, &nrhs, &one, panel, &h, mine, &nx);
+        if (!rest) continue;
+        gemm("N", "N", &rest, &nrhs, &own, &one, panel + own, &h, mine, &nx, &zero, p->work, &rest);
+        for (int32_t i = p->first[k], top = 0; i < p->first[k + 1]; top += p->size[p->below[i++]])
+            for (int c = 0; c < nrhs; ++c)
+                for (int l = 0; l < p->size[p->below[i]]; ++l)
+                    x[c * n + p->start[p->below[i]] + l] -= p->work[(int64_t)c * rest + top + l];
+    }
+    for (int64_t k = p->count - 1; k >= 0; --k) {
+        int own = p->size[k], h = p->height[k], rest = h - own;
+        double *panel = values + p->at[k], *mine = x + p->start[k];
+        if (rest) {
+            for (int32_t i = p->first[k], top = 0; i < p->first[k + 1]; top += p->size[p->below[i++]])
+                for (int c = 0; c < nrhs; ++c)
+                    for (int l = 0; l < p->size[p->below[i]]; ++l)
+                        p->work[(int64_t)c * rest + top + l] = x[c * n + p->start[p->below[i]] + l];
+            gemm("T", "N", &own, &nrhs, &rest, &minus, panel + own, &h, p->work, &rest, &one, mine, &nx);
+        }
+        trsm("L", "L", "T", "N", &own, &nrhs, &one, panel, &h, mine, &nx);
+    }
+}

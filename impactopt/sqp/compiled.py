@@ -55,26 +55,10 @@ def _pointer(module: Any, name: str) -> int:
     return int(api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule)))
 
 
-_OF_STAGES = [
-    "q",
-    "e",
-    "t",
-    "u",
-    "qe",
-    "qc",
-    "te",
-    "tc",
-    "hee",
-    "heu",
-    "hcu",
-    "lu",
-    "pivots",
-    "X",
-    "T",
-    "H",
-    "G",
-    "x0",
-]
+_OF_STAGES = (
+    *("q", "e", "t", "u", "qe", "qc", "te", "tc", "hee", "heu", "hcu"),
+    *("lu", "pivots", "X", "T", "H", "G", "x0"),
+)
 _OF_PANELS = ("size", "height", "first", "below", "row_at", "start", "at")
 
 

@@ -11,10 +11,11 @@ from impactopt.sqp.cholesky import BlockCholesky
 from impactopt.sqp.condense import Condenser
 from impactopt.sqp.kernels import Index, Kernels
 
-_PENALTY = 1e9  # weight of the equalities that are left, in the matrix: it changes no step
+_PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
 _HELD = 1e15  # on the diagonal of variables that must not move
 _REFINEMENTS = 1  # weights of ten decades cost digits
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
+_RELATIVE = 0.1  # the first shift is at most this part of the Hessian's largest entry
 _GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0
 
 
@@ -70,6 +71,7 @@ class NewtonSystem:
         self._jacobian, self._hessian, self._hard = jacobian, hessian, hard
         self._transposed = jacobian.T
         self._A = c.A
+        penalty = self._penalty()
         everywhere = np.zeros(c.n)
         everywhere[c.free] = diagonal
         self.shift = 0.0
@@ -78,7 +80,7 @@ class NewtonSystem:
             self._weights = np.zeros(c.m)
             self._weights[c.rows] = weights(self.shift)
             if hard:
-                self._weights[c.rows[c.equal]] = _PENALTY
+                self._weights[c.rows[c.equal]] = penalty
             if self._matrix.factor(self._values()):
                 break
             self.shift = self._next()
@@ -90,10 +92,20 @@ class NewtonSystem:
             self._schur = self._A @ self._spread
         return True
 
+    def _penalty(self) -> Vector:
+        """Weights of the equalities left: far above the curvature along them, and no farther."""
+        squares = self._A.multiply(self._A)
+        length = np.maximum(1e-30, squares.sum(axis=1))
+        curvature = squares @ np.abs(self._hessian.diagonal()[self._condenser.free]) / length
+        out: Vector = _PENALTY * np.maximum(1.0, curvature) / np.maximum(1.0, length)
+        return out
+
     def _next(self) -> float:
         """The shift to try where this one was not enough."""
         if not self.shift:
-            return max(_LEAST, self._last / _SHRINK) if self._last else _FIRST
+            # what a far more curved Hessian needed is no guide here
+            most = _RELATIVE * float(np.abs(self._hessian.data).max(initial=1.0))
+            return min(most, max(_LEAST, self._last / _SHRINK)) if self._last else _FIRST
         return self.shift * (_GROW if self._last else _GROW_FIRST)
 
     def _values(self) -> Vector:

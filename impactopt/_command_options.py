@@ -10,8 +10,37 @@ from typing import Annotated
 import typer
 
 NOT_SOLVED = 1  # exit code
+
+
+def complete_problem(incomplete: str) -> list[str]:
+    """Names of problems, and files, that begin like this: for the shell, which waits for it."""
+    from impactopt._folders import FOLDERS
+
+    folder = next((folder for folder in FOLDERS if folder.is_dir()), None)
+    names = [] if folder is None else sorted(path.stem for path in folder.glob("*.toml"))
+    typed = Path(incomplete)
+    inside = typed if incomplete.endswith("/") else typed.parent
+    beside = sorted(inside.iterdir()) if inside.is_dir() else []
+    files = [f"{path}/" if path.is_dir() else str(path) for path in beside]
+    fit = [file for file in files if file.endswith((".toml", "/"))]
+    return [name for name in (*names, *fit) if name.startswith(incomplete)]
+
+
 ProblemPath = Annotated[
-    Path, typer.Argument(metavar="PROBLEM", help="Its name, as `impactopt problems` lists them, or its file.")
+    Path,
+    typer.Argument(
+        metavar="PROBLEM",
+        help="Its name, as `impactopt problems` lists them, or its file.",
+        autocompletion=complete_problem,
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Another value for a key of the problem file, as target.mass=8; may be repeated.",
+    ),
 ]
 
 
@@ -30,6 +59,20 @@ Starts = Annotated[
 Seed = Annotated[int, typer.Option(min=0, help="Of the starts that are drawn.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="A line for every iteration, and the traceback of an error.")
+]
+
+
+def check_loudness(quiet: bool, verbose: bool) -> None:
+    """BadParameter if both are asked for."""
+    if quiet and verbose:
+        raise typer.BadParameter("give one of them", param_hint="--quiet, --verbose")
+
+
+def examples(*lines: str) -> str:
+    """Examples as the end of a command's help."""
+    return "\n\n".join(["Examples:", *(f"  {line}" for line in lines)])
 
 
 def check_time_limit(seconds: float | None) -> None:

@@ -8,34 +8,43 @@ from typing import Annotated
 
 import typer
 
+from impactopt._command_options import (
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Settings,
+    Verbose,
+    check_loudness,
+)
 from impactopt.plain_errors import plain_errors
 
 NOT_IN = 1  # exit code
 
 
 def drive(
-    problem: Annotated[
-        str, typer.Argument(metavar="PROBLEM", help="Name or file of a problem with a nail, such as arm7.")
-    ],
+    problem: ProblemPath,
     depth: Annotated[float, typer.Option(metavar="M", help="How deep the nail is to go.")] = 0.05,
     most: Annotated[int, typer.Option(metavar="N", help="Blows at most.", min=1)] = 20,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write blows.json there.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON, no table.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
-    """Plan blow after blow on a nail, each where the one before has left it, until it is in.
+    """Plan blow after blow on a nail, each where the one before has left it, until it is in, as in arm7.
 
     Exit code: 0 it is in, 1 it is not, 2 bad input.
     """
-    with plain_errors("interrupted before the nail was in") as console:
+    with plain_errors("interrupted before the nail was in", verbose=verbose) as console:
         from impactopt.blows import drive_nail
         from impactopt.output import make_directory, plain, write_file
-        from impactopt.problem_file import read_problem_file
+        from impactopt.problem_file import parse_settings, read_problem_file
         from impactopt.screen import Progress, blows_table
 
-        read = read_problem_file(problem)
+        check_loudness(quiet, verbose)
+        read = read_problem_file(problem, parse_settings(settings or ()))
         directory = None if out is None else make_directory(out)
         with Progress(console, quiet=quiet) as progress:
             series = drive_nail(

@@ -14,9 +14,12 @@ from impactopt._command_options import (
     ProblemPath,
     Quiet,
     Seed,
+    Settings,
     SolverName,
     Starts,
     TimeLimit,
+    Verbose,
+    check_loudness,
     check_time_limit,
     command_line,
 )
@@ -34,23 +37,26 @@ def strike(
     seed: Seed = 0,
     solver: SolverName = None,
     time_limit: TimeLimit = None,
+    settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Find the posture and velocity at contact that hit hardest, with no motion that leads to them.
 
     From several starts, as local optima differ much. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    with plain_errors("interrupted before there was a strike to keep") as console:
+    with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
         from impactopt.output import make_directory, record_of_strike, save_record
-        from impactopt.problem_file import read_problem_file
+        from impactopt.problem_file import parse_settings, read_problem_file
         from impactopt.screen import Progress
         from impactopt.strike import optimize_strike
 
         check_time_limit(time_limit)
-        read = read_problem_file(file)
+        check_loudness(quiet, verbose)
+        read = read_problem_file(file, parse_settings(settings or ()))
         chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
-        with Progress(console, quiet=quiet) as progress:
+        with Progress(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = None if out is None else make_directory(out)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from impactopt._command_options import AsJson, Quiet, Settings, Verbose, check_loudness
 from impactopt.plain_errors import plain_errors
 
 FELL = 1  # exit code
@@ -33,7 +34,10 @@ def validate(
     animation: Annotated[
         Path | None, typer.Option(metavar="FILE.gif", help="Draw the robot's motion, slow around contact.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON, no table.")] = False,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
     problem: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one kept in RESULT.")
     ] = None,
@@ -61,10 +65,14 @@ def validate(
 
     Exit code: 0 stands (or the engine holds the soles), 1 fell, 2 bad input.
     """
-    with plain_errors("interrupted before the replay was done"):
+    with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
         from impactopt.output import make_directory, write_file
+        from impactopt.problem_file import parse_settings
         from impactopt.replay import load_planned, replay
+        from impactopt.screen import Progress
         from impactopt.validation import Conditions
+
+        check_loudness(quiet, verbose)
 
         world = Conditions(
             mass=mass,
@@ -85,20 +93,23 @@ def validate(
         if animation is not None:
             make_directory(animation.parent)
         options = {name: value for name, value in (("step", step), ("settle", settle)) if value is not None}
-        planned = load_planned(result, problem_file=problem)
-        done = replay(planned, engine=engine.value, conditions=world, **options)
-        written = []
-        if directory is not None:
-            from impactopt.plotting import save_pictures
+        changes, written = parse_settings(settings or ()), []
+        with Progress(stderr, quiet=quiet, verbose=verbose) as progress:
+            planned = load_planned(result, problem_file=problem, settings=changes)
+            progress.say(f"{result} is read; replaying it in {engine.value}")
+            done = replay(planned, engine=engine.value, conditions=world, **options)
+            if directory is not None:
+                from impactopt.plotting import save_pictures
 
-            text = f"{json.dumps(done.report, indent=2)}\n".encode()
-            written.append(directory / "replay.json")
-            write_file(written[0], lambda file: file.write(text))
-            written += save_pictures(done.record, directory, ["replay"])
-        if animation is not None:
-            from impactopt.plotting.animation import save_animation
+                text = f"{json.dumps(done.report, indent=2)}\n".encode()
+                written.append(directory / "replay.json")
+                write_file(written[0], lambda file: file.write(text))
+                written += save_pictures(done.record, directory, ["replay"])
+            if animation is not None:
+                progress.say("drawing the motion")
+                from impactopt.plotting.animation import save_animation
 
-            written.append(save_animation(done, animation))
+                written.append(save_animation(done, animation))
         if as_json:
             typer.echo(json.dumps(done.report, indent=2))
         else:

@@ -1,7 +1,8 @@
-"""The command line: `impactopt solve`, `strike`, `check`, `problems`, `robots`, and what it gathers.
+"""The command line: `impactopt solve`, and the commands that it gathers.
 
 What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
-Exit codes: 0 solved, 1 not solved, or fallen in a replay, 2 bad input.
+Exit codes: 0 done; 1 the answer is no: not solved, fallen in a replay, no such collision; 2 bad input; 70 a
+fault of ours; 130 Ctrl-C.
 """
 
 from __future__ import annotations
@@ -13,19 +14,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from impactopt._collide_command import collide
 from impactopt._command_options import (
     NOT_SOLVED,
     AsJson,
     ProblemPath,
     Quiet,
     Seed,
+    Settings,
     SolverName,
     Starts,
     TimeLimit,
+    Verbose,
+    check_loudness,
     check_time_limit,
     command_line,
+    examples,
 )
 from impactopt._drive_command import drive
+from impactopt._file_commands import check, new, problems, robots
 from impactopt._show_command import show
 from impactopt._strike_command import strike
 from impactopt._sweep_command import sweep
@@ -49,8 +56,9 @@ app = typer.Typer(
     name="impactopt",
     help="Impact motions of humanoid robots: planned by the impulse they deliver, checked in full dynamics.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    epilog="Exit codes: 0 done; 1 the answer is no: not solved, fallen, no such collision; 2 bad input; 70 a "
+    "fault of impactopt; 130 Ctrl-C. Each command's own help has examples; docs/command_line.md has more.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -76,7 +84,13 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "impactopt solve punch --out results/punch",
+        "impactopt solve my.toml --set target.mass=8 --set swing.duration=[0.6,0.9]",
+        "impactopt solve punch --start strike --starts 4 --json --quiet",
+    )
+)
 def solve(
     context: typer.Context,
     file: ProblemPath,
@@ -89,8 +103,10 @@ def solve(
     starts: Starts = 1,
     seed: Seed = 0,
     time_limit: TimeLimit = None,
+    settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
     baseline: Annotated[
         bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach in the same limits.")
@@ -100,16 +116,17 @@ def solve(
 
     Ctrl-C stops the solver; its best iterate is kept. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    with plain_errors("interrupted before there was a plan to keep") as console:
+    with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
         from impactopt.output import make_directory
         from impactopt.planner import solve as plan
-        from impactopt.problem_file import read_problem_file
+        from impactopt.problem_file import parse_settings, read_problem_file
         from impactopt.screen import Progress
 
         check_time_limit(time_limit)
-        read = read_problem_file(file)
+        check_loudness(quiet, verbose)
+        read = read_problem_file(file, parse_settings(settings or ()))
         chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
-        with Progress(console, quiet=quiet) as progress:
+        with Progress(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
@@ -135,59 +152,37 @@ def solve(
             raise typer.Exit(NOT_SOLVED)
 
 
-app.command()(strike)
-app.command()(validate)
-app.command()(show)
-app.command()(drive)
-app.command()(sweep)
-app.command()(reproduce)
-
-
-@app.command()
-def check(file: ProblemPath) -> None:
-    """Say whether a problem file is sound and its target within reach. Exit code: 0 sound, 2 not."""
-    with plain_errors("interrupted"):
-        from impactopt.problem_file import load_problem
-
-        problem = load_problem(file)
-        typer.echo(f"{file} is sound:")
-        for name, value in problem.describe().items():
-            typer.echo(f"  {name:<8} {value}")
-
-
-@app.command()
-def problems() -> None:
-    """List the problems that come with the package: `impactopt solve NAME`."""
-    with plain_errors("interrupted"):
-        from impactopt.problem_file.names import problem_names, problem_summary
-
-        names = problem_names()
-        for name in names:
-            typer.echo(f"{name:<{max(map(len, names))}}  {problem_summary(name)}")
-
-
-@app.command()
-def robots() -> None:
-    """List the robots that problem files can name."""
-    with plain_errors("interrupted"):
-        from impactopt.errors import InputError
-        from impactopt.presets import load_robot, robot_names
-
-        for name in robot_names():
-            try:
-                robot = load_robot(name)
-            except InputError as error:
-                typer.echo(f"{name}: {error}")
-                continue
-            mass = sum(float(body.mass) for body in robot.model.inertias)
-            typer.echo(f"{name}: {robot.n} joints, {mass:.0f} kg")
-            for kind, names in (
-                ("strikers", robot.strikers),
-                ("soles", [sole.name for sole in robot.soles]),
-                ("postures", robot.postures),
-            ):
-                if names:
-                    typer.echo(f"  {kind:<9} {', '.join(names)}")
+app.command(
+    epilog=examples("impactopt strike punch --starts 8", "impactopt strike my.toml --json --out results/s")
+)(strike)
+app.command(
+    epilog=examples(
+        "impactopt collide punch --speed 0.5",
+        "impactopt collide punch --speed 0.5 --set target.mass=20 --model full --json",
+        "impactopt collide results/punch",
+    )
+)(collide)
+app.command(
+    epilog=examples(
+        "impactopt validate results/punch",
+        "impactopt validate results/punch --missing --json",
+        "impactopt validate results/punch --animation punch.gif",
+    )
+)(validate)
+app.command(epilog=examples("impactopt show results/punch --open"))(show)
+app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
+app.command(epilog=examples("impactopt sweep my_sweep.toml --out results/s --workers 2"))(sweep)
+app.command(epilog=examples("impactopt reproduce table3", "impactopt reproduce all --out results/r"))(
+    reproduce
+)
+app.command(epilog=examples("impactopt new", "impactopt new punch > my.toml", "impactopt new --reference"))(
+    new
+)
+app.command(epilog=examples("impactopt check my.toml", "impactopt check punch --set problem.point.0=0.7"))(
+    check
+)
+app.command(epilog=examples("impactopt problems --json"))(problems)
+app.command(epilog=examples("impactopt robots --json"))(robots)
 
 
 def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Progress) -> Record:

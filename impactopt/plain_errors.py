@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import traceback
 import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -12,16 +13,16 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["BAD_INPUT", "INTERRUPTED", "plain_errors"]
+__all__ = ["BAD_INPUT", "BUG", "INTERRUPTED", "plain_errors"]
 
-BAD_INPUT, INTERRUPTED = 2, 130  # exit codes
+BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130  # exit codes
 
 
 @contextlib.contextmanager
-def plain_errors(interrupted: str) -> Iterator[Console]:
+def plain_errors(interrupted: str, *, verbose: bool = False) -> Iterator[Console]:
     """A console on stderr, for a command's body.
 
-    interrupted : what Ctrl-C prints, where the body does not catch it.
+    interrupted : what Ctrl-C prints, where the body does not catch it.  verbose : bad input has a traceback.
     """
     from rich.console import Console
 
@@ -33,8 +34,17 @@ def plain_errors(interrupted: str) -> Iterator[Console]:
         try:
             yield console
         except InputError as error:
+            if verbose:
+                traceback.print_exc()
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             typer.echo(interrupted, err=True)
             raise typer.Exit(INTERRUPTED) from None
+        except (typer.Exit, typer.Abort, typer.BadParameter, BrokenPipeError):
+            raise
+        except Exception:
+            # 1 is a command's "no", which a script may count on
+            traceback.print_exc()
+            typer.echo("error: this is a fault of impactopt; please report it with the lines above", err=True)
+            raise typer.Exit(BUG) from None

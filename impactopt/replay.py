@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,11 +54,15 @@ def has_mujoco() -> bool:
 
 
 def load_planned(
-    result: str | os.PathLike[str], *, problem_file: str | os.PathLike[str] | None = None
+    result: str | os.PathLike[str],
+    *,
+    problem_file: str | os.PathLike[str] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Planned:
     """The plan in a directory that `impactopt solve` wrote, or in its `solution.npz`.
 
     problem_file : instead of the record's own text, such as when that is missing or its URDF has moved.
+    settings : other values of the problem, by dotted key.
 
     Raises
     ------
@@ -67,7 +72,7 @@ def load_planned(
     if not record.completed:
         note = record.summary.get("note", "the solve was stopped before there was one")
         raise InputError(f"{result} holds no motion to replay: {note}")
-    problem = _problem(record, Path(result), problem_file)
+    problem = _problem(record, Path(result), problem_file, settings)
     a, robot = record.arrays, problem.robot
     if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
         raise InputError(
@@ -84,14 +89,19 @@ def _trajectory(record: Record, prefix: str) -> Trajectory:
     return Trajectory(**fields)
 
 
-def _problem(record: Record, result: Path, problem_file: str | os.PathLike[str] | None) -> ImpactProblem:
+def _problem(
+    record: Record,
+    result: Path,
+    problem_file: str | os.PathLike[str] | None,
+    settings: Mapping[str, Any] | None,
+) -> ImpactProblem:
     if problem_file is not None:
-        return read_problem_file(problem_file).build()
+        return read_problem_file(problem_file, settings).build()
     if not record.problem:
         raise InputError(f"{result} holds no problem file: give it with --problem FILE")
     path = record.problem_path or result / "problem.toml"
     try:
-        return parse_problem_file(record.problem, path).build()
+        return parse_problem_file(record.problem, path, settings).build()
     except InputError as error:
         raise InputError(
             f"the problem in {result} cannot be built again ({error}); if its files have moved, give the "

@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Cell", "Row", "number_row", "replay_columns", "result_columns", "result_rows"]
+__all__ = [
+    "Cell",
+    "Row",
+    "collision_rows",
+    "number_row",
+    "replay_columns",
+    "result_columns",
+    "result_rows",
+]
 
 PHASES = ("swing", "collision", "follow")
 Columns = Mapping[str, Mapping[str, Any]]
@@ -58,10 +66,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("hand speed at contact [m/s]", "hand_speed_m_s", 3),
     ):
         yield number_row(label, [source.get(key) for source in sources], digits)
-    targets = [source.get("target") or {} for source in sources]
-    yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
-    yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
-    yield _word_row("the board breaks", [target.get("broken") for target in targets])
+    yield from _target_rows([source.get("target") or {} for source in sources])
     for label, key, digits, scale, least, most in (
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
@@ -78,6 +83,32 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
     stands = [None, *(source.get("standing") for source in sources[1:])]
     yield _of_replays(_word_row("stands at the end", stands, no_is_bad=True))
+
+
+def collision_rows(found: Mapping[str, Any]) -> list[Row]:
+    """One collision; `found` as in `impactopt collide --json`."""
+    rows = [
+        number_row(label, [found.get(key)], digits, scale=scale, least=least, most=most)
+        for label, key, digits, scale, least, most in (
+            ("hand speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
+            ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
+            ("impulse [N s]", "impulse_Ns", 3, 1.0, -np.inf, np.inf),
+            ("peak force [N]", "peak_force_N", 1, 1.0, -np.inf, np.inf),
+            ("contact time [ms]", "contact_ms", 2, 1.0, -np.inf, np.inf),
+            ("energy to the target [J]", "energy_J", 3, 1.0, -np.inf, np.inf),
+            ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
+            ("least force on a sole [N]", "sole_force_N", 0, 1.0, 0.0, np.inf),
+            ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
+            ("joint speed / limit", "velocity_ratio", 2, 1.0, 0.0, 1.0),
+        )
+    ]
+    return [row for row in (*rows, *_target_rows([found["target"]])) if row is not None]
+
+
+def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
+    yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
+    yield _word_row("the board breaks", [target.get("broken") for target in targets])
 
 
 def number_row(

@@ -13,15 +13,25 @@ from rich.status import Status
 from rich.table import Table
 
 from impactopt.program import IterationRecord
-from impactopt.result_rows import PHASES, Row, number_row, replay_columns, result_columns, result_rows
+from impactopt.result_rows import (
+    PHASES,
+    Row,
+    collision_rows,
+    number_row,
+    replay_columns,
+    result_columns,
+    result_rows,
+)
 
 __all__ = [
     "Progress",
     "blows_table",
+    "collision_table",
     "replay_table",
     "result_table",
     "starts_table",
     "strike_table",
+    "torques_table",
     "violation_table",
 ]
 
@@ -32,11 +42,11 @@ QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot
 class Progress:
     """Lines about what is being done, and a live line about the iterations.
 
-    Where there is no terminal, iterations are plain lines, one a second at most.
+    Where there is no terminal, iterations are plain lines, one a second at most; `verbose`: all of them.
     """
 
-    def __init__(self, console: Console, *, quiet: bool = False) -> None:
-        self._console, self._quiet = console, quiet
+    def __init__(self, console: Console, *, quiet: bool = False, verbose: bool = False) -> None:
+        self._console, self._quiet, self._verbose = console, quiet, verbose
         self._live: Status | None = None
         self._last = -QUIET_BETWEEN
         self._start = time.perf_counter()
@@ -72,7 +82,7 @@ class Progress:
             return
         if self._live is not None:
             self._live.update(text)
-        elif record.seconds - self._last >= QUIET_BETWEEN:
+        if self._verbose or (self._live is None and record.seconds - self._last >= QUIET_BETWEEN):
             self._last = record.seconds
             self._console.print(f"          {text}", highlight=False, soft_wrap=True)
 
@@ -94,6 +104,27 @@ def strike_table(summary: Mapping[str, Any]) -> Table:
     row = number_row("capture point's margin after contact [mm]", margin, 1, scale=1e3, least=-1e-6)
     if row is not None:
         _add(table, row)
+    return table
+
+
+def collision_table(found: Mapping[str, Any]) -> Table:
+    """One collision; `found` as in `impactopt collide --json`."""
+    table = Table(title=escape(f"{found['problem']}: {found['model']}"), title_justify="left")
+    table.add_column("")
+    table.add_column("collision", justify="right")
+    for row in collision_rows(found):
+        _add(table, row)
+    return table
+
+
+def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
+    """The joints whose servos are asked for most; `joints` as in `impactopt collide --json`."""
+    table = Table(title="largest torque demands", title_justify="left")
+    for name in ("joint", "torque [N m]", "limit [N m]", "ratio"):
+        table.add_column(name, justify="left" if name == "joint" else "right")
+    for joint in joints[:most]:
+        numbers = (f"{joint['torque_Nm']:.1f}", f"{joint['limit_Nm']:.1f}", f"{joint['ratio']:.2f}")
+        table.add_row(str(joint["joint"]), *numbers)
     return table
 
 

@@ -1,19 +1,14 @@
-"""Problems by name: the files that come with the package.
-
-In git they are in `problems/` beside the package; a wheel has them inside it, in `_problems`.
-"""
+"""Problems by name: the files that come with the package."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+from impactopt._folders import FOLDERS
 from impactopt.errors import InputError, did_you_mean
 
 __all__ = ["problem_file", "problem_names", "problem_summary"]
-
-_PACKAGE = Path(__file__).resolve().parents[1]
-FOLDERS = (_PACKAGE / "_problems", _PACKAGE.parent / "problems")
 
 
 def problem_names() -> tuple[str, ...]:

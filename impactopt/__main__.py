@@ -1,0 +1,5 @@
+"""`python -m impactopt`: the command line."""
+
+from impactopt.cli import main
+
+main()

@@ -9,7 +9,7 @@ EXTRAS := robots,validate,qp,sweep,cluster,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench reproduce clean distclean
+.PHONY: help venv demo test lint types format bench reproduce figures clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
@@ -68,6 +68,9 @@ bench: $(STAMP) ## run every benchmark, some minutes; tables, JSON and pictures 
 
 reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes; results/reproduce
 	@$(BIN)/impactopt reproduce all --out results/reproduce $(ARGS)
+
+figures: $(STAMP) ## make the figures of docs/ anew (ARGS='strobe fig7' for some; the benchmarks' only by name)
+	@$(BIN)/impactopt figures $(ARGS)
 
 clean: ## remove results and caches of the tools; .venv and compiled functions stay
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -85,6 +85,7 @@ _EXPORTS = {
     "load_robot": "presets",
     "planar_arm": "presets",
     "optimize_strike": "strike",
+    "plot": "plotting",
     "posture_of_effective_mass": "cases",
     "problem_names": "problem_file",
     "report_page": "report",

@@ -40,6 +40,7 @@ from impactopt._validate_command import validate
 from impactopt.bench.command import app as bench_app
 from impactopt.plain_errors import plain_errors
 from impactopt.reproduce.command import reproduce
+from impactopt.reproduce.figures import figures
 
 if TYPE_CHECKING:
     from impactopt.output import Record
@@ -174,6 +175,9 @@ app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
 app.command(epilog=examples("impactopt sweep my_sweep.toml --out results/s --workers 2"))(sweep)
 app.command(epilog=examples("impactopt reproduce table3", "impactopt reproduce all --out results/r"))(
     reproduce
+)
+app.command(epilog=examples("impactopt figures strobe fig7", "impactopt figures --out results/figures"))(
+    figures
 )
 app.command(epilog=examples("impactopt new", "impactopt new punch > my.toml", "impactopt new --reference"))(
     new

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.problem import ImpactProblem
 from impactopt.program import SolverResult
+from impactopt.reference.poses import poses_of
 from impactopt.solution import Solution
 from impactopt.strike import StrikeSolution
 from impactopt.support import support_polygon
@@ -54,8 +55,8 @@ class Record:
         corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
         by field, `reference_*` (`impactopt.plan.Trajectory`) and, of a plan with a brake, `missed_*`,
         `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*` (`PlannedCollision`),
-        `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without velocities
-        and torques), `solver_*` (`SolverResult`), `history_*` (its iterations).
+        `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation` on free soles, without
+        velocities and torques), `solver_*` (`SolverResult`), `history_*` (its iterations).
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
@@ -99,7 +100,7 @@ def record_of(
     parts |= {"collision": plan.collision, "solver": result}
     summary = _summary(solution, simulation, replay)
     if "note" not in summary:
-        parts["reference"] = solution.trajectory
+        parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}
         if plan.brake is not None:
             parts["missed"] = solution.missed_trajectory
     if simulation is not None:

@@ -128,6 +128,17 @@ class Solution(Solved):
 
         return Path(report_page(self, simulation=simulation, replay=replay).save(path))
 
+    def plot(
+        self, what: str = "overview", *, simulation: Any | None = None, replay: Any | None = None
+    ) -> Any:
+        """Poses, contact force, ZMP and torque as one picture, or another one by name; a matplotlib figure.
+
+        what, simulation, replay : as of :func:`impactopt.plot`, such as ``solution.plot("strobe")``.
+        """
+        from impactopt import plot
+
+        return plot(self, what, simulation=simulation, replay=replay)
+
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 import impactopt
 from impactopt.cli import app
 from impactopt.output import Record, load_record
+from impactopt.plotting import PICTURES
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile
 from impactopt.program import IterationRecord, Status, Violation
@@ -44,7 +45,7 @@ max_iter = 7
 [solver.sqp]
 price = 50.0
 """
-FILES = {"solution.npz", "summary.json", "force.png", "zmp.png", "torque.png", "motion.png", "replay.png"}
+FILES = {"solution.npz", "summary.json", *(f"{name}.png" for name in PICTURES)}
 
 runner = CliRunner()
 
@@ -94,7 +95,7 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReque
     """Empty files in place of pictures; test_output draws them, and here `real_pictures`."""
 
     def save(record: Record, directory: Path) -> list[Path]:
-        paths = [directory / f"{name}.png" for name in ("force", "zmp", "torque", "motion", "replay")]
+        paths = [directory / f"{name}.png" for name in PICTURES]
         for path in paths:
             path.touch()
         return paths

@@ -20,7 +20,7 @@ from impactopt.nlp.start import first_iterate
 from impactopt.nlp.transcription import Transcription
 from impactopt.output import load_record, record_of, save_record
 from impactopt.plan import Plan
-from impactopt.plotting import save_pictures
+from impactopt.plotting import PICTURES, save_pictures
 from impactopt.problem import ImpactProblem
 from impactopt.program import Status
 from impactopt.screen import result_table
@@ -256,12 +256,7 @@ def test_it_is_kept_shown_and_drawn(solved: Planned, tmp_path: Path) -> None:
         assert record.summary["problem"]["collision"].startswith(solved.problem.collision)
         assert result_table(record.summary).row_count > 4
         names = {path.stem for path in save_pictures(record, folder)}
-        wanted = (
-            {"force", "torque", "motion", "zmp"}
-            if len(solved.plan.polygon)
-            else {"force", "torque", "motion"}
-        )
-        assert names == wanted
+        assert names == set(PICTURES) - {"replay"} - ({"zmp"} if not len(solved.plan.polygon) else set())
 
 
 def test_a_higher_restitution_gives_more(arm_transcription: Transcription) -> None:

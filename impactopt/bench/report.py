@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from rich.table import Table
+
+    from impactopt.plotting.style import Picture
 
 __all__ = ["Report", "Say", "cell", "columns_table", "machine", "make_table", "save_report", "timed"]
 
@@ -34,7 +35,7 @@ class Report:
     name: str
     numbers: Mapping[str, Any]
     tables: Sequence[Table] = ()
-    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[], Picture]] = field(default_factory=dict)
 
 
 def timed(run: Callable[..., Report], say: Say, **options: Any) -> Report:
@@ -117,18 +118,12 @@ def save_report(report: Report, directory: Path) -> list[Path]:
     ------
     InputError : they cannot be written.
     """
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     from impactopt.output import plain, write_file
-    from impactopt.plotting.style import STYLE
 
     written = [directory / f"{report.name}.json"]
     text = json.dumps(plain(report.numbers), indent=2, allow_nan=False)
     write_file(written[0], lambda file: file.write(f"{text}\n".encode()))
     for name, draw in report.figures.items():
-        with matplotlib.rc_context(STYLE):
-            canvas = FigureCanvasAgg(draw())
-            write_file(directory / f"{name}.png", canvas.print_png)
+        write_file(directory / f"{name}.png", draw().write)
         written.append(directory / f"{name}.png")
     return written

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PAGE, Picture, styled
 
 LINES = (
     ("impulse_change_pct", "impulse [%]", "o", BLUE),
@@ -17,13 +16,14 @@ LINES = (
 )
 
 
-def convergence_picture(steps: Sequence[Mapping[str, Any]], settings: Sequence[Mapping[str, Any]]) -> Figure:
+@styled
+def convergence_picture(steps: Sequence[Mapping[str, Any]], settings: Sequence[Mapping[str, Any]]) -> Picture:
     """Change from the smallest step's replay over the step, log-log, with a line of first order; beside it
     what other settings change.
 
     steps, settings : rows of `impactopt.bench.replay`.
     """
-    figure = Figure(figsize=(10.0, 4.4))
+    figure = Picture(PAGE, 3.4)
     left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.1])
     for key, label, marker, color in LINES:
         points = np.array([(1e3 * r["step"], abs(r[key])) for r in steps if r.get(key)]).reshape(-1, 2)

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
 
@@ -24,10 +23,11 @@ GREY = "#999999"
 WORST, MEDIAN = "worst_impulse_error_pct", "median_impulse_error_pct"
 
 
-def fidelity_picture(rows: Sequence[Row]) -> Figure:
+@styled
+def fidelity_picture(rows: Sequence[Row]) -> Picture:
     """One panel a robot; rows of `impactopt.bench.fidelity`. Worst errors solid, medians dashed."""
     robots = list(dict.fromkeys(r["robot"] for r in rows))
-    figure = Figure(figsize=(3.4 * len(robots) + 1.2, 4.6))
+    figure = Picture(2.1 * len(robots) + 0.9, 3.6)
     panels = figure.subplots(1, len(robots), sharex=True, sharey=True, squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=True):
         own = [r for r in rows if r["robot"] == robot]
@@ -55,7 +55,7 @@ def fidelity_picture(rows: Sequence[Row]) -> Figure:
         Line2D([], [], color=GREY, linestyle=":", label="falls with the square"),
         Line2D([], [], color=BLACK, linestyle="--", linewidth=1.0, label="dashed: median"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=7)
     return figure
 
 

@@ -6,19 +6,28 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import FigureBase
 
 from impactopt.output import Record
-from impactopt.plotting.style import PLANNED, SIMULATED, title
+from impactopt.plotting.style import COLUMN, PLANNED, SIMULATED, Picture, styled, title
 
 
-def force(record: Record) -> Figure:
+@styled
+def force(record: Record) -> Picture:
     """Contact force over the time since contact."""
+    figure = Picture(COLUMN, 2.6)
+    draw_force(figure, record)
+    figure.axes[0].set_title(title(record, "contact force"))
+    return figure
+
+
+def draw_force(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
     a, summary = record.arrays, record.summary
-    figure = Figure(figsize=(7.0, 3.8))
     axes = figure.subplots()
     label = f"planned: {_impulse(summary)}"
-    axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", color=PLANNED, label=label, zorder=3)
+    style: Any = {"color": PLANNED, "markersize": 4, "label": label, "zorder": 3}
+    axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", **style)
     end = 1e3 * float(a["collision_time"][-1])
     if not end:  # an impact without duration: the simulation's contact is all there is to see
         end = 1e3 * float(a.get("simulated_contact_end", 0.0) - a.get("simulated_contact_start", 0.0))
@@ -32,10 +41,9 @@ def force(record: Record) -> Figure:
         value = np.concatenate([[0.0, 0.0], a["simulated_force"][keep]])
         axes.plot(shown, value, color=SIMULATED, label=label)
     axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
-    axes.set_title(title(record, "contact force"))
     axes.set_ylim(bottom=0.0)
-    axes.legend(title="impulse")
-    return figure
+    # below, as no corner of the axes is free of force for every contact
+    figure.legend(title="impulse", loc="outside lower center", ncols=2)
 
 
 def _impulse(summary: Mapping[str, Any]) -> str:

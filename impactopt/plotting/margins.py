@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from impactopt.plotting.style import BLACK, BLUE, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, VERMILION, Picture, styled
 
 COLUMNS = 4
 Row = Mapping[str, Any]
 
 
-def margins_picture(rows: Sequence[Row]) -> Figure:
+@styled
+def margins_picture(rows: Sequence[Row]) -> Picture:
     """One panel an option, values from daring to cautious: planned impulse above, standing draws below.
 
     rows : of `impactopt.bench.margins`. All panels share their scales, so that what one option costs can be
@@ -24,11 +24,11 @@ def margins_picture(rows: Sequence[Row]) -> Figure:
     """
     options = list(dict.fromkeys(r["option"] for r in rows))
     lines = -(-(len(options) + 1) // COLUMNS)  # one place is the legend's
-    height = 3.5 * lines + 0.6
+    height = 2.8 * lines + 0.5
     # by hand: an automatic layout would make panels with long labels smaller than the others
-    figure = Figure(figsize=(11.0, height))
+    figure = Picture(8.8, height)
     figure.set_layout_engine("none")
-    edges = {"left": 0.075, "right": 0.985, "bottom": 1.0 / height, "top": 1 - 0.35 / height}
+    edges = {"left": 0.075, "right": 0.985, "bottom": 0.8 / height, "top": 1 - 0.28 / height}
     outer = figure.add_gridspec(lines, COLUMNS, wspace=0.1, hspace=0.27, **edges)
     impulses = [r["impulse_planned_Ns"] for r in rows if r["impulse_planned_Ns"] is not None]
     span = (min(impulses), max(impulses)) if impulses else (0.0, 1.0)
@@ -41,7 +41,7 @@ def margins_picture(rows: Sequence[Row]) -> Figure:
         _impulse(upper, chosen)
         _standing(lower, chosen)
         unit = f" [{chosen[0]['unit']}]" if chosen[0]["unit"] else ""
-        upper.set_title(f"{option}{unit}", fontsize=8.5, loc="left")
+        upper.set_title(f"{option}{unit}", fontsize=7, loc="left")
         for axes in (upper, lower):
             axes.set_xlim(-0.5, len(chosen) - 0.5)
             axes.set_xticks(range(len(chosen)))
@@ -66,13 +66,13 @@ def _impulse(axes: Any, rows: Sequence[Row]) -> None:
         if r["impulse_planned_Ns"] is None:
             continue
         fill = BLUE if r["standing_missing"] else "white"
-        axes.plot(k, r["impulse_planned_Ns"], "o", color=BLUE, markerfacecolor=fill, markersize=6.5)
+        axes.plot(k, r["impulse_planned_Ns"], "o", color=BLUE, markerfacecolor=fill, markersize=5.5)
         if r["standing"] is False:
-            axes.plot(k, r["impulse_planned_Ns"], "x", color=BLACK, markersize=11, zorder=4)
+            axes.plot(k, r["impulse_planned_Ns"], "x", color=BLACK, markersize=9, zorder=4)
     bottom = axes.get_ylim()[0]
     for k, r in enumerate(rows):
         if r["impulse_planned_Ns"] is None:
-            axes.text(k, bottom, f" {r['status']}", rotation=90, ha="center", va="bottom", fontsize=8)
+            axes.text(k, bottom, f" {r['status']}", rotation=90, ha="center", va="bottom", fontsize=6.5)
 
 
 def _standing(axes: Any, rows: Sequence[Row]) -> None:
@@ -100,9 +100,9 @@ def _base_line(axes: Any, rows: Sequence[Row]) -> None:
 
 def _name_values(axes: Any, labels: Sequence[str]) -> None:
     if max(map(len, labels)) > 6:
-        axes.set_xticklabels(labels, rotation=35, ha="right", rotation_mode="anchor", fontsize=8)
+        axes.set_xticklabels(labels, rotation=35, ha="right", rotation_mode="anchor", fontsize=6.5)
     else:
-        axes.set_xticklabels(labels, fontsize=9)
+        axes.set_xticklabels(labels, fontsize=7)
 
 
 def _legend(axes: Any) -> None:
@@ -123,7 +123,7 @@ def _legend(axes: Any) -> None:
         ],
         loc="center left",
         bbox_to_anchor=(-0.08, 0.5),
-        fontsize=9,
+        fontsize=7,
         title="to the right: more cautious",
         alignment="left",
     )

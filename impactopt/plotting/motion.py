@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from impactopt.output import Record
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, joint_label, title
+from impactopt.plotting.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    Picture,
+    joint_label,
+    styled,
+    title,
+)
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 
 
-def motion(record: Record) -> Figure:
+@styled
+def motion(record: Record) -> Picture:
     """Angles and velocities of the joints that move most."""
     a = record.arrays
     names, time, angle = a["joints"], a["reference_time"], a["reference_angle"]
     until = float(a["reference_end"])
     chosen = np.argsort(-np.ptp(angle, axis=0))[: len(COLOURS)]
     rate = a["reference_v"][:, -len(names) :] / a["velocity_limit"]
-    figure = Figure(figsize=(9.0, 6.0))
+    figure = Picture(PAGE, 4.6)
     top, bottom = figure.subplots(2, 1, sharex=True)
     for j, colour in zip(chosen, COLOURS, strict=False):
         top.plot(time, angle[:, j], color=colour, label=joint_label(names[j]))

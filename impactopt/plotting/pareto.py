@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from matplotlib.figure import Figure
-
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
 
@@ -35,11 +33,12 @@ def front(rows: Sequence[Row]) -> list[Row]:
     return out
 
 
-def pareto_picture(rows: Sequence[Row]) -> Figure:
+@styled
+def pareto_picture(rows: Sequence[Row]) -> Picture:
     """One panel a robot; rows of `impactopt.bench.collision` that have a time and an error."""
     known = [r for r in rows if r["time_us"] is not None and r["impulse_error_pct"] is not None]
     robots = list(dict.fromkeys(r["robot"] for r in known))
-    figure = Figure(figsize=(5.0 * max(1, len(robots)) + 0.6, 5.0))
+    figure = Picture(3.4 * max(1, len(robots)) + 0.4, 4.0)
     panels = figure.subplots(1, max(1, len(robots)), sharex=True, sharey=True, squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=False):
         own = [r for r in known if r["robot"] == robot]
@@ -61,7 +60,7 @@ def pareto_picture(rows: Sequence[Row]) -> Figure:
         axes.set_title(robot, loc="left")
         axes.set_xlabel("time of a collision [us]")
     panels[0].set_ylabel("impulse error against full dynamics [%]")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=6.5)
     return figure
 
 

@@ -5,25 +5,37 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from impactopt.output import Record
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PHASES, VERMILION, Array, title
+from impactopt.plotting.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PHASES,
+    VERMILION,
+    Array,
+    Picture,
+    styled,
+    title,
+)
 from impactopt.support import zmp
 
 SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)
 
 
-def replay(record: Record) -> Figure | None:
+@styled
+def replay(record: Record) -> Picture | None:
     """Centres of pressure on the soles, normal forces, slip and lift; None without a replay on soles."""
     a = record.arrays
     if not record.replayed or not len(a["replayed_soles"]):
         return None
-    figure = Figure(figsize=(11.0, 5.6))
+    figure = Picture(PAGE, 4.2)
     places = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
-    _centres(places["cop"], a)
+    _centres(figure, places["cop"], a)
     time, start = a["replayed_time"], float(a["replayed_contact_start"])
     names = [str(name).replace("_", " ") for name in a["replayed_soles"]]
     for k, (name, colour) in enumerate(zip(names, SOLE_COLOURS, strict=False)):
@@ -40,7 +52,7 @@ def replay(record: Record) -> Figure | None:
         places[which].set_ylim(bottom=0.0)
         places[which].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
     places["force"].tick_params(labelbottom=False)
-    places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact with the target")
+    places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact")
     places["move"].set(xlabel="time [s]", ylabel="slip, lift [mm]", title="the corner that moved most")
     figure.suptitle(title(record, f"soles in the replay ({_verdict(record)})"))
     return figure
@@ -52,7 +64,7 @@ def _verdict(record: Record) -> str:
     return "stands at the end" if stands else str(reason).split(":")[0] if stands is None else str(reason)
 
 
-def _centres(axes: Any, a: Any) -> None:
+def _centres(figure: Picture, axes: Any, a: Any) -> None:
     """Paths of the centres of pressure by phase, from above: forward is up, left is left."""
     time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
     phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false
@@ -63,10 +75,11 @@ def _centres(axes: Any, a: Any) -> None:
         axes.annotate(
             label,
             (-corners[:, 1].mean(), corners[:, 0].max()),
-            (0, 3),
+            (0, 2),
             textcoords="offset points",
             color="#666666",
             ha="center",
+            fontsize=6.5,
         )
         loaded = np.isfinite(a["replayed_cop_margin"][:, k])
         for which, colour in enumerate(PHASE_COLOURS):
@@ -77,11 +90,11 @@ def _centres(axes: Any, a: Any) -> None:
     axes.set(
         xlabel="y, to the right [m]",
         ylabel="x, forward [m]",
-        title="centre of pressure; soles where they are planned\n",
+        title="centre of pressure\n",
     )
     axes.grid(False)
     key = [
         Line2D([], [], linestyle="", marker="o", color=colour, label=name)
         for name, colour in zip(PHASES, PHASE_COLOURS, strict=True)
     ]
-    axes.legend(handles=key, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
+    figure.legend(handles=key, loc="outside lower left", ncols=3)

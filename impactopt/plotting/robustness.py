@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
-from impactopt.plotting.style import BLACK, BLUE, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, VERMILION, Picture, styled
 from impactopt.robustness import LOGARITHMIC, Robustness
 
 LABELS = {
@@ -25,11 +24,12 @@ SCALE = {"distance": 1e3}
 COLUMNS = 4
 
 
-def robustness_picture(result: Robustness) -> Figure:
+@styled
+def robustness_picture(result: Robustness) -> Picture:
     """Histogram of the impulse above, one scatter a drawn parameter below; falls are crosses."""
     table = result.table()
     rows = -(-len(table) // COLUMNS)
-    figure = Figure(figsize=(11.0, 3.4 + 2.7 * rows))
+    figure = Picture(8.8, 2.7 + 2.2 * rows)
     grid = figure.add_gridspec(rows + 1, COLUMNS, height_ratios=[1.25] + [1.0] * rows)
     _histogram(figure.add_subplot(grid[0, :]), result)
     for k, (name, value) in enumerate(table.items()):

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
 _FORMULA = {"linestyle": ":", "linewidth": 1.2}
@@ -28,9 +27,10 @@ _METHODS = (
 )
 
 
-def scaling_picture(rows: Sequence[Row], exponents: Sequence[Row]) -> Figure:
+@styled
+def scaling_picture(rows: Sequence[Row], exponents: Sequence[Row]) -> Picture:
     """Three panels over joints, three over step and batch; rows of `impactopt.bench.scaling`."""
-    figure = Figure(figsize=(13.0, 8.2))
+    figure = Picture(10.4, 6.6)
     of = {over: [r for r in rows if r["over"] == over] for over in ("dof", "step", "batch")}
     grid = figure.subplots(2, 3)
     for axes, part, title in zip(grid[0], _PARTS, _TITLES, strict=True):
@@ -65,7 +65,7 @@ def _over_dof(
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
     _head_room(axes, 20.0)
-    axes.legend(fontsize=8, loc="upper left")
+    axes.legend(fontsize=6.5, loc="upper left")
 
 
 def _power(row: Row | None, key: str) -> str:
@@ -89,7 +89,7 @@ def _over_step(axes: Any, rows: Sequence[Row]) -> None:
             )
     axes.set(xlabel="step [s]", ylabel="time of a collision [us]")
     axes.set_title(f"over the step{_of(rows)}", loc="left")
-    axes.legend(fontsize=8, loc="upper right")
+    axes.legend(fontsize=6.5, loc="upper right")
 
 
 def _errors(axes: Any, rows: Sequence[Row]) -> None:
@@ -100,13 +100,13 @@ def _errors(axes: Any, rows: Sequence[Row]) -> None:
         for r, x, y in zip(own, times, errors, strict=True):
             text, left = f"{r['step_s'] or r['tolerance']:g}", method == "implicit"
             at: Any = {"xytext": (-5 if left else 4, 4), "ha": "right" if left else "left"}
-            axes.annotate(text, (x, y), fontsize=7, textcoords="offset points", **at)
+            axes.annotate(text, (x, y), fontsize=6, textcoords="offset points", **at)
     axes.set(xlabel="time of a collision [us]", ylabel="impulse against the exact solution")
     axes.set_title(f"error over time{_of(rows)}", loc="left")
     low, high = axes.get_xlim()
     axes.set_xlim(low / 1.8, high * 1.4)  # room for the numbers
     _head_room(axes, 1e3)
-    axes.legend(fontsize=8, loc="upper right")
+    axes.legend(fontsize=6.5, loc="upper right")
 
 
 def _of(rows: Sequence[Row]) -> str:
@@ -123,7 +123,7 @@ def _over_batch(axes: Any, rows: Sequence[Row]) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_title("over the batch", loc="left")
-    axes.legend(fontsize=8, loc="lower right")
+    axes.legend(fontsize=6.5, loc="lower right")
 
 
 def _head_room(axes: Any, factor: float) -> None:

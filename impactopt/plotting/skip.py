@@ -6,23 +6,23 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from impactopt.plotting.style import BLUE, ORANGE
+from impactopt.plotting.style import BLUE, ORANGE, PAGE, Picture, styled
 
 Row = Mapping[str, Any]
 
 
-def skip_picture(rows: Sequence[Row]) -> Figure:
+@styled
+def skip_picture(rows: Sequence[Row]) -> Picture:
     """Bars of time and instructions; rows of `impactopt.bench.skip` that have a time."""
     timed = [r for r in rows if r["time_us"] is not None][::-1]
-    figure = Figure(figsize=(9.0, 0.36 * len(timed) + 1.4))
+    figure = Picture(PAGE, 0.28 * len(timed) + 1.1)
     panels = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(timed))
     panels[0].barh(places, [r["time_us"] for r in timed], color=BLUE)
     panels[0].set_xlabel("time of a collision [us]")
     for place, r in zip(places, timed, strict=True):
-        panels[0].text(r["time_us"], place, f" {r['speedup']:.2f}x", va="center", fontsize=8)
+        panels[0].text(r["time_us"], place, f" {r['speedup']:.2f}x", va="center", fontsize=6.5)
     panels[0].set_xlim(right=1.2 * max(r["time_us"] for r in timed))
     freeze, step = ([r[f"{part}_instructions"] for r in timed] for part in ("freeze", "step"))
     panels[1].barh(places, freeze, color=BLUE, label="freeze, once")

@@ -5,14 +5,22 @@ Okabe and Ito's colours, and cividis for scales: any kind of colour vision tells
 
 from __future__ import annotations
 
-from typing import Any
+import io
+from collections.abc import Callable
+from functools import wraps
+from typing import IO, Any, ParamSpec, TypeVar
 
+import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from impactopt.output import Record
 
 Array = NDArray[np.float64]
+Given = ParamSpec("Given")
+Drawn = TypeVar("Drawn")
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
     "#0072B2",
@@ -27,12 +35,17 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
 PLANNED, SIMULATED, OVER = BLUE, VERMILION, VERMILION
 PHASES = ("swing", "collision", "follow-through")
 
+# [in] what a paper's column and its page are wide; a picture of that width needs no scaling in print
+COLUMN, PAGE = 3.5, 7.2
+DPI = 200
+
 STYLE: Any = {
-    "figure.dpi": 100,
-    "savefig.dpi": 150,
+    "figure.dpi": DPI,
+    "savefig.dpi": DPI,
     "figure.constrained_layout.use": True,
-    "font.size": 10,
-    "axes.titlesize": 11,
+    "font.size": 8,
+    "axes.titlesize": 9,
+    "figure.titlesize": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -43,6 +56,53 @@ STYLE: Any = {
     "legend.frameon": False,
     "image.cmap": "cividis",
 }
+
+
+class Picture(Figure):
+    """A figure in our style, however and wherever it is drawn; notebooks show it as it is.
+
+    No display is needed, and no global state is touched.
+    """
+
+    def __init__(self, width: float, height: float) -> None:
+        with matplotlib.rc_context(STYLE):
+            super().__init__(figsize=(width, height))
+            FigureCanvasAgg(self)
+
+    def add_subplot(self, *args: Any, **options: Any) -> Any:  # subplots come through here too
+        with matplotlib.rc_context(STYLE):
+            return super().add_subplot(*args, **options)
+
+    def legend(self, *args: Any, **options: Any) -> Any:
+        with matplotlib.rc_context(STYLE):
+            return super().legend(*args, **options)
+
+    def draw(self, renderer: Any) -> None:
+        with matplotlib.rc_context(STYLE):  # ticks are made when they are drawn
+            super().draw(renderer)
+
+    def write(self, file: IO[bytes]) -> None:
+        """Write the picture as PNG."""
+        with matplotlib.rc_context(STYLE):
+            self.savefig(file, format="png")
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        """For notebooks: half as many pixels on the page as in the file, which is sharp on any screen."""
+        width, height = (int(side * DPI / 2) for side in self.get_size_inches())
+        memory = io.BytesIO()
+        self.write(memory)
+        return memory.getvalue(), {"width": width, "height": height}
+
+
+def styled(draw: Callable[Given, Drawn]) -> Callable[Given, Drawn]:
+    """The function, in our style."""
+
+    @wraps(draw)
+    def in_style(*args: Given.args, **options: Given.kwargs) -> Drawn:
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **options)
+
+    return in_style
 
 
 def title(record: Record, what: str) -> str:

@@ -6,18 +6,44 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import FigureBase
 
 from impactopt.output import Record
-from impactopt.plotting.style import OVER, PHASES, Array, joint_label, simulated_phases, title
+from impactopt.plotting.style import (
+    OVER,
+    PAGE,
+    PHASES,
+    Array,
+    Picture,
+    joint_label,
+    simulated_phases,
+    styled,
+    title,
+)
+
+ROW = 0.13  # [in] of a joint
 
 
-def torque(record: Record) -> Figure:
+@styled
+def torque(record: Record) -> Picture:
     """Torque demand over limit, joints by time; contact has a panel of its own, at a larger scale."""
+    figure = Picture(PAGE, torque_height(record) + 0.2)
+    draw_torque(figure, record)
+    kind = "simulated, before saturation" if record.simulated else "planned"
+    figure.suptitle(title(record, f"torque over limit ({kind})"))
+    return figure
+
+
+def torque_height(record: Record) -> float:
+    """How high [in] it has to be, so that joints can be read."""
+    return 0.75 + ROW * max(len(record.arrays["joints"]), 8)
+
+
+def draw_torque(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
     a = record.arrays
     names = [joint_label(name) for name in a["joints"]]
     histories = _demand(record)
-    figure = Figure(figsize=(11.0, 0.8 + 0.21 * len(names) + 0.6))
     panels = figure.subplots(1, 3, sharey=True, gridspec_kw={"width_ratios": [4, 3, 4]})
     colours = matplotlib.colormaps["cividis"].with_extremes(over=OVER)
     mesh: Any = None
@@ -33,15 +59,12 @@ def torque(record: Record) -> Figure:
             xlabel="time since contact [ms]" if k == 1 else "time [s]",
             title=f"{'contact' if k == 1 else PHASES[k]}: at most {ratio.max():.2f}",
         )
-    panels[0].set_yticks(np.arange(len(names)), names, fontsize=8)
+    panels[0].set_yticks(np.arange(len(names)), names, fontsize=6.5)
     panels[0].invert_yaxis()
     for axes in panels[1:]:
         axes.tick_params(left=False)
     bar = figure.colorbar(mesh, ax=list(panels), extend="max", aspect=40, pad=0.01)
-    bar.set_label("|torque demand| / limit")
-    kind = "simulated, before saturation" if record.simulated else "planned"
-    figure.suptitle(title(record, f"torque over limit ({kind})"))
-    return figure
+    bar.set_label("|demand| / limit")
 
 
 def _demand(record: Record) -> list[tuple[Array, Array]]:

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
-from impactopt.plotting.style import BLACK, BLUE, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
 
@@ -25,10 +24,11 @@ PAPER = 1e5  # [kg]
 LEAST = 1e-16  # below a double's rounding nothing is to be seen
 
 
-def virtual_base_picture(rows: Sequence[Row]) -> Figure:
+@styled
+def virtual_base_picture(rows: Sequence[Row]) -> Picture:
     """One panel a robot; rows of `impactopt.bench.virtual_base`."""
     robots = list(dict.fromkeys(r["robot"] for r in rows))
-    figure = Figure(figsize=(4.6 * len(robots) + 0.6, 4.6))
+    figure = Picture(3.3 * len(robots) + 0.6, 3.8)
     panels = figure.subplots(1, len(robots), sharex=True, sharey=True, squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=True):
         chosen = [r for r in rows if r["robot"] == robot]
@@ -55,5 +55,5 @@ def virtual_base_picture(rows: Sequence[Row]) -> Figure:
         Line2D([], [], color=VERMILION, label="literal, impulse", linestyle="--", linewidth=1.1),
         Line2D([], [], color=BLACK, label="literal: Cholesky fails", marker="x", linestyle=""),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=7)
     return figure

@@ -2,33 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from impactopt.output import Record
-from impactopt.plotting.style import BLACK, OVER, PHASES, Array, simulated_phases, title
+from impactopt.plotting.style import (
+    BLACK,
+    OVER,
+    PAGE,
+    PHASES,
+    Array,
+    Picture,
+    simulated_phases,
+    styled,
+    title,
+)
 from impactopt.support import zmp
 
 
-def zero_moment_point(record: Record) -> Figure | None:
+@styled
+def zero_moment_point(record: Record) -> Picture | None:
     """Path of the ZMP in the support polygon, seen from above; None without soles."""
-    a = record.arrays
-    polygon = a["polygon"]
-    if not len(polygon):
+    if not len(record.arrays["polygon"]):
         return None
+    figure = Picture(PAGE, 3.1)
+    draw_zmp(figure, record)
+    figure.suptitle(title(record, "zero-moment point, from above"))
+    return figure
+
+
+def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 2)) -> None:
+    """The same into a figure, or a part of one; a panel for each of the phases."""
+    a = record.arrays
     paths = _zmp_paths(record)
-    figure = Figure(figsize=(11.0, 4.3))
-    panels = figure.subplots(1, 3, sharex=True, sharey=True)
-    for k, (axes, phase) in enumerate(zip(panels, PHASES, strict=True)):
+    panels: Any = figure.subplots(1, len(phases), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, k in zip(panels, phases, strict=True):
         _ground(axes, a)
         norm = None
         for kind in ("simulated", "planned"):
@@ -45,21 +62,21 @@ def zero_moment_point(record: Record) -> Figure | None:
                     points[marks, 0],
                     c=time[marks],
                     norm=norm,
-                    s=34,
+                    s=13,
                     edgecolors=BLACK,
-                    linewidths=0.8,
+                    linewidths=0.5,
                     zorder=4,
                 )
         if norm is not None:
-            bar = figure.colorbar(matplotlib.cm.ScalarMappable(norm), ax=axes, location="bottom", aspect=30)
+            place: Any = {"location": "bottom", "aspect": 25} if len(phases) > 1 else {"shrink": 0.8}
+            bar = figure.colorbar(matplotlib.cm.ScalarMappable(norm), ax=axes, **place)
             bar.set_label("time since contact [ms]" if k == 1 else "time [s]")
         margin = _margin(record, k)
         text = "" if margin is None else f": margin {1e3 * margin:.0f} mm"
-        axes.set_title(phase + text, color=BLACK if margin is None or margin >= 0 else OVER)
+        what = PHASES[k] if len(phases) > 1 else f"ZMP, {PHASES[k]}"
+        axes.set_title(what + text, color=BLACK if margin is None or margin >= 0 else OVER)
     panels[0].set_ylabel("x, forward [m]")
-    figure.legend(handles=_zmp_key(record), loc="outside lower center", ncols=4)
-    figure.suptitle(title(record, "zero-moment point, from above"))
-    return figure
+    figure.legend(handles=_zmp_key(record), loc="outside lower center", ncols=4 if len(phases) > 1 else 2)
 
 
 def _zmp_paths(record: Record) -> dict[tuple[str, int], tuple[Array, Array]]:
@@ -88,7 +105,7 @@ def _zmp_key(record: Record) -> list[Line2D | Patch]:
         Patch(facecolor="#eeeeee", edgecolor="#999999", label="sole"),
     ]
     if record.simulated:
-        key.insert(1, Line2D([], [], color=grey, linewidth=2.4, label="simulated"))
+        key.insert(1, Line2D([], [], color=grey, linewidth=1.8, label="simulated"))
     return key
 
 
@@ -115,7 +132,7 @@ def _ground(axes: Any, arrays: Mapping[str, Array]) -> None:
                 ha="center",
                 va="bottom",
                 color="#666666",
-                fontsize=8,
+                fontsize=6.5,
             )
     polygon = np.vstack([arrays["polygon"], arrays["polygon"][:1]])
     axes.plot(-polygon[:, 1], polygon[:, 0], "--", color=BLACK, linewidth=1.0)
@@ -127,7 +144,7 @@ def _ground(axes: Any, arrays: Mapping[str, Array]) -> None:
 def _coloured_line(axes: Any, time: Array, points: Array, norm: Normalize) -> None:
     path = np.column_stack([-points[:, 1], points[:, 0]])
     pieces = np.stack([path[:-1], path[1:]], axis=1)
-    lines = LineCollection(list(pieces), cmap="cividis", norm=norm, linewidth=2.4, zorder=3)
+    lines = LineCollection(list(pieces), cmap="cividis", norm=norm, linewidth=1.8, zorder=3)
     lines.set_array(time[:-1])
     axes.add_collection(lines, autolim=True)
     axes.autoscale_view()

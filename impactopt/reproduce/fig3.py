@@ -13,7 +13,7 @@ from impactopt.presets import standin
 from impactopt.reproduce.timing import Times, measure
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from impactopt.plotting.style import Picture
 
 __all__ = ["run"]
 
@@ -83,17 +83,15 @@ def in_words(times: Times) -> str:
     )
 
 
-def draw(rows: list[dict[str, Any]]) -> Figure:
+def draw(rows: list[dict[str, Any]]) -> Picture:
     """Formulas as lines, measured ratios as marks."""
-    from matplotlib.figure import Figure
+    from impactopt.plotting.style import BLUE, PAGE, VERMILION, Picture
 
-    from impactopt.plotting.style import BLUE, VERMILION
-
-    figure = Figure(figsize=(8.0, 4.2))
+    figure = Picture(PAGE, 3.6)
     steps = np.array([r["t_s_s"] for r in rows])
     fine = np.geomspace(steps.min(), steps.max(), 200)
     names = {"C_r1": "$C_{r1} = C_2 / C_1$", "C_r3": "$C_{r3} = C_2 / C_3$"}
-    against = {"C_r1": "against dense full dynamics", "C_r3": "against the articulated-body algorithm"}
+    against = {"C_r1": "against dense full dynamics", "C_r3": "against articulated bodies"}
     for axes, (name, label) in zip(figure.subplots(1, 2), names.items(), strict=True):
         line = [ratios(float(step))[name] for step in fine]
         axes.loglog(fine, line, color=BLUE, label="operations, n = 28 (paper's formula)")

@@ -17,7 +17,7 @@ from impactopt.bench.trees import random_robot, tip_speed
 from impactopt.reproduce.timing import measure
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from impactopt.plotting.style import Picture
 
 __all__ = ["run"]
 
@@ -90,16 +90,14 @@ def run(say: Say, *, measured: Sequence[int] = MEASURED) -> Report:
     return Report(name="fig4", numbers=numbers, tables=(table,), figures={"fig4": lambda: draw(rows)})
 
 
-def draw(rows: list[dict[str, Any]]) -> Figure:
+def draw(rows: list[dict[str, Any]]) -> Picture:
     """Formulas as lines, measured ratios as marks."""
-    from matplotlib.figure import Figure
+    from impactopt.plotting.style import BLACK, BLUE, PAGE, VERMILION, Picture
 
-    from impactopt.plotting.style import BLACK, BLUE, VERMILION
-
-    figure = Figure(figsize=(8.0, 4.2))
+    figure = Picture(PAGE, 3.6)
     fine = np.arange(8, 121)
     names = {"C_r1": "$C_{r1} = C_2 / C_1$", "C_r3": "$C_{r3} = C_2 / C_3$"}
-    against = {"C_r1": "against dense full dynamics", "C_r3": "against the articulated-body algorithm"}
+    against = {"C_r1": "against dense full dynamics", "C_r3": "against articulated bodies"}
     for axes, (name, label) in zip(figure.subplots(1, 2), names.items(), strict=True):
         axes.plot(
             fine, [ratios(int(n))[name] for n in fine], color=BLUE, label="operations (paper's formula)"

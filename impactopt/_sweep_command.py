@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -32,6 +32,9 @@ def sweep(
         str | None,
         typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port: its workers do it."),
     ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Do cases once more that crashed or ran out of time before.")
+    ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -45,9 +48,8 @@ def sweep(
         from impactopt.sweeps import sweep as run
 
         with _Screen(console, quiet=quiet) as screen:
-            result = run(
-                file, out, workers=workers, scheduler=scheduler, report=screen.say, progress=screen.progress
-            )
+            told: dict[str, Any] = {"report": screen.say, "progress": screen.progress}
+            result = run(file, out, workers=workers, scheduler=scheduler, again=again, **told)
         if as_json:
             typer.echo(json.dumps(result.summary()))
         else:

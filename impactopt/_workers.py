@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import multiprocessing
 import os
 import signal
@@ -207,6 +208,7 @@ def _interrupts_held_back() -> Iterator[None]:
 
 def _serve(pipe: Connection, function: Callable[[Any, Any], Any], shared: Any, parent: int) -> None:
     _end_with(parent)
+    gc.freeze()  # modules stay, and need not be gone through for garbage again and again
     try:
         pipe.send((None, None))  # ready
         while True:

@@ -27,8 +27,9 @@ from impactopt.sweeps.alarm import RANG
 from impactopt.sweeps.collisions import collide_many
 from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.journal import Entry, Journal
 from impactopt.sweeps.running import TOGETHER
-from impactopt.sweeps.units import Unit, Work
+from impactopt.sweeps.units import Found, Unit, Work
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
 RESISTANCES = [500.0, 700.0, 9e3, 600.0]
@@ -57,9 +58,16 @@ def undisturbed() -> list[dict[str, Any]]:
     return out
 
 
-def test_a_worker_that_is_killed_costs_nothing_and_the_table_tells_all(
+def test_ctrl_c_and_a_worker_that_is_killed_cost_nothing_and_the_table_tells_all(
     tmp_path: Path, undisturbed: list[dict[str, Any]]
 ) -> None:
+    def stop(now: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # Ctrl-C
+        sweep(SWEEP, tmp_path / "out", workers=1, progress=stop)
+    assert multiprocessing.active_children() == []
+    assert rows(tmp_path / "out" / "table.parquet") == undisturbed[:1]
     told: list[Progress] = []
 
     def kill_one(now: Progress) -> None:
@@ -71,8 +79,8 @@ def test_a_worker_that_is_killed_costs_nothing_and_the_table_tells_all(
 
     result = sweep(SWEEP, tmp_path / "out", workers=2, progress=kill_one)
     assert rows(result.table) == undisturbed
-    assert (result.cases, result.done, result.failed, result.resumed) == (4, 4, 0, 0)
-    assert [now.done for now in told] == [1, 2, 3, 4] and told[-1].remaining == 0
+    assert (result.cases, result.done, result.failed, result.resumed) == (4, 4, 0, 1)
+    assert [now.done for now in told] == [2, 3, 4] and told[-1].remaining == 0
     best = max(undisturbed, key=lambda row: row["impulse_Ns"])
     assert (result.best, result.best_case) == (best["impulse_Ns"], best["case"])
     assert 50 < result.peak_worker_mb < 1000
@@ -141,6 +149,14 @@ def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_p
     assert "[0.7" in record.problem
     assert not (out / "cases" / "000001").exists()
     assert sum(result.reasons.values()) == 1
+    assert sweep(given, out, workers=1, again=True).resumed == 2  # another try would not help
+    journal = Journal(out / "units.journal")
+    lost = Found(columns={"status": ["crashed"], "reason": ["its process died"]}, peak_mb=1.0)
+    journal.add(Entry(unit=0, peak_mb=1.0, columns=lost.columns))
+    journal.close()
+    assert sweep(given, out, workers=1).failed == 2
+    again = sweep(given, out, workers=1, again=True)
+    assert (again.resumed, again.failed, rows(again.table)) == (1, 1, [good, bad])
 
 
 # ---------------------------------------------------------------- workers

@@ -25,7 +25,7 @@ class Alarm:
 
     def building(self, line: str) -> None:
         """A solve's `report`: functions may be compiled, which is no part of a case's time."""
-        self._set(max(BUILDING, self._seconds) if self._seconds else 0.0)
+        self._set(max(BUILDING, self._seconds))
 
     def iteration(self, record: Any) -> None:
         """A solve's `callback`."""
@@ -34,6 +34,6 @@ class Alarm:
     def off(self) -> None:
         self._set(0.0)
 
-    @staticmethod
-    def _set(seconds: float) -> None:
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+    def _set(self, seconds: float) -> None:
+        if self._seconds:  # without a limit a timer of the caller's own is left alone
+            signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -28,12 +29,21 @@ def connected(address: str) -> Iterator[Any]:
     InputError : Dask is not installed; nothing answers there.
     """
     distributed = _distributed()
+    # of a scheduler that is lost `_found` says all in one sentence, Dask on many pages
+    loggers = [logging.getLogger(f"distributed.{name}") for name in ("client", "utils")]
+    before = [logger.level for logger in loggers]
     try:
-        client = distributed.Client(address, timeout=PATIENCE)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"no Dask scheduler answers at {address}: {error}") from error
-    with client:
-        yield client
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        try:
+            client = distributed.Client(address, timeout=PATIENCE)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(f"no Dask scheduler answers at {address}: {error}") from error
+        with client:
+            yield client
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
 
 
 def on_cluster(

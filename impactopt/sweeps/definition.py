@@ -14,10 +14,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from impactopt.errors import InputError
-from impactopt.problem_file import ProblemFile, key_place, read_problem_file, read_toml
+from impactopt.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file
-from impactopt.problem_file.toml import TOMLError
+from impactopt.problem_file.toml import TOMLError, plain_value
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column
@@ -90,7 +90,8 @@ def parse_sweep(text: str, path: Path) -> Sweep:
 
 def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = "sweep") -> Sweep:
     """The sweep that the data of a file describe; see `parse_sweep`."""
-    return _checked(json.loads(json.dumps(data)), Path(where), "")
+    plain: dict[str, Any] = plain_value(data)
+    return _checked(plain, Path(where), write_toml(plain))
 
 
 def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:

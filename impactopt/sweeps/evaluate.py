@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import resource
 import sys
 import threading
@@ -34,12 +35,11 @@ def evaluate(work: Work, unit: Unit) -> Found:
     """
     if work.version != __version__:
         raise InputError(f"a worker has impactopt {__version__}, the sweep {work.version}; install the same")
-    with _ONE_AT_A_TIME:
+    with _ONE_AT_A_TIME, threadpool_limits(1):
         return _evaluate(work, unit)
 
 
 def _evaluate(work: Work, unit: Unit) -> Found:
-    threadpool_limits(1)
     began, alarm = time.perf_counter(), Alarm(work.time_limit, work.grace)
     records: Mapping[int, Record] = {}
     try:
@@ -50,6 +50,7 @@ def _evaluate(work: Work, unit: Unit) -> Found:
         columns = failed_columns(unit.count, "error", f"{type(error).__name__}: {error}")
     finally:
         alarm.off()
+        gc.collect()  # a solve leaves cycles, which would make a worker of a long night ever larger
     if work.grain != "collision":
         columns = {**columns, "seconds": [time.perf_counter() - began]}
     return Found(columns=columns, records=records, peak_mb=_peak_memory())

@@ -25,6 +25,7 @@ from impactopt.sweeps.units import Found, Unit, Work
 
 __all__ = ["SweepResult", "sweep"]
 
+ACCIDENTS = {"crashed", "error", "time_limit"}  # what another run may do better
 Engine = Generator[tuple[Unit, Found], None, None]
 TOGETHER = {"collision": 16384}  # cases in a unit; one of the other grains
 
@@ -65,6 +66,7 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     client: Any = None,
+    again: bool = False,
     report: Callable[[str], None] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> SweepResult:
@@ -76,6 +78,7 @@ def sweep(
     scheduler : address of a Dask scheduler, tcp://host:port, whose workers do the cases; client : or a
         `distributed.Client`. Workers need this version of impactopt, one thread each, and to see the files
         that the problem's file names.
+    again : do cases once more that crashed, met an error of ours or ran out of time in an earlier run.
     report : told in words what is going on.  progress : told after every unit.
 
     A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
@@ -103,7 +106,7 @@ def sweep(
                     return on_cluster(work, units, cluster, tell)
                 return on_processes(work, units, workers=_cores() if workers is None else workers)
 
-            return _run(chosen, problem, store, engine, tell, progress)
+            return _run(chosen, problem, store, engine, again, tell, progress)
     finally:
         store.close()
 
@@ -113,6 +116,7 @@ def _run(
     problem: ImpactProblem,
     store: Store,
     engine: Callable[[Work, Iterator[Unit]], Engine],
+    again: bool,
     tell: Callable[[str], None],
     progress: Callable[[Progress], None] | None,
 ) -> SweepResult:
@@ -121,8 +125,11 @@ def _run(
         tell(f"the end of {journal.path} was torn, as when a run is killed; that unit is done again")
     if journal.damaged:
         tell(f"{journal.path} is damaged in {journal.damaged} places; the units there are done again")
-    tally = Tally(chosen.design.cases)
+    tally, finished = Tally(chosen.design.cases), set[int]()
     for entry in journal.read():
+        if again and not ACCIDENTS.isdisjoint(entry.columns.get("status", ())):
+            continue
+        finished.add(entry.unit)
         tally.add(entry.unit * together, entry.columns, entry.peak_mb)
     tally.begin()
     if tally.resumed:
@@ -130,7 +137,7 @@ def _run(
     work = _work(chosen)
     if tally.done < tally.cases:
         _compile(chosen, problem, work, tell)
-    left = _units(chosen, together, journal.units)
+    left = _units(chosen, together, finished)
     with contextlib.closing(engine(work, left)) as found:
         try:
             for unit, result in found:
@@ -220,7 +227,7 @@ def _write(chosen: Sweep, problem: ImpactProblem, store: Store, together: int, t
         "sweep_hash": chosen.hash,
         "problem_hash": problem.hash,
         "versions": json.dumps(versions()),
-        "sweep": chosen.text or json.dumps(chosen.content),
+        "sweep": chosen.text,
         "problem": chosen.problem.text,
     }
     write_table(store.table, parts(), {**kinds, **tally.kinds}, metadata)

@@ -13,8 +13,8 @@ from impactopt.sqp.kernels import Index, Kernels
 
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
 _HELD = 1e15  # on the diagonal of variables that must not move
-_REFINEMENTS = 1  # weights of ten decades cost digits
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
+_SMALL = 1e-5  # none is tried before a shift that would be smaller
 _RELATIVE = 0.1  # the first shift is at most this part of the Hessian's largest entry
 _GROW, _GROW_FIRST, _SHRINK = 8.0, 100.0, 3.0
 
@@ -74,7 +74,7 @@ class NewtonSystem:
         penalty = self._penalty()
         everywhere = np.zeros(c.n)
         everywhere[c.free] = diagonal
-        self.shift = 0.0
+        self.shift = self._first()
         while True:
             self._diagonal = everywhere + self.shift
             self._weights = np.zeros(c.m)
@@ -100,13 +100,21 @@ class NewtonSystem:
         out: Vector = _PENALTY * np.maximum(1.0, curvature) / np.maximum(1.0, length)
         return out
 
+    def _first(self) -> float:
+        """The shift to try first: after an iteration that needed one, a smaller one instead of none."""
+        shift = self._smaller() if self.shift else 0.0
+        return shift if shift > _SMALL else 0.0
+
     def _next(self) -> float:
         """The shift to try where this one was not enough."""
         if not self.shift:
-            # what a far more curved Hessian needed is no guide here
-            most = _RELATIVE * float(np.abs(self._hessian.data).max(initial=1.0))
-            return min(most, max(_LEAST, self._last / _SHRINK)) if self._last else _FIRST
+            return self._smaller() if self._last else _FIRST
         return self.shift * (_GROW if self._last else _GROW_FIRST)
+
+    def _smaller(self) -> float:
+        """Than the last; what a far more curved Hessian needed is no guide."""
+        most = _RELATIVE * float(np.abs(self._hessian.data).max(initial=1.0))
+        return min(most, max(_LEAST, self._last / _SHRINK))
 
     def _values(self) -> Vector:
         """The matrix as `BlockCholesky` takes it."""
@@ -125,45 +133,45 @@ class NewtonSystem:
         """The step (n,) and the new multipliers (m,) of all rows, for a gradient (n,) and the rows' residuals
         (m,): what they are off by, with weights.
         """
-        c = self._condenser
-        d, y = self._respond(q, r)
-        gone_or_hard = np.concatenate([c.eliminated, c.rows[c.equal]]) if self._hard else c.eliminated
-        for _ in range(_REFINEMENTS):
-            left = q + self._times(d) + self._pulled(y)
-            left[c.free[self._held]] = 0.0
-            off = np.zeros(c.m)
-            off[gone_or_hard] = (self._rows(d) + r)[gone_or_hard]
-            more_d, more_y = self._respond(left, off)
-            d, y = d + more_d, y + more_y
-        return d, y
-
-    def _respond(self, q: Vector, r: Vector) -> tuple[Vector, Vector]:
         c, w = self._condenser, self._weights.copy()
         equal = c.rows[c.equal]
-        own, w[equal] = w[equal], 0.0
-        g, off = c.forward(q + self._pulled(w * r), r)
-        g += self._A.T @ (own * off)
-        g[self._held] = 0.0
-        free = -self._matrix.solve(g)
+        w[equal] = 0.0
+        exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
+        d, y, rows, dual = self._respond(q + self._pulled(w * r), r, w)
+        # once more, with what is left of the equations: weights of ten decades cost digits
+        left, hard = np.zeros(c.m), np.zeros(c.m)
+        left[exact] = (rows + r)[exact]
+        hard[c.eliminated], hard[equal] = y[c.eliminated], y[equal]
+        dual += self._pulled(hard)
+        dual[c.free[self._held]] = 0.0
+        more_d, more_y, _, _ = self._respond(dual, left, w)
+        d, y = d + more_d, y + more_y
+        y += w * r
+        return d, y
+
+    def _respond(self, g: Vector, r: Vector, w: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+        """Step for a gradient and the residuals of equalities; multipliers, of rows with weights w what the
+        step changes; how all rows change; gradient of the Lagrangian without the equalities.
+        """
+        c = self._condenser
+        equal = c.rows[c.equal]
+        own = self._weights[equal]
+        by_free, off = c.forward(g, r)
+        by_free += self._A.T @ (own * off)
+        by_free[self._held] = 0.0
+        free = -self._matrix.solve(by_free)
         extra = np.zeros(equal.size)
         if self._hard and equal.size:
             extra = np.linalg.lstsq(self._schur, self._A @ free + off, rcond=None)[0]
             free -= self._spread @ extra
         free[self._held] = 0.0
         d = c.expand(free)
-        y = w * (self._rows(d) + r)
-        y_left = own * (self._A @ free + off) + extra
-        y[c.eliminated] = c.multipliers(q + self._times(d) + self._pulled(y), y_left)
-        y[equal] = y_left
-        return d, y
-
-    def _times(self, d: Vector) -> Vector:
-        out: Vector = self._hessian @ d + self._diagonal * d
-        return out
-
-    def _rows(self, d: Vector) -> Vector:
-        """All rows' change with a step."""
-        return np.concatenate([self._jacobian @ d, d[self._condenser.bounded]])
+        rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
+        y = w * rows
+        dual = g + self._hessian @ d + self._diagonal * d + self._pulled(y)
+        y[equal] = own * (self._A @ free + off) + extra
+        y[c.eliminated] = c.multipliers(dual, y[equal])
+        return d, y, rows, dual
 
     def _pulled(self, y: Vector) -> Vector:
         """Gradient of all rows with multipliers (m,)."""

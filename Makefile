@@ -5,11 +5,11 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 BROWSER := $(VENV)/.browser
-EXTRAS := robots,validate,qp,sweep,cluster,dev
+EXTRAS := robots,validate,qp,sweep,cluster,docs,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench reproduce figures clean distclean
+.PHONY: help venv demo test lint types format bench reproduce figures docs clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
@@ -71,6 +71,10 @@ reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes;
 
 figures: $(STAMP) ## make the figures of docs/ anew (ARGS='strobe fig7' for some; the benchmarks' only by name)
 	@$(BIN)/impactopt figures $(ARGS)
+
+docs: $(STAMP) ## build the documentation, needs no internet: build/docs/index.html
+	@$(BIN)/python -m sphinx -W --keep-going -q docs build/docs
+	@echo "== open build/docs/index.html"
 
 clean: ## remove results and caches of the tools; .venv and compiled functions stay
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

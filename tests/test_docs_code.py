@@ -1,0 +1,68 @@
+"""Every code block of README and docs does what it says: see docs_blocks.py for what is done with each."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+from docs_blocks import BASE, PAGES, ROOT, check_line, languages, run_page, whole
+
+from impactopt import InputError
+
+# `text`: what a program prints, pictures of words; braces: directives of the site
+KNOWN = ("python", "toml", "sh", "text")
+WITH_BLOCKS = [page for page in PAGES if {"python", "toml", "sh"} & set(languages(page))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_block_says_what_it_is(page: Path) -> None:
+    assert [tag for tag in languages(page) if tag not in KNOWN and not tag.startswith("{")] == []
+
+
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_blocks_of_a_page_work(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_page(page, tmp_path) == sum(tag in KNOWN[:3] for tag in languages(page))
+
+
+# ---------------------------------------------------------------- the checks can fail
+@pytest.mark.parametrize(
+    "line",
+    [
+        "impactopt slove punch",
+        "impactopt solve punch --solvr sqp",
+        "impactopt solve punch --starts many",
+        "impactopt solve",
+        "impactopt check no_such_problem",
+        "impactopt bench trouth",
+        "make demmo",
+        "make demo ARG='--quiet'",
+        "pip install impactopt[robot]",
+        "impactopts solve punch",
+    ],
+)
+def test_a_command_that_would_not_work_is_found_out(line: str) -> None:
+    with pytest.raises(BaseException) as raised:
+        check_line(shlex.split(line))
+    assert not isinstance(raised.value, KeyboardInterrupt)
+
+
+def test_python_that_fails_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("```python\nx = 1\n```\n\n```python\nassert x == 2\n```\n", encoding="utf-8")
+    with pytest.raises(AssertionError):
+        run_page(page, tmp_path)
+
+
+def test_a_fragment_of_a_problem_file_takes_the_place_of_its_sections(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = whole("[target]\nmass_kg = 2.0\n", BASE.read_text(encoding="utf-8"))
+    assert text.count("[target]") == 1 and "mass_kg = 2.0" in text and "mass_kg = 5.0" not in text
+    monkeypatch.chdir(tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("```toml\n[target]\nmas_kg = 2.0\n```\n", encoding="utf-8")
+    with pytest.raises(InputError, match="mas_kg"):
+        run_page(page, tmp_path)

@@ -1,0 +1,97 @@
+"""The documentation builds without a warning, asks nothing of the internet, and has what it promises."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import impactopt
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+LOADS = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "video": "src"}
+ELSEWHERE = re.compile(r"(https?:)?//")
+
+
+class Page(HTMLParser):
+    """What a page loads, and the names that links can lead to."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
+        self.formulas = 0
+        self.feed(file.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        known = dict(attrs)
+        self.formulas += tag == "math"
+        self.anchors.add(known.get("id") or "")
+        if where := known.get(LOADS.get(tag, "")):
+            self.loads.append(where)
+        if tag == "a" and (leads := known.get("href")):
+            self.links.append(leads)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site as `make docs` builds it; what it warns of is an error."""
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", str(DOCS), str(out)]
+    built = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=out)
+    assert built.returncode == 0, built.stderr[-4000:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[Path, Page]:
+    return {file: Page(file) for file in sorted(site.rglob("*.html"))}
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -> None:
+    assert sum(len(page.loads) for page in pages.values()) > 20
+    asked = [(file.name, url) for file, page in pages.items() for url in page.loads if ELSEWHERE.match(url)]
+    assert asked == []
+    for style in site.rglob("*.css"):
+        text = style.read_text(encoding="utf-8")
+        assert re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//[^)]*", text) == [], style.name
+
+
+def test_links_within_the_site_lead_somewhere(site: Path, pages: dict[Path, Page]) -> None:
+    broken = []
+    for file, page in pages.items():
+        for link in page.links:
+            if ELSEWHERE.match(link) or link.startswith("mailto:"):
+                continue
+            name, _, anchor = link.partition("#")
+            target = (file.parent / name).resolve() if name else file.resolve()
+            known = pages.get(site.resolve() / target.relative_to(site.resolve()))
+            if not target.is_file() or (anchor and known is not None and anchor not in known.anchors):
+                broken.append(f"{file.relative_to(site)}: {link}")
+    assert broken == []
+
+
+def test_formulas_are_drawn_by_the_browser_itself(site: Path, pages: dict[Path, Page]) -> None:
+    assert sum(page.formulas for page in pages.values()) > 30
+    left = [file.name for file in pages if re.search(r"\\frac|\\mathsf|\\begin\{", file.read_text("utf-8"))]
+    assert left == []
+
+
+def test_every_public_name_has_its_place_in_the_reference(pages: dict[Path, Page]) -> None:
+    anchors = [anchor for page in pages.values() for anchor in page.anchors]
+    lacking = [name for name in impactopt._EXPORTS if anchors.count(f"impactopt.{name}") != 1]
+    assert lacking == [], "name each of these once in a file of docs/api/"
+
+
+def test_the_search_needs_no_server(site: Path) -> None:
+    """Its index is a script beside the pages: a page from disk may load that, but may not fetch."""
+    index = (site / "searchindex.js").read_text(encoding="utf-8")
+    assert index.startswith("Search.setIndex(")
+    for word in ("impactproblem", "torqu", "nail"):
+        assert f'"{word}' in index or f"{word}:" in index, word

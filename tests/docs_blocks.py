@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
 import shlex
@@ -25,7 +27,12 @@ PAGES = sorted(
 )
 BASE = ROOT / "problems" / "punch_standin.toml"  # what fragments of problem files are parts of
 ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
-QUICK = ("check", "problems", "robots")  # commands that are run; of the others it is checked that they exist
+QUICK = (
+    "check",
+    "new",
+    "problems",
+    "robots",
+)  # commands that are run; of the others it is checked that they exist
 HEADER = re.compile(r"^\[{1,2}[^\]]+\]{1,2}", re.MULTILINE)
 COMMENT = re.compile(r"\s+#.*$")
 ELSEWHERE = {
@@ -64,9 +71,15 @@ def whole(fragment: str, base: str) -> str:
 def read_toml(example: Example) -> None:
     """A whole file, under the name that its first line gives, or a fragment of the page's last whole one."""
     from impactopt.problem_file import read_problem_file
+    from impactopt.sweeps import read_sweep_file
 
     text = str(example.parsed)
     named = re.match(r"# (\S+\.toml)\b", text)
+    if "[sweep]" in text:
+        path = Path(named[1] if named else "sweep.toml")
+        path.write_text(text, encoding="utf-8")
+        read_sweep_file(path)
+        return
     if "[problem]" not in text:
         text = whole(text, example.namespace.get("_toml") or BASE.read_text(encoding="utf-8"))
     else:
@@ -90,13 +103,18 @@ def commands(text: str) -> Iterator[list[str]]:
 def check_impactopt(words: list[str]) -> None:
     """An `impactopt` command's name, arguments and options exist, of the right kind; quick ones run."""
     command: Any = get_command(app)
+    words, written = (words[:-2], words[-1]) if words[-2:-1] == [">"] else (words, None)
     name, rest = "impactopt", words
     while hasattr(command, "commands") and rest and not rest[0].startswith("-"):
         assert rest[0] in command.commands, f"{name} has no command {rest[0]!r}"
         command, name, rest = command.commands[rest[0]], f"{name} {rest[0]}", rest[1:]
     if words[:1] and words[0] in QUICK:
-        code = command.main(rest, prog_name=name, standalone_mode=False)
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            code = command.main(rest, prog_name=name, standalone_mode=False)
         assert not code, f"{name} {' '.join(rest)}: exit code {code}"
+        if written is not None:
+            Path(written).write_text(printed.getvalue(), encoding="utf-8")
     elif not {"--help", "--version"} & set(rest):
         command.make_context(name, list(rest))
 
@@ -171,7 +189,9 @@ def run_page(page: Path, directory: Path) -> int:
     )
     shutil.copy(robots / "robots/talos_data/robots/talos_reduced.urdf", "my_robot.urdf")
     count = 0
-    for example in SYBIL.parse(page).examples():
+    document = SYBIL.parse(page)
+    document.namespace["__name__"] = "__main__"  # it is what the reader runs
+    for example in document.examples():
         example.evaluate()
         count += 1
     return count

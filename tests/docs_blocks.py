@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import inspect
 import io
 import os
 import re
@@ -15,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from sybil import Example, Sybil
-from sybil.parsers.markdown import CodeBlockParser, PythonCodeBlockParser
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.markdown import CodeBlockParser
 from typer.main import get_command
 
 import impactopt
@@ -34,10 +37,12 @@ QUICK = (
     "robots",
 )  # commands that are run; of the others it is checked that they exist
 HEADER = re.compile(r"^\[{1,2}[^\]]+\]{1,2}", re.MULTILINE)
+NEEDS = re.compile(r"<!-- needs [^>]+ -->\s*$")  # before a block that no test can run
 COMMENT = re.compile(r"\s+#.*$")
 ELSEWHERE = {
     "cd",
     "cp",
+    "dask",
     "export",
     "git",
     "open",
@@ -45,6 +50,28 @@ ELSEWHERE = {
     "python3",
     "source",
 }  # what the reader's machine has
+
+
+# ------------------------------------------------------------ Python
+def run_python(example: Example) -> None:
+    """Run a block; after a comment `<!-- needs SOMETHING -->` check only that what it uses of ours exists."""
+    if NEEDS.search(example.document.text[: example.start]):
+        check_python(str(example.parsed))
+    else:
+        PythonEvaluator()(example)
+
+
+def check_python(text: str) -> None:
+    """Names of the package, and the keywords that its functions are called with, exist."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module == "impactopt":
+            for alias in node.names:
+                getattr(impactopt, alias.name)
+        elif isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "impactopt":
+            getattr(impactopt, node.attr)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).startswith("impactopt."):
+            known = inspect.signature(getattr(impactopt, ast.unparse(node.func).split(".")[1])).parameters
+            assert {k.arg for k in node.keywords} <= set(known), f"{ast.unparse(node.func)}: {set(known)}"
 
 
 # ------------------------------------------------------------ problem files
@@ -158,7 +185,7 @@ def run_shell(example: Example) -> None:
 # ------------------------------------------------------------ pages
 SYBIL = Sybil(
     parsers=[
-        PythonCodeBlockParser(),
+        CodeBlockParser(language="python", evaluator=run_python),
         CodeBlockParser(language="toml", evaluator=read_toml),
         CodeBlockParser(language="sh", evaluator=run_shell),
     ]

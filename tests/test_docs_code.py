@@ -56,6 +56,21 @@ def test_python_that_fails_is_found_out(tmp_path: Path, monkeypatch: pytest.Monk
         run_page(page, tmp_path)
 
 
+@pytest.mark.parametrize(
+    "block",
+    [
+        "import impactopt\nimpactopt.swep()",
+        "from impactopt import Swep",
+        "import impactopt\nimpactopt.solve(None, sover=1)",
+    ],
+)
+def test_a_block_that_cannot_run_is_checked_all_the_same(block: str, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"<!-- needs SLURM -->\n```python\n{block}\n```\n", encoding="utf-8")
+    with pytest.raises((AttributeError, AssertionError)):
+        run_page(page, tmp_path)
+
+
 def test_a_fragment_of_a_problem_file_takes_the_place_of_its_sections(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 LOADS = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "video": "src"}
-ELSEWHERE = re.compile(r"(https?:)?//")
+ELSEWHERE = re.compile(r"(\w+:)?//")
 
 
 class Page(HTMLParser):

@@ -24,11 +24,11 @@ A problem file says in [TOML](https://toml.io) all that `impactopt.ImpactProblem
 in it is run. Units are SI, and part of a key's name where the quantity has one. Keys and sections that are
 left out keep their defaults.
 
-```text
-impactopt new                                 which problems come with the package
-impactopt new punch > my.toml                 a copy of one, with a comment to each key, and the other keys
-impactopt check my.toml                       all mistakes at once: where, what was meant, what is allowed
-impactopt solve my.toml --set target.mass=8   another value for once; a key's unit may be left out
+```sh
+impactopt new                                 # which problems come with the package
+impactopt new punch > my.toml                 # a copy of one, with a comment to each key, and the other keys
+impactopt check my.toml                       # all mistakes at once: where, what was meant, what is allowed
+impactopt solve my.toml --set target.mass=8   # another value for once; a key's unit may be left out
 ```
 
 `--set` takes a value as in TOML and can be repeated. A number of a list has its index from 0

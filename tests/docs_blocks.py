@@ -38,6 +38,7 @@ QUICK = (
 )  # commands that are run; of the others it is checked that they exist
 HEADER = re.compile(r"^\[{1,2}[^\]]+\]{1,2}", re.MULTILINE)
 NEEDS = re.compile(r"<!-- needs [^>]+ -->\s*$")  # before a block that no test can run
+OURS = re.compile(r"impactopt\.(\w+)")
 COMMENT = re.compile(r"\s+#.*$")
 ELSEWHERE = {
     "cd",
@@ -69,9 +70,9 @@ def check_python(text: str) -> None:
                 getattr(impactopt, alias.name)
         elif isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "impactopt":
             getattr(impactopt, node.attr)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).startswith("impactopt."):
-            known = inspect.signature(getattr(impactopt, ast.unparse(node.func).split(".")[1])).parameters
-            assert {k.arg for k in node.keywords} <= set(known), f"{ast.unparse(node.func)}: {set(known)}"
+        elif isinstance(node, ast.Call) and (named := OURS.fullmatch(ast.unparse(node.func))):
+            known = set(inspect.signature(getattr(impactopt, named[1])).parameters)
+            assert {keyword.arg for keyword in node.keywords} <= known, f"{named[1]} takes {known}"
 
 
 # ------------------------------------------------------------ problem files

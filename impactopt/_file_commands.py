@@ -39,7 +39,7 @@ def check(
             typer.echo(json.dumps(found, indent=2))
             return
         typer.echo(f"{file} is sound:")
-        for name, value in {**problem.describe(), "hash": problem.hash}.items():
+        for name, value in problem.describe().items():
             typer.echo(f"  {name:<8} {value}")
 
 

@@ -3,16 +3,47 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CacheWarning", "InputError", "NoCompilerWarning", "check_array", "did_you_mean"]
+__all__ = ["CacheWarning", "InputError", "Mistakes", "NoCompilerWarning", "check_array", "did_you_mean"]
 
 
 class InputError(ValueError):
-    """What was asked for cannot be done; the message names the thing and the mend."""
+    """What was asked for cannot be done; the message names the thing and the mend.
+
+    mistakes : each of them, where the message has several.
+    """
+
+    def __init__(self, message: str = "", mistakes: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.mistakes = tuple(mistakes) or (message,)
+
+
+class Mistakes:
+    """Gathers what several checks find, so that all of it can be said at once."""
+
+    def __init__(self) -> None:
+        self.found: list[str] = []
+
+    def attempt(self, check: Callable[[], object]) -> bool:
+        """Whether a check passes; what its InputError says is kept."""
+        try:
+            check()
+        except InputError as error:
+            self.found += error.mistakes
+            return False
+        return True
+
+    def raise_if_any(self, what: str) -> None:
+        """One InputError for all mistakes of `what`."""
+        if len(self.found) == 1:
+            raise InputError(self.found[0])
+        if self.found:
+            rows = "".join(f"\n  {mistake}" for mistake in self.found)
+            raise InputError(f"{what} has {len(self.found)} mistakes:{rows}", self.found)
 
 
 class NoCompilerWarning(UserWarning):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.contact.laws import ContactLaw, SpringDamper
-from impactopt.contact.targets import FreeMass, RigidWall, Target
+from impactopt._problem_checks import COLLISIONS, check_at_rest, check_collision, check_names
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, Mistakes, check_array
 from impactopt.extra_terms import HitCone, SelfCollision
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem_hash import problem_hash
@@ -22,12 +22,12 @@ from impactopt.robot import Robot
 from impactopt.scenario import Scenario
 from impactopt.skeleton import skeleton_pairs
 from impactopt.stance import BothSoles, Stance
-from impactopt.support import margin, support_polygon
 from impactopt.terms import DEFAULT_TERMS, Incidence, Term
 
 Array = NDArray[np.float64]
+__all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
+
 AnyTerm = TypeVar("AnyTerm", bound=Term)
-COLLISIONS = ("dynamics", "rigid", "virtual mass")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +93,8 @@ class ImpactProblem:
 
     Raises
     ------
-    InputError : one clear message for a NaN, a wrong shape, an unknown striker or posture, a normal that is
-        not a unit vector, a start posture outside its limits or off the ground, a point out of reach.
+    InputError : one message with all mistakes: a NaN, a wrong shape, an unknown striker or posture, a normal
+        that is not a unit vector, a start posture outside its limits or off the ground, a point out of reach.
     """
 
     robot: Robot
@@ -121,15 +121,33 @@ class ImpactProblem:
     name: str = "impact"
 
     def __post_init__(self) -> None:
-        put = object.__setattr__
-        self.robot.striker(self.striker)
-        put(self, "point", check_array("point", self.point, (3,)))
+        found = Mistakes()
+        hits = found.attempt(lambda: self.robot.striker(self.striker))
+        aimed = found.attempt(self._check_aim)
+        stands = found.attempt(self._check_stance) and found.attempt(self._check_start)
+        for check in (self._check_elements, self._check_prices, partial(check_collision, self)):
+            found.attempt(check)
+        if found.attempt(self._check_scenarios):
+            for scenario in self.scenarios:
+                found.attempt(partial(scenario.numbers, self.law, self.target))
+        if found.attempt(self._check_terms):
+            for term in self.terms:
+                found.attempt(partial(check_names, self.robot, term))
+        found.attempt(self._check_objectives)
+        if hits and aimed and stands:
+            found.attempt(lambda: self.contact_posture)
+        found.raise_if_any("the problem")
+
+    def _check_aim(self) -> None:
+        object.__setattr__(self, "point", check_array("point", self.point, (3,)))
         normal = check_array("normal", self.normal, (3,))
         if abs(np.linalg.norm(normal) - 1) > 1e-6:
             length = float(np.linalg.norm(normal))
             unit = f": did you mean {np.round(normal / length, 6).tolist()}?" if length > 0 else ""
             raise InputError(f"normal must be a unit vector, its length is {length:.6g}{unit}")
-        put(self, "normal", normal / np.linalg.norm(normal))
+        object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
+
+    def _check_elements(self) -> None:
         if len(self.collision_elements) != 2:
             raise InputError(
                 "collision_elements are those of compression and those of restitution, two tuples, not "
@@ -145,14 +163,25 @@ class ImpactProblem:
             raise InputError(
                 f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
             )
+
+    def _check_prices(self) -> None:
         for name in ("smoothness", "wrench_price", "return_price"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} must be a number >= 0, not {getattr(self, name)}")
+
+    def _check_scenarios(self) -> None:
         listed = isinstance(self.scenarios, (list, tuple))
         if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
             raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
-        put(self, "scenarios", tuple(self.scenarios))
-        self._check_collision()
+        object.__setattr__(self, "scenarios", tuple(self.scenarios))
+        if self.scenarios and self.collision != "dynamics":
+            raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
+        names = [s.name for s in self.scenarios]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"two scenarios are called {name!r}: give each a name of its own")
+
+    def _check_stance(self) -> None:
         if np.any(self.stance.compliance > 0):
             raise InputError(
                 f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
@@ -163,95 +192,31 @@ class ImpactProblem:
                 f"a plan stands on soles only: give {type(self.stance).__name__} without hands, which are "
                 "for collision models"
             )
-        put(self, "terms", tuple(self._with_pairs(t) for t in self.terms))
+
+    def _check_terms(self) -> None:
+        object.__setattr__(self, "terms", tuple(self._with_pairs(t) for t in self.terms))
         kinds = [type(t) for t in self.terms]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError(f"two terms of kind {kind.__name__}: give one")
         if HitCone in kinds and Incidence in kinds:
             raise InputError("HitCone takes the place of Incidence: give one of them")
-        self._check_names()
+
+    def _check_objectives(self) -> None:
         lasts, stands = self.collision == "dynamics", self.robot.floating
-        put(self, "objectives", check_objectives(self.objectives, contact=lasts, balance=stands))
+        checked = check_objectives(self.objectives, contact=lasts, balance=stands)
+        object.__setattr__(self, "objectives", checked)
+
+    def _check_start(self) -> None:
         posture = self.start_posture
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
-        self._check_at_rest(posture)
-        _ = self.contact_posture
-
-    def _check_at_rest(self, posture: Array) -> None:
-        """InputError if the start's centre of mass is not above the held soles: it would fall at once."""
-        polygon = support_polygon(self.robot, self.coordinates)
-        if not len(polygon):
-            return
-        model, names = self.robot.model, ", ".join(self.stance.sole_names(self.robot))
-        centre = np.array(pin.centerOfMass(model, model.createData(), posture))[:2]
-        inside = float(margin(polygon, centre[None])[0])
-        if inside < 0:
-            raise InputError(
-                f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm "
-                f"outside the support polygon of {names}; start from a posture with its weight on what is "
-                "held, or hold more"
-            )
+        check_at_rest(self.robot, self.coordinates, self.stance.sole_names(self.robot), posture)
 
     def _with_pairs(self, term: Term) -> Term:
         if isinstance(term, SelfCollision) and term.pairs is None:
             return replace(term, pairs=skeleton_pairs(self.robot, self.striker))
         return term
-
-    def _check_names(self) -> None:
-        """That the robot has what the terms name."""
-        frames = [f.name for f in self.robot.model.frames]
-        for term in self.terms:
-            for kind, names, known in (
-                ("frame", term.frames, frames),
-                ("joint", term.joints, self.robot.joint_names),
-            ):
-                for name in names:
-                    if name not in known:
-                        near = did_you_mean(name, known)
-                        raise InputError(
-                            f"{type(term).__name__}: {self.robot.name} has no {kind} {name!r}{near}"
-                        )
-
-    def _check_collision(self) -> None:
-        for name, kind in (("law", ContactLaw), ("target", Target)):
-            thing = getattr(self, name)
-            if not isinstance(thing, kind):
-                raise InputError(f"{name} must be a {kind.__name__} of impactopt.contact, not {thing!r}")
-        if self.collision not in COLLISIONS:
-            raise InputError(
-                f"unknown collision {self.collision!r}{did_you_mean(self.collision, COLLISIONS)}: there are "
-                f"{', '.join(COLLISIONS)}"
-            )
-        e = self.coefficient_of_restitution
-        if not 0 <= e <= 1:
-            raise InputError(f"coefficient_of_restitution must be between 0 and 1, not {e}")
-        if e and self.collision != "rigid":
-            raise InputError(
-                f'coefficient_of_restitution is for collision="rigid"; with {self.collision!r} leave it out'
-            )
-        if self.collision == "virtual mass" and not isinstance(self.law, SpringDamper):
-            raise InputError(
-                'collision="virtual mass" has a closed form for the law SpringDamper only, not '
-                f"{type(self.law).__name__}"
-            )
-        if self.collision != "dynamics" and not isinstance(self.target, (FreeMass, RigidWall)):
-            raise InputError(
-                f"collision={self.collision!r} knows the targets FreeMass and RigidWall only, not "
-                f'{type(self.target).__name__}; take collision="dynamics"'
-            )
-        if self.collision == "dynamics":  # refuses what has switches
-            still = [[0.0] * k for k in (self.target.n_states, len(self.target.helpers))]
-            self.target.smooth(still[0], 0.0, still[1], False)
-        if self.scenarios and self.collision != "dynamics":
-            raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
-        for s in self.scenarios:
-            s.numbers(self.law, self.target)
-        names = [s.name for s in self.scenarios]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"two scenarios are called {name!r}: give each a name of its own")
 
     @property
     def brake_after(self) -> float | None:
@@ -304,6 +269,7 @@ class ImpactProblem:
             "normal": self.normal.tolist(),
             "target": repr(self.target),
             "law": repr(self.law),
+            "hash": self.hash,
         }
         if self.collision != "dynamics":
             restitution = f", restitution {self.coefficient_of_restitution:g}"

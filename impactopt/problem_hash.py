@@ -71,4 +71,6 @@ def _plain(item: Any) -> Any:
     if dataclasses.is_dataclass(item):
         fields = {f.name: _plain(getattr(item, f.name)) for f in dataclasses.fields(item)}
         return type(item).__name__, fields
+    if hasattr(item, "__dict__") and not callable(item):  # a stance of a user's own, which is no dataclass
+        return type(item).__name__, _plain(vars(item))
     raise TypeError(f"a problem holds {item!r}, which has no hash")

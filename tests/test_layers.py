@@ -30,6 +30,7 @@ LAYERS = (
         "objectives",
         "scenario",
         "problem_hash",
+        "_problem_checks",
         "problem",
         "plan",
     ),

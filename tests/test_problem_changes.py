@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impactopt import objectives, terms
+from impactopt import extra_terms, objectives, terms
 from impactopt.contact import CustomLaw, FreeMass
 from impactopt.errors import InputError
 from impactopt.problem import ImpactProblem, Phase
@@ -286,3 +286,49 @@ def test_what_python_can_say_a_file_can_too(problem: ImpactProblem) -> None:
     ):
         with pytest.raises(InputError, match=said):
             problem_from_data(change_data(DATA, {key: value}), where="x.toml")
+
+
+def test_all_that_is_wrong_with_a_problem_is_said_at_once(problem: ImpactProblem) -> None:
+    gaze = extra_terms.Gaze(frame="heed", axis=(1, 0, 0))
+    rate = extra_terms.TorqueRate(limit={"elbo": 1.0, "wrst": 1.0})
+    with pytest.raises(InputError) as caught:
+        dataclasses.replace(
+            problem,
+            striker="hamer",
+            normal=[1.0, 1.0, 0.0],
+            smoothness=-1.0,
+            contact_duration=(0.2, 0.1),
+            terms=(gaze, rate),
+        )
+    said = ["'hammer'", "unit vector", "smoothness", "contact_duration", "'heed'", "'elbow'", "'wrist'"]
+    assert len(caught.value.mistakes) == len(said)
+    assert "the problem has 7 mistakes" in str(caught.value)
+    for mend in said:
+        assert sum(mend in mistake for mistake in caught.value.mistakes) == 1, mend
+
+
+def test_all_that_is_wrong_with_a_robot_is_said_with_its_lines(tmp_path: Path) -> None:
+    data = {**DATA, "problem": {k: v for k, v in DATA["problem"].items() if k != "robot"}}
+    hand = {"name": "hand", "frame": "hnd", "point_m": [0.0, 0.0, 0.1]}
+    robot = {"preset": "planar_arm", "kp_N_m_rad": {"elbw": 1.0}, "kd_N_m_s_rad": {"wrst": 1.0}}
+    path = tmp_path / "arm.toml"
+    path.write_text(write_toml({**data, "robot": {**robot, "strikers": [hand]}}), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        load_problem(path)
+    rows = str(caught.value).splitlines()
+    assert "3 mistakes" in rows[0]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for row, (key, meant) in zip(rows[1:], (("elbw", "elbow"), ("wrst", "wrist"), ("hnd", "")), strict=True):
+        number = int(row.split("line ")[1].split(",")[0])
+        assert key in row and meant in row
+        assert key in "".join(lines[number - 2 : number + 2])
+
+
+def test_names_in_terms_are_told_beside_other_names() -> None:
+    data = change_data(DATA, {"problem.striker": "hamer", "problem.start": "redy"})
+    data = change_data(data, {"terms.gaze": {"frame": "elbw", "axis": [1.0, 0.0, 0.0]}})
+    with pytest.raises(InputError) as caught:
+        problem_from_data(data, where="arm.toml")
+    text = str(caught.value)
+    assert "3 mistakes" in text and "[terms.gaze]" in text
+    assert all(meant in text for meant in ("'hammer'", "'ready'", "'elbow'"))

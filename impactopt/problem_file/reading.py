@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from impactopt._problem_checks import check_names
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file.changes import change_and_place
@@ -71,18 +73,27 @@ class ProblemFile:
             frame; then an unknown striker, posture and sole, all at once; then a point out of reach.
         """
         content, mistakes = self.content, _Collector(self.lines)
-        robot = mistakes.attempt(("robot",), lambda: content.make_robot(self.path.parent))
-        mistakes.raise_if_any(self.path)
-        assert robot is not None  # for mypy: it would have been a mistake
+        try:
+            robot = content.make_robot(self.path.parent)
+        except InputError as error:
+            for place, wrong in content.robot_mistakes(self.path.parent, error):
+                mistakes.add(place, wrong)
+            raise InputError(mistakes.report(self.path)) from error
         mistakes.attempt(("problem", "striker"), lambda: robot.striker(content.problem.striker))
         mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
         stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
-        mistakes.raise_if_any(self.path)
+        given = content.arguments()
+        if mistakes or stance is None:
+            # the rest of the problem cannot be put together, but what its terms name can be looked at
+            for name, term in content.given_terms():
+                mistakes.attempt(("terms", name), partial(check_names, robot, term))
+            mistakes.raise_if_any(self.path)
         assert stance is not None
         try:
-            return ImpactProblem(robot=robot, stance=stance, **content.arguments())
+            return ImpactProblem(robot=robot, stance=stance, **given)
         except InputError as error:
-            raise InputError(f"{self.path}: {error}") from error
+            mistakes.add((), error)
+            raise InputError(mistakes.report(self.path)) from error
 
 
 def load_problem(path: str | os.PathLike[str]) -> ImpactProblem:
@@ -162,17 +173,27 @@ class _Collector:
     def __init__(self, lines: Mapping[Place, int]) -> None:
         self._lines, self._mistakes = lines, list[Mistake]()
 
+    def __bool__(self) -> bool:
+        return bool(self._mistakes)
+
+    def add(self, place: tuple[str, ...], error: InputError) -> None:
+        sections = max(1, len(place) - 1) if place[:1] != ("terms",) else len(place)
+        self._mistakes += [Mistake(place=place, sections=sections, text=text) for text in error.mistakes]
+
     def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
         """What `make` gives; None, and a mistake at `place`, if it raises an InputError."""
         try:
             return make()
         except InputError as error:
-            self._mistakes.append(Mistake(place=place, sections=1, text=str(error)))
+            self.add(place, error)
             return None
+
+    def report(self, path: Path) -> str:
+        return report_mistakes(str(path), self._lines, self._mistakes)
 
     def raise_if_any(self, path: Path) -> None:
         if self._mistakes:
-            raise InputError(report_mistakes(str(path), self._lines, self._mistakes))
+            raise InputError(self.report(path))
 
 
 def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:

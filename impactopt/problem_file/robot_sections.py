@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from pydantic import model_validator
 
+from impactopt.errors import InputError
 from impactopt.presets import load_robot
 from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import (
@@ -128,3 +129,30 @@ class RobotSection(Section):
         for tool in tools:
             robot = robot.with_tool(tool)
         return robot
+
+    def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
+        """All that keeps `make` from making a robot, `error` being the first of it, and of which key it is.
+
+        Each key is tried by itself on the bare robot.
+        """
+        bare = {key: getattr(self, key) for key in self.model_fields_set & _BARE}
+        if _tried(bare, folder):
+            return [((), error)]
+        found: list[tuple[tuple[str, ...], InputError]] = []
+        for key, info in type(self).model_fields.items():
+            if key in self.model_fields_set - _BARE:
+                wrong = _tried({**bare, key: getattr(self, key)}, folder)
+                found += [((info.alias or key,), wrong)] if wrong else []
+        return found or [((), error)]
+
+
+_BARE = {"preset", "urdf", "srdf", "floating", "locked"}  # what the other keys are about
+
+
+def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:
+    """What is wrong with a robot of these keys alone."""
+    try:
+        RobotSection.model_construct(_fields_set=set(keys), **keys).make(folder)
+    except InputError as error:
+        return error
+    return None

@@ -7,7 +7,7 @@ stand nowhere twice.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
@@ -265,6 +265,19 @@ class File(Section):
         """The robot of [robot], or the preset that [problem] names."""
         section = RobotSection(preset=self.problem.robot) if self.robot is None else self.robot
         return section.make(folder)
+
+    def robot_mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
+        """All that keeps `make_robot` from making one, `error` being the first of it, and where it is."""
+        if "robot" not in self.model_fields_set:
+            return [(("problem", "robot"), error)]
+        return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
+
+    def given_terms(self) -> Iterator[tuple[str, Any]]:
+        """The terms that the file has, by their sections' names."""
+        for name in Terms.model_fields if self.terms is not None else ():
+            section = getattr(self.terms, name)
+            if section is not None:
+                yield name, section.build()
 
     def make_stance(self, robot: Robot) -> Stances:
         """What [stance] says of a robot; InputError for what it cannot stand on."""

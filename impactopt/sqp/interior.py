@@ -28,11 +28,10 @@ from impactopt.program import (
     stationarity,
 )
 from impactopt.sqp.barrier import Bounded
-from impactopt.sqp.compiled import kernels
-from impactopt.sqp.condense import Condenser, Determined, find_eliminations
+from impactopt.sqp.condense import Determined
 from impactopt.sqp.elastic import Elastic
 from impactopt.sqp.linesearch import Filter, Progress
-from impactopt.sqp.newton import NewtonSystem
+from impactopt.sqp.newton import borrow, give_back
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point, TimedProgram
 from impactopt.sqp.report import Report
@@ -91,22 +90,22 @@ class InteriorRun:
         x = point.x
         moves = p.x_upper - p.x_lower > 1e-12
         bounded = (np.isfinite(p.x_lower) | np.isfinite(p.x_upper)) & moves
-        algebra = kernels()
-        self._condenser = c = Condenser(
+        self._newton = borrow(
             point.jacobian,
             p.hessian(x, 1.0, np.zeros(p.m)),
-            find_eliminations(point.jacobian, p.g_lower == p.g_upper, self._determined),
-            p.g_lower == p.g_upper,
-            bounded,
-            algebra,
+            determined=self._determined,
+            equal=p.g_lower == p.g_upper,
+            bounded=bounded,
+            moves=moves,
+            sequence=self._sequence,
         )
+        self._condenser = c = self._newton.condenser
         lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])
         upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
         self._gone = lower[c.eliminated]
         lower, upper = lower[c.rows], upper[c.rows]
         self._equal, self._unequal = np.flatnonzero(lower == upper), np.flatnonzero(lower < upper)
         self._level = lower[self._equal]
-        self._held = np.flatnonzero(~moves[c.free])
         push = self.options.push_warm if self._warm else self.options.push
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         self._x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self._mu)
@@ -128,7 +127,6 @@ class InteriorRun:
         if not self._warm:
             for values in (self._x, self._s):
                 values.below, values.above = np.sign(values.below), np.sign(values.above)
-        self._newton = NewtonSystem(c, self._held, self._sequence, algebra)
         self._elastic: Elastic | None = None
         self._filter: Filter | None = None
 
@@ -149,6 +147,12 @@ class InteriorRun:
             self.report.iteration(self.point, self._kkt, "start")
             return Status.SOLVED
         self._begin()
+        try:
+            return self._iterate()
+        finally:
+            give_back(self._newton)
+
+    def _iterate(self) -> Status:
         note = "start"
         for _ in range(self.options.max_iterations + 1):
             residual = self._residual(self.point, self._s.values)
@@ -403,7 +407,7 @@ class InteriorRun:
         self.z[c.free] = self._x.multiplier
         self.z[c.bounded] = everything[p.m :]
         dual = self._sigma * point.gradient + point.jacobian.T @ self.y + self.z
-        held = c.free[self._held]
+        held = c.free[self._newton.held]
         self.z[held] -= dual[held]
         dual[held] = 0.0
         self._dual = float(np.abs(dual).max(initial=0.0))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from impactopt.program import Matrix, Vector
 from impactopt.sqp.cholesky import BlockCholesky
-from impactopt.sqp.condense import Condenser
+from impactopt.sqp.compiled import kernels
+from impactopt.sqp.condense import Condenser, Determined, Mask, find_eliminations
 from impactopt.sqp.kernels import Index, Kernels
 
+_KEPT = 3  # structures
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
 _HELD = 1e15  # on the diagonal of variables that must not move
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
@@ -29,6 +33,7 @@ class NewtonSystem:
 
     Attributes
     ----------
+    condenser : of this system; held : numbers of the free variables that do not move.
     shift : the last.
     """
 
@@ -36,7 +41,7 @@ class NewtonSystem:
         """held: numbers of the free variables that do not move; sequence (n,): variables near each other in
         it touch each other, None: to be found.
         """
-        self._condenser, self._held = condenser, held
+        self.condenser, self.held = condenser, held
         order = None if sequence is None else sequence[condenser.free]
         self._matrix = BlockCholesky(condenser.pattern, order, kernels)
         _, i, j = condenser.at_free
@@ -44,8 +49,12 @@ class NewtonSystem:
         self._diagonal_to = self._matrix.places(
             np.arange(condenser.free.size), np.arange(condenser.free.size)
         )
-        self._last = 0.0
-        self.shift = 0.0
+        self.begin(b"")
+
+    def begin(self, key: bytes) -> None:
+        """Forget the shifts of another program; key: of the structure."""
+        self.key = key
+        self._last = self.shift = 0.0
 
     def factor(
         self,
@@ -63,7 +72,7 @@ class NewtonSystem:
 
         False: nothing helps.
         """
-        c = self._condenser
+        c = self.condenser
         try:
             c.load(jacobian, hessian)
         except np.linalg.LinAlgError:
@@ -96,7 +105,7 @@ class NewtonSystem:
         """Weights of the equalities left: far above the curvature along them, and no farther."""
         squares = self._A.multiply(self._A)
         length = np.maximum(1e-30, squares.sum(axis=1))
-        curvature = squares @ np.abs(self._hessian.diagonal()[self._condenser.free]) / length
+        curvature = squares @ np.abs(self._hessian.diagonal()[self.condenser.free]) / length
         out: Vector = _PENALTY * np.maximum(1.0, curvature) / np.maximum(1.0, length)
         return out
 
@@ -118,10 +127,10 @@ class NewtonSystem:
 
     def _values(self) -> Vector:
         """The matrix as `BlockCholesky` takes it."""
-        c, matrix = self._condenser, self._matrix
+        c, matrix = self.condenser, self._matrix
         values = np.zeros(matrix.size)
         values[self._to] = c.reduce(self._weights, self._diagonal)
-        values[self._diagonal_to[self._held]] += _HELD
+        values[self._diagonal_to[self.held]] += _HELD
         A = self._A
         for w, a, b in zip(self._weights[c.rows[c.equal]], A.indptr[:-1], A.indptr[1:], strict=True):
             columns, row = A.indices[a:b], A.data[a:b]
@@ -133,7 +142,7 @@ class NewtonSystem:
         """The step (n,) and the new multipliers (m,) of all rows, for a gradient (n,) and the rows' residuals
         (m,): what they are off by, with weights.
         """
-        c, w = self._condenser, self._weights.copy()
+        c, w = self.condenser, self._weights.copy()
         equal = c.rows[c.equal]
         w[equal] = 0.0
         exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
@@ -143,7 +152,7 @@ class NewtonSystem:
         left[exact] = (rows + r)[exact]
         hard[c.eliminated], hard[equal] = y[c.eliminated], y[equal]
         dual += self._pulled(hard)
-        dual[c.free[self._held]] = 0.0
+        dual[c.free[self.held]] = 0.0
         more_d, more_y, _, _ = self._respond(dual, left, w)
         d, y = d + more_d, y + more_y
         y += w * r
@@ -153,18 +162,18 @@ class NewtonSystem:
         """Step for a gradient and the residuals of equalities; multipliers, of rows with weights w what the
         step changes; how all rows change; gradient of the Lagrangian without the equalities.
         """
-        c = self._condenser
+        c = self.condenser
         equal = c.rows[c.equal]
         own = self._weights[equal]
         by_free, off = c.forward(g, r)
         by_free += self._A.T @ (own * off)
-        by_free[self._held] = 0.0
+        by_free[self.held] = 0.0
         free = -self._matrix.solve(by_free)
         extra = np.zeros(equal.size)
         if self._hard and equal.size:
             extra = np.linalg.lstsq(self._schur, self._A @ free + off, rcond=None)[0]
             free -= self._spread @ extra
-        free[self._held] = 0.0
+        free[self.held] = 0.0
         d = c.expand(free)
         rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
         y = w * rows
@@ -177,5 +186,52 @@ class NewtonSystem:
         """Gradient of all rows with multipliers (m,)."""
         m = self._jacobian.shape[0]
         out: Vector = self._transposed @ y[:m]
-        out[self._condenser.bounded] += y[m:]
+        out[self.condenser.bounded] += y[m:]
         return out
+
+
+# ---------------------------------------------------------------- structures
+_structures: OrderedDict[bytes, NewtonSystem] = OrderedDict()
+
+
+def borrow(
+    jacobian: Matrix,
+    hessian: Matrix,
+    *,
+    determined: Sequence[Determined],
+    equal: Mask,
+    bounded: Mask,
+    moves: Mask,
+    sequence: Vector | None,
+) -> NewtonSystem:
+    """The system for these patterns, for one who gives it back: its structure takes as long as 30 iterations
+    and serves all programs that differ in their numbers.
+
+    determined : what rows determine; equal (m,): which rows are equalities; bounded, moves (n,): which
+    variables have a finite bound, and which are not fixed; sequence (n,): see `NewtonSystem`.
+    """
+    arrays = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
+    arrays += [variables for _, variables in determined]
+    ranks = np.array([rank for rank, _ in determined])
+    arrays += [ranks, equal, bounded, moves, np.zeros(0) if sequence is None else sequence]
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    key = digest.digest()
+    system = _structures.pop(key, None)
+    if system is None:
+        algebra = kernels()
+        eliminations = find_eliminations(jacobian, equal, determined)
+        condenser = Condenser(jacobian, hessian, eliminations, equal, bounded, algebra)
+        held = np.flatnonzero(~moves[condenser.free])
+        system = NewtonSystem(condenser, held, sequence, algebra)
+    system.begin(key)
+    return system
+
+
+def give_back(system: NewtonSystem) -> None:
+    """Keep the structure for the next program that has it."""
+    _structures[system.key] = system
+    while len(_structures) > _KEPT:
+        _structures.popitem(last=False)

@@ -144,6 +144,9 @@ class CompiledKernels(Kernels):
         return self._lists[key]
 
     # ------------------------------------------------------------------ the operations
+    def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
+        self._c.newton_copy(_at(values), _at(source), _at(to), _at(places), ctypes.c_int64(source.size))
+
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
         _, parts, work = self._groups(products)
         groups = ctypes.c_int64(len(products))

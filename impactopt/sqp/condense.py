@@ -94,6 +94,7 @@ class Condenser:
     equal : which of the rows left are equalities: numbers into `rows`.
     bounded : eliminated variables with a bound, each a row of its own from number m on.
     m, n : number of rows with those of `bounded`, and of variables.
+    at_free : places of the numbers of free variables in what `reduce` gives, and their rows and columns.
     pattern : which of the free variables W couples (f, f), once all is eliminated, with those that an
         equality left touches.
     """
@@ -143,9 +144,9 @@ class Condenser:
         pairs, nothing = _numbered(i, j, couples.shape)
         pairs[j, i] = pairs[i, j]
         self.J, self.W = np.zeros(none + 1), np.zeros(nothing + 1)
-        self._own_jacobian = rows[own_rows, own_columns], mine
+        self._own_jacobian = mine.astype(np.int32), rows[own_rows, own_columns]
         lower = H.row >= H.col
-        self._own_hessian = pairs[H.row[lower], H.col[lower]], np.flatnonzero(lower)
+        self._own_hessian = np.flatnonzero(lower).astype(np.int32), pairs[H.row[lower], H.col[lower]]
         self._diagonal = np.diagonal(pairs).copy()
         self._products = [_products(pairs, *group) for group in groups]
         self._stages = [_stage(found, rows, none, pairs, nothing) for found in systems]
@@ -159,7 +160,7 @@ class Condenser:
         place = np.full(n, -1)
         place[self.free] = np.arange(self.free.size)
         inside = (place[i] >= 0) & (place[j] >= 0)
-        self.at_free = np.flatnonzero(inside), place[i[inside]], place[j[inside]]
+        self.at_free = np.flatnonzero(inside).astype(np.int32), place[i[inside]], place[j[inside]]
 
     # ------------------------------------------------------------------ numbers
     def load(self, jacobian: Matrix, hessian: Matrix) -> None:
@@ -169,10 +170,12 @@ class Condenser:
         ------
         LinAlgError : rows do not determine their variables.
         """
-        self._jacobian, self._hessian = jacobian.data, hessian.data
+        self._jacobian, self._hessian = (
+            np.ascontiguousarray(a.data, dtype=float) for a in (jacobian, hessian)
+        )
         self.J[:] = 0.0
-        to, where = self._own_jacobian
-        self.J[to] = jacobian.data[where]
+        where, to = self._own_jacobian
+        self._kernels.copy(self._jacobian, where, self.J, to)
         for stage in self._stages:
             self._kernels.eliminate(stage, self.J)
 
@@ -183,21 +186,20 @@ class Condenser:
         return sp.csr_array((self.J[where], *structure), shape=(self._left.size, self.free.size))
 
     def reduce(self, weights: Vector, diagonal: Vector) -> Vector:
-        """H + diag(diagonal) + J' diag(weights) J, and eliminated from: values at the places `at_free`.
+        """H + diag(diagonal) + J' diag(weights) J, eliminated from: its values, to be read by `at_free`.
 
         weights (m,) of the rows: those of equalities play no part; diagonal (n,).
         """
         self.W[:] = 0.0
-        to, where = self._own_hessian
-        self.W[to] = self._hessian[where]
+        where, to = self._own_hessian
+        self._kernels.copy(self._hessian, where, self.W, to)
         self.W[self._diagonal] += diagonal
         bounds = self._diagonal[self.bounded]
         self.W[bounds] += weights[self.m - self.bounded.size :]
         self._kernels.add_products(self._products, self._jacobian, weights, self.W)
         for stage in self._stages:
             self._kernels.reduce(stage, self.W)
-        out: Vector = self.W[self.at_free[0]]
-        return out
+        return self.W
 
     def forward(self, gradient: Vector, residual: Vector) -> tuple[Vector, Vector]:
         """Gradient by the free variables (f,) and residual of the equalities left (l,), where the step meets

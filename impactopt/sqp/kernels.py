@@ -105,6 +105,10 @@ class Panels:
 class Kernels:
     """In NumPy."""
 
+    def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
+        """to[places] = values[source]"""
+        to[places] = values[source]
+
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
         """W += J' diag(weights) J."""
         for p in products:

@@ -10,9 +10,9 @@ import numpy as np
 
 from impactopt.program import Matrix, Vector
 from impactopt.sqp.cholesky import BlockCholesky
-from impactopt.sqp.compiled import kernels
+from impactopt.sqp.compiled import kernels as fastest
 from impactopt.sqp.condense import Condenser, Determined, Mask, find_eliminations
-from impactopt.sqp.kernels import Index, Kernels
+from impactopt.sqp.kernels import Index, Kernels, Products
 
 _KEPT = 3  # structures
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
@@ -44,11 +44,15 @@ class NewtonSystem:
         self.condenser, self.held = condenser, held
         order = None if sequence is None else sequence[condenser.free]
         self._matrix = BlockCholesky(condenser.pattern, order, kernels)
-        _, i, j = condenser.at_free
-        self._to = self._matrix.places(i, j)
-        self._diagonal_to = self._matrix.places(
-            np.arange(condenser.free.size), np.arange(condenser.free.size)
-        )
+        self._from, i, j = condenser.at_free
+        places = self._matrix.places
+        self._to = places(i, j).astype(np.int32)
+        self._diagonal_to = places(np.arange(condenser.free.size), np.arange(condenser.free.size))
+        self._products, self._kernels, A = [], kernels, condenser.A
+        for row, (a, b) in enumerate(zip(A.indptr[:-1], A.indptr[1:], strict=True)):
+            columns, (i, j) = A.indices[a:b], np.tril_indices(b - a)
+            own = np.full(1, row, dtype=np.int32), np.arange(a, b, dtype=np.int32)[None]
+            self._products.append(Products(*own, places(columns[i], columns[j]).astype(np.int32)))
         self.begin(b"")
 
     def begin(self, key: bytes) -> None:
@@ -127,15 +131,12 @@ class NewtonSystem:
 
     def _values(self) -> Vector:
         """The matrix as `BlockCholesky` takes it."""
-        c, matrix = self.condenser, self._matrix
-        values = np.zeros(matrix.size)
-        values[self._to] = c.reduce(self._weights, self._diagonal)
+        c = self.condenser
+        values = np.zeros(self._matrix.size)
+        W = c.reduce(self._weights, self._diagonal)
+        self._kernels.copy(W, self._from, values, self._to)
         values[self._diagonal_to[self.held]] += _HELD
-        A = self._A
-        for w, a, b in zip(self._weights[c.rows[c.equal]], A.indptr[:-1], A.indptr[1:], strict=True):
-            columns, row = A.indices[a:b], A.data[a:b]
-            i, j = np.tril_indices(columns.size)
-            values[matrix.places(columns[i], columns[j])] += w * row[i] * row[j]
+        self._kernels.add_products(self._products, self._A.data, self._weights[c.rows[c.equal]], values)
         return values
 
     def solve(self, q: Vector, r: Vector) -> tuple[Vector, Vector]:
@@ -221,7 +222,7 @@ def borrow(
     key = digest.digest()
     system = _structures.pop(key, None)
     if system is None:
-        algebra = kernels()
+        algebra = fastest()
         eliminations = find_eliminations(jacobian, equal, determined)
         condenser = Condenser(jacobian, hessian, eliminations, equal, bounded, algebra)
         held = np.flatnonzero(~moves[condenser.free])

@@ -45,6 +45,11 @@ static void take(const double *from, const int32_t *at, int64_t count, double *t
     for (int64_t i = 0; i < count; ++i) to[i] = from[at[i]];
 }
 
+EXPORT void newton_copy(const double *values, const int32_t *source, double *to, const int32_t *places,
+                        int64_t count) {
+    for (int64_t i = 0; i < count; ++i) to[places[i]] = values[source[i]];
+}
+
 /* ---------------------------------------------------------------- matrices */
 /* Rows of groups, one after the other: g rows over p columns; W's places of the products of two. */
 EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, const int32_t *rows,

@@ -16,7 +16,7 @@ __all__ = ["charts_of", "thinned"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
-BUCKETS = 500  # of a history; of each its ends, and its least and largest value are kept
+BUCKETS = 400  # of a history; of each its ends, and its least and largest value are kept
 NEAR = (0.01, 0.03)  # [s] before and after contact that the force is shown over at first
 # label, prefix in a record, style; the styles are those of style.css
 SOURCES = (
@@ -51,9 +51,10 @@ def thinned(time: Array, *columns: Array) -> list[Array]:
     """Time (k,) and columns at fewer instants: of each bucket its ends, and where a column is least and most.
 
     Source: U. Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB 2014: lines
-    through these look as through all.
+    through these look as through all. The neighbours of the extremes are kept too: a jump stays one when seen
+    closely.
     """
-    if len(time) <= 4 * BUCKETS:
+    if len(time) <= 3 * BUCKETS:
         return [time, *columns]
     edges = np.linspace(0, len(time), BUCKETS + 1).astype(int)
     kept = {*edges[:-1].tolist(), *(edges[1:] - 1).tolist()}
@@ -61,7 +62,8 @@ def thinned(time: Array, *columns: Array) -> list[Array]:
         for column in columns:
             part = column[low:high]
             if np.isfinite(part).any():
-                kept |= {low + int(np.nanargmin(part)), low + int(np.nanargmax(part))}
+                extremes = {low + int(np.nanargmin(part)), low + int(np.nanargmax(part))}
+                kept |= {k + step for k in extremes for step in (-1, 0, 1) if 0 <= k + step < len(time)}
             if not np.isfinite(part).all():  # where a history has a gap, so has its picture
                 kept.add(low + int(np.argmin(np.isfinite(part))))
     chosen = np.array(sorted(kept))

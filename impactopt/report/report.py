@@ -116,7 +116,7 @@ def _cards(s: Mapping[str, Any]) -> str:
         least = 1e3 * min(margins.values())
         card(f"{least:.0f} mm", "least planned ZMP margin", "" if least >= 0 else "bad")
     standing = s.get("replayed", {}).get("standing")
-    if standing is not None:
+    if standing is not None and margins:  # without soles nothing can fall
         card("stands" if standing else "falls", "replayed on free soles", "good" if standing else "bad")
     return f'<div class="cards">{"".join(cards)}</div>'
 

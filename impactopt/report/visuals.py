@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import coal
@@ -13,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.report.solids import Solid, box, cylinder, rounded_box, sphere
-from impactopt.robot import Robot
+from impactopt.robot import Robot, Striker
 
 __all__ = ["Visual", "visuals_of"]
 
@@ -36,10 +37,11 @@ class Visual:
 def visuals_of(robot: Robot) -> list[Visual]:
     """The robot's visual shapes; links whose mesh files are missing or damaged are left out.
 
-    If nothing is left, boxes of the links' inertia, and bones between the joints.
+    Tools are rods. If nothing is left, boxes of the links' inertia, and bones between the joints.
     """
     found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
-    return found or _from_inertia(robot)
+    tools = robot.source.tools if robot.source is not None else ()
+    return [*found, *_bones_to(robot, [tool.striker for tool in tools])] if found else _from_inertia(robot)
 
 
 def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
@@ -149,9 +151,19 @@ def _from_inertia(robot: Robot) -> list[Visual]:
             found.append(Visual(joint=j, solid=sphere(THICK), colour=JOINT))
         if parent > robot.floating:
             found += _bone(parent, np.array(model.jointPlacements[j].translation))
-    for striker in robot.strikers.values():
-        frame = model.frames[model.getFrameId(striker.model_frame)]
-        found += _bone(int(frame.parentJoint), np.array(frame.placement.translation))
+    return found + _bones_to(robot, robot.strikers.values())
+
+
+def _bones_to(robot: Robot, strikers: Iterable[Striker]) -> list[Visual]:
+    """From the frame that each is given in to the striking point, with a ball there."""
+    model, found = robot.model, []
+    for striker in strikers:
+        frame = model.frames[model.getFrameId(striker.frame)]
+        joint, place = int(frame.parentJoint), frame.placement
+        ball = sphere(THIN).moved(np.eye(3), place.act(striker.point))
+        rod = _bone(joint, np.array(striker.point))
+        found += [replace(v, solid=v.solid.moved(place.rotation, place.translation)) for v in rod]
+        found.append(Visual(joint=joint, solid=ball, colour=JOINT))
     return found
 
 

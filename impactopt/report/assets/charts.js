@@ -23,7 +23,7 @@ class Frame {
     this.legend = make("div", { class: "legend" });
     const bar = make("div", { class: "group tools", role: "group", "aria-label": `zoom: ${spec.title}` });
     for (const [text, label, act] of tools) bar.append(make("button", { "aria-label": label, title: label, onclick: act }, text));
-    this.svg = svg("svg", { tabindex: 0, role: "img", "aria-label": `${spec.title}. ${spec.hint}` });
+    this.svg = svg("svg", { tabindex: 0, role: "application", "aria-label": `${spec.title}. ${spec.hint}` });
     this.body = make("div", { class: "plot" }, this.svg);
     this.heading = make("div", { class: "head" }, make("h3", {}, spec.title), bar);
     this.root = make("figure", { class: "chart" }, this.heading, this.legend, this.body);
@@ -190,21 +190,24 @@ class Chart extends Frame {
     if (at != null) { this.line.setAttribute("x1", this.x(at)); this.line.setAttribute("x2", this.x(at)); }
     this.spec.series.forEach((s, n) => {
       const [x, y] = [this.column(s.x), this.column(s.y)];
-      const near = at == null || !x.length ? -1 : this.nearest(x, at), dot = this.dots[n];
-      const there = near >= 0 && !this.hidden.has(s.label) && Number.isFinite(y[near]);
+      const [px, py] = at == null || this.hidden.has(s.label) ? [] : this.valueAt(x, y, at), dot = this.dots[n];
+      const there = Number.isFinite(py);
       dot.style.display = there ? "" : "none";
-      if (there) { dot.setAttribute("cx", this.x(x[near])); dot.setAttribute("cy", this.y(y[near])); }
-      const value = there ? (this.spec.log ? 10 ** y[near] : y[near]) : NaN;
-      this.values[n].textContent = there ? `${shortNumber(value)}${this.names?.(s, near) ?? ""}` : "";
+      if (there) { dot.setAttribute("cx", this.x(px)); dot.setAttribute("cy", this.y(py)); }
+      this.values[n].textContent = there ? shortNumber(this.spec.log ? 10 ** py : py) : "";
     });
     const unit = this.timed ? " s" : "";
     this.when ??= this.legend.appendChild(make("span", { class: "when" }));
     this.when.textContent = at == null ? "" : `${this.timed ? "t = " : ""}${this.timed ? at.toFixed(3) : shortNumber(at)}${unit}`;
   }
 
-  nearest(x, at) {
-    const k = findBefore(x, at + 1e-6);
-    return k + 1 < x.length && x[k + 1] - at < at - x[k] ? k + 1 : k;
+  // where the line is: between the entries over time, at the nearest one of what is counted
+  valueAt(x, y, at) {
+    if (!x.length || at < x[0] - 1e-6 || at > x[x.length - 1] + 1e-6) return [];
+    const k = findBefore(x, at + 1e-6), next = Math.min(k + 1, x.length - 1);
+    const f = next > k ? Math.max(0, (at - x[k]) / (x[next] - x[k])) : 0;
+    if (!this.timed) return f > 0.5 ? [x[next], y[next]] : [x[k], y[k]];
+    return [at, f > 1e-3 ? (1 - f) * y[k] + f * y[next] : y[k]];
   }
 
   listen() {

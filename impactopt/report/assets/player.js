@@ -9,7 +9,7 @@ class Player {
   constructor(root, header, arrays) {
     Object.assign(this, { header, arrays, listeners: [], time: 0, track: 0, speed: 1, playing: false, seen: true });
     this.canvas = make("canvas", {
-      tabindex: 0, role: "img",
+      tabindex: 0, role: "application",
       "aria-label": "The robot's motion. Arrow keys turn the view, plus and minus zoom, space plays and pauses.",
     });
     this.readout = make("div", { class: "readout" });

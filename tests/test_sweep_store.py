@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from impactopt.errors import InputError
 from impactopt.sweeps import sweep_from_data
 from impactopt.sweeps.journal import Entry, Journal
 from impactopt.sweeps.store import Store
+from impactopt.sweeps.table import merge_kinds, unit_of, write_table
 from impactopt.sweeps.units import Found
 
 
@@ -182,3 +184,70 @@ def test_two_processes_do_not_share_a_directory(tmp_path: Path) -> None:
             Store(sweep(), tmp_path)
         other.kill()
     Store(sweep(), tmp_path).close()  # a killed process holds nothing
+
+
+# ---------------------------------------------------------------- the table
+def test_small_parts_and_large_ones_become_one_table_with_units(tmp_path: Path) -> None:
+    parts: list[Any] = [
+        (0, {"reason": [""], "x_m": [1], "kind": ["a"], "at": [[1, {"y": 0}]], "n": [3]}),
+        (1, {"reason": ["bad"]}),
+        (
+            2,
+            {
+                "reason": ["", ""],
+                "x_m": np.array([0.5, np.nan]),
+                "kind": ["b", "c"],
+                "at": [None, {"y": 0}],
+                "n": [4, 5],
+            },
+        ),
+    ]
+    kinds: dict[str, str] = {}
+    for _, columns in parts:
+        merge_kinds(kinds, columns)
+    write_table(tmp_path / "t.parquet", parts, kinds, {"name": "of tests"})
+    table = pq.read_table(tmp_path / "t.parquet")
+    assert table.to_pydict() == {
+        "case": [0, 1, 2, 3],
+        "reason": ["", "bad", "", ""],
+        "x_m": [1.0, None, 0.5, None],
+        "kind": ["a", None, "b", "c"],
+        "at": ['[1, {"y": 0}]', None, None, '{"y": 0}'],
+        "n": [3, None, 4, 5],
+    }
+    assert table.schema.field("x_m").metadata == {b"unit": b"m"}
+    assert table.schema.metadata[b"impactopt.name"] == b"of tests"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("impulse_Ns", "N s"),
+        ("contact.stiffness_N_m", "N/m"),
+        ("robot.torque_limit_N_m", "N m"),
+        ("contact.damping_N_s_m", "N s/m"),
+        ("problem.point_m.1", "m"),
+        ("at_contact.joints_rad.elbow", "rad"),
+        ("hand_speed_m_s", "m/s"),
+        ("contact_ms", "ms"),
+        ("seconds", "s"),
+        ("iterations", ""),
+        ("torque_ratio_swing", ""),
+    ],
+)
+def test_units_are_read_off_names(name: str, unit: str) -> None:
+    assert unit_of(name) == unit
+
+
+def test_a_full_disk_leaves_the_table_of_before(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    write_table(path, [(0, {"x": np.arange(3.0)})], {"x": "float"}, {})
+    before = path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        with pytest.raises(InputError, match=r"cannot write .*: File too large"):
+            write_table(path, [(0, {"x": np.random.default_rng(0).random(100_000)})], {"x": "float"}, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == before and [*tmp_path.iterdir()] == [path]

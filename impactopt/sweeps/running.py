@@ -150,14 +150,14 @@ def _run(
             _write(chosen, problem, store, together, tally)
             raise
     _write(chosen, problem, store, together, tally)
-    now = tally.progress()
+    seconds = tally.seconds
     return SweepResult(
         cases=tally.cases,
         done=tally.done,
         failed=tally.failed,
         resumed=tally.resumed,
-        seconds=now.seconds,
-        rate_per_second=now.rate,
+        seconds=seconds,
+        rate_per_second=(tally.done - tally.resumed) / seconds,
         peak_worker_mb=tally.peak_mb,
         table=store.table,
         best=tally.best,

@@ -14,7 +14,7 @@ from impactopt.errors import InputError
 from impactopt.output import write_file
 from impactopt.sweeps.units import Columns
 
-__all__ = ["pyarrow", "unit_of", "write_table"]
+__all__ = ["merge_kinds", "pyarrow", "unit_of", "write_table"]
 
 Part = tuple[int, Columns]  # the first case, and columns of it and those after it
 
@@ -60,16 +60,16 @@ def pyarrow() -> Any:
 
 
 def unit_of(name: str) -> str:
-    """The unit that a column's name ends with, "" for none: impulse_Ns is in N s."""
-    stem = name.rpartition(".")[2] if not name.rpartition(".")[2].isdecimal() else name.rsplit(".", 2)[-2]
-    if stem in ("seconds", "solve_seconds", "build_seconds"):
+    """The unit that a column's name has, "" for none: impulse_Ns is in N s."""
+    if name.endswith("seconds"):
         return "s"
-    if "stiffness" in stem or "hardening" in stem:
-        stem = stem.replace("_N_m", "_N/m") if stem.endswith("_N_m") else stem
-        if stem.endswith("_N/m"):
-            return "N/m"
-    ends = [end for end in _UNITS if stem.endswith(end)]
-    return _UNITS[max(ends, key=len)] if ends else ""
+    # the last part that ends with one: others name a joint, or an entry of a list
+    for part in reversed(name.split(".")):
+        ends = [end for end in _UNITS if part.endswith(end)]
+        if ends:
+            end = max(ends, key=len)
+            return "N/m" if end == "_N_m" and part.startswith(("stiffness", "hardening")) else _UNITS[end]
+    return ""
 
 
 def write_table(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from impactopt.sweeps.units import Columns
 __all__ = ["Progress", "Tally"]
 
 BEST = "impulse_Ns"
+OF_LATE = 30.0  # [s]
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 
 
@@ -22,7 +23,8 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 class Progress:
     """Cases of the sweep, done, failed among these, and resumed from runs before.
 
-    seconds : since this run began.  rate : its cases a second.  remaining [s] : at this rate; nan at first.
+    seconds : since this run began.  rate : its cases a second, of late: workers take a while to start.
+    remaining [s] : at this rate; nan at first.
     best [N s], best_case : the largest impulse of usable rows; None if there is none.
     """
 
@@ -51,10 +53,17 @@ class Tally:
         self.kinds: dict[str, str] = {}
         self.reasons: Counter[str] = Counter()
         self._began = time.perf_counter()
+        self._recent = deque([(self._began, 0)])
+
+    @property
+    def seconds(self) -> float:
+        """Since this run began."""
+        return time.perf_counter() - self._began
 
     def begin(self) -> None:
         """What has come so far is from runs before; this one begins now."""
         self.resumed, self._began = self.done, time.perf_counter()
+        self._recent = deque([(self._began, self.done)])
 
     def add(self, first: int, columns: Columns, peak_mb: float) -> None:
         """Count rows: of cases from `first` on."""
@@ -72,14 +81,18 @@ class Tally:
 
     def progress(self) -> Progress:
         """How it stands now."""
-        seconds, fresh = time.perf_counter() - self._began, self.done - self.resumed
-        rate = fresh / seconds if seconds > 0 else 0.0
+        now = time.perf_counter()
+        while len(self._recent) > 2 and now - self._recent[0][0] > OF_LATE:
+            self._recent.popleft()
+        since, before = self._recent[0]
+        self._recent.append((now, self.done))
+        rate = (self.done - before) / (now - since) if now > since else 0.0
         return Progress(
             cases=self.cases,
             done=self.done,
             failed=self.failed,
             resumed=self.resumed,
-            seconds=seconds,
+            seconds=now - self._began,
             rate=rate,
             remaining=(self.cases - self.done) / rate if rate > 0 else float("nan"),
             best=self.best,

@@ -2,7 +2,7 @@
 
 * section.py    what all sections have in common
 * contacts.py   [target] and [contact], of which there are several kinds
-* robot_sections.py, term_sections.py   [robot]; [terms]
+* robot_sections.py, term_sections.py, solver_sections.py   [robot]; [terms]; [solver]
 * sections.py   the other sections and keys of a file, and what they make
 * values.py     ranges of the keys' values
 * mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed

@@ -18,7 +18,8 @@ from impactopt.problem_file.changes import change_and_place
 from impactopt.problem_file.contacts import with_kinds
 from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file
-from impactopt.problem_file.sections import File, SolverSettings
+from impactopt.problem_file.sections import File
+from impactopt.problem_file.solver_sections import SolverSettings
 from impactopt.problem_file.toml import Place, TOMLError, plain_value, read_toml, write_toml
 
 __all__ = [

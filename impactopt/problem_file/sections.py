@@ -7,27 +7,27 @@ stand nowhere twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Iterator
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, create_model
+from pydantic import Field
 
 from impactopt import objectives
 from impactopt.errors import InputError
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.problem_file.contacts import Contact, Target
 from impactopt.problem_file.robot_sections import RobotSection
-from impactopt.problem_file.section import Section, attribute_docs, optional, required
+from impactopt.problem_file.section import Section, optional, required
+from impactopt.problem_file.solver_sections import Solver
 from impactopt.problem_file.term_sections import Terms
 from impactopt.problem_file.values import (
     AtLeastOne,
     Duration,
     Fractions,
-    IpoptOptions,
     NotNegative,
     Positive,
     Posture,
@@ -38,7 +38,6 @@ from impactopt.problem_file.values import (
 )
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
-from impactopt.sqp import SQPOptions
 from impactopt.stance import BothSoles, FixedBase, OneSole
 from impactopt.stance import Stance as Stances
 
@@ -200,48 +199,6 @@ class Objectives(Section):
     penetration: Penetration = optional("")
     angular_momentum: AngularMomentum = optional("")
     effort: Effort = optional("")
-
-
-def _sqp_keys() -> dict[str, Any]:
-    """A key for each option but the time limit, as the options' own docstring describes it."""
-    said = attribute_docs(SQPOptions)
-    hints = get_type_hints(SQPOptions)
-    return {name: (hints[name], optional(said[name])) for name in hints if name != "time_limit"}
-
-
-SQP: Any = create_model("SQP", __base__=Section, __doc__="Options of the SQP.", **_sqp_keys())
-SQP.kind = SQPOptions
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolverSettings:
-    """What a file's [solver] section says.
-
-    name : of the solver.  time_limit [s] : None for no limit.  options : by solver, the solver's own.
-    """
-
-    name: str = "sqp"
-    time_limit: float | None = None
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-    def arguments(self, solver: str | None = None, time_limit: float | None = None) -> dict[str, Any]:
-        """What `solve` and its like take of a solver; given ones go before the file's."""
-        chosen = self.name if solver is None else solver
-        limit = self.time_limit if time_limit is None else time_limit
-        return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
-
-
-class Solver(Section):
-    """Which solver, and its options."""
-
-    name: Literal["ipopt", "sqp"] = optional("of the solver")
-    time_limit: Positive = optional("after which its best iterate is kept [s]", "time_limit_s")
-    ipopt: IpoptOptions = optional("IPOPT's own options by name")
-    sqp: SQP = optional("")
-
-    @classmethod
-    def defaults(cls) -> dict[str, Any]:
-        return {"name": SolverSettings.name}
 
 
 class File(Section):

@@ -28,9 +28,9 @@ from impactopt.problem_file.sections import (
     Objectives,
     Problem,
     ScenarioSection,
-    SolverSettings,
     Swing,
 )
+from impactopt.problem_file.solver_sections import SolverSettings
 from impactopt.problem_file.term_sections import Shape, Terms
 from impactopt.problem_file.toml import plain_value, write_toml
 from impactopt.skeleton import skeleton_pairs

@@ -34,6 +34,7 @@ class Job:
     width: int = 1280
     scripts: tuple[str, ...] = ()
     picture: Path | None = None  # a file to put one into
+    ready: str = READY  # an expression that says that the page can be looked at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +113,7 @@ def _main() -> None:
         view.show()
         page.load(QUrl.fromLocalFile(job["page"]))
         end = time.monotonic() + PATIENCE
-        while not value(page, READY) and time.monotonic() < end:
+        while not value(page, job["ready"]) and time.monotonic() < end:
             wait(50)
         wait(100)
         for script in job["scripts"]:

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from browser import Job, visit
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -81,9 +82,11 @@ def test_formulas_are_drawn_by_the_browser_itself(site: Path, pages: dict[Path, 
     assert left == []
 
 
-def test_the_search_needs_no_server(site: Path) -> None:
-    """Its index is a script beside the pages: a page from disk may load that, but may not fetch."""
-    index = (site / "searchindex.js").read_text(encoding="utf-8")
-    assert index.startswith("Search.setIndex(")
-    for word in ("impactproblem", "torqu", "nail"):
-        assert f'"{word}' in index or f"{word}:" in index, word
+def test_the_search_works_from_disk_and_asks_nobody(site: Path) -> None:
+    go = site / "go.html"
+    go.write_text("<script>location = 'search.html?q=nail'</script>", encoding="utf-8")
+    found = "[...document.querySelectorAll('#search-results li a')].map((a) => a.getAttribute('href'))"
+    (visited,) = visit(Job(page=go, ready=f"{found}.length > 5", scripts=(found,)))
+    assert any("api/contact.html" in link for link in visited.values[0])
+    assert [url for url in visited.requests if not url.startswith("file:")] == []
+    assert visited.console == []

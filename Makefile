@@ -50,7 +50,7 @@ $(BROWSER): $(STAMP)
 
 test: $(STAMP) $(BROWSER) ## run the tests (ARGS='-k robot' for some of them)
 	@echo "== running the tests (the first run compiles functions)"
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest -n auto $(ARGS)
 
 lint: $(STAMP) ## check style with ruff
 	@echo "== ruff"

@@ -148,8 +148,13 @@ def test_the_factor_in_blocks_against_dense_algebra(algebra, seed, n, wide):
     assert not matrix.factor(values(K - 1.01 * np.linalg.eigvalsh(K)[-1] * np.eye(n)))
 
 
-def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra):
-    t = transcribed(biped_problem())
+@pytest.fixture(scope="module")
+def motion():
+    return transcribed(biped_problem())
+
+
+def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, motion):
+    t = motion
     p = t.program
     rng = np.random.default_rng(0)
     x = first_iterate(t) + 1e-3 * rng.normal(size=p.n)

@@ -38,24 +38,32 @@ def sweep(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Do every case of a sweep file, and write one table of them: DIR/table.parquet.
+    """Do every case of a sweep file, and write one table of them: DIR/table.parquet, and DIR/figure.png.
 
     Each finished case is on disk at once: after Ctrl-C, a kill or a power cut the same command goes on. A
     case that fails is a row with its reason. Exit code: 0 done, 1 no case has a usable result, 2 bad input.
     """
     interrupted = f"interrupted; what is finished is in {out}, and the same command goes on from there"
     with plain_errors(interrupted) as console:
+        from impactopt.sweeps import read_sweep_file
         from impactopt.sweeps import sweep as run
 
+        chosen = read_sweep_file(file)
         with _Screen(console, quiet=quiet) as screen:
             told: dict[str, Any] = {"report": screen.say, "progress": screen.progress}
-            result = run(file, out, workers=workers, scheduler=scheduler, again=again, **told)
+            result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
         if as_json:
             typer.echo(json.dumps(result.summary()))
         else:
             _show(result)
         if result.failed == result.done:
             raise typer.Exit(NOT_SOLVED)
+        if chosen.figure is not None:
+            from impactopt.plotting.sweep import save_sweep_picture
+
+            picture = save_sweep_picture(chosen, result.table)
+            if not (as_json or quiet):
+                console.print(str(picture), markup=False, highlight=False, soft_wrap=True)
 
 
 class _Screen:

@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, did_you_mean
 from impactopt.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file
@@ -21,8 +21,10 @@ from impactopt.problem_file.toml import TOMLError, plain_value
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column
+from impactopt.sweeps.dotted import flat
+from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.sections import File, Grain, of_other_grains
-from impactopt.sweeps.varied import VariedKeys, flat, telling
+from impactopt.sweeps.varied import VariedKeys, telling
 
 __all__ = ["Sweep", "parse_sweep", "read_sweep_file", "sweep_from_data"]
 
@@ -31,13 +33,15 @@ __all__ = ["Sweep", "parse_sweep", "read_sweep_file", "sweep_from_data"]
 class Sweep:
     """A sweep whose file is sound.
 
-    path, text : where it was read, and what it said.  content : the same as tables.
+    path, text : where it was read, and what it said.  content : the same as tables, but for [figure], which
+        no row depends on.
     problem : the problem's file with the sweep's [set], which every case changes.
     grain : what a case is: "solve" (a whole motion), "strike" or "collision".
     design : the values of the cases.  name : for people.
     seed, start, starts : of a case's solves, as of :func:`impactopt.solve`.
     time_limit [s] : of a case; None for none.  trajectories : whether each case's result is kept whole.
     at_contact, outputs : of collisions, as of :func:`impactopt.collide_many`.
+    figure : of the table, with full names of the keys; None for none.
     """
 
     path: Path
@@ -54,6 +58,7 @@ class Sweep:
     trajectories: bool
     at_contact: Mapping[str, Any]
     outputs: tuple[str, ...]
+    figure: Figure | None
 
     @property
     def hash(self) -> str:
@@ -129,11 +134,17 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         _check_collisions(path, base, content, design)
     else:
         reader.check_values(grid, rows, over)
+    if content.figure is not None and given.grain == "collision":
+        known = [*reader.names, *given.outputs]
+        for name in content.figure.renamed(reader.full_name).columns:
+            if name not in known:
+                text = f"{name!r} is neither varied nor among the outputs{did_you_mean(name, known)}"
+                mistakes.append(Mistake(place=("figure",), sections=1, text=text))
     raise_if_any()
     return Sweep(
         path=path,
         text=text,
-        content=data,
+        content={name: table for name, table in data.items() if name != "figure"},
         problem=base,
         design=design,
         name=given.name or path.stem,
@@ -145,6 +156,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         trajectories=given.trajectories,
         at_contact=content.at_contact,
         outputs=given.outputs,
+        figure=None if content.figure is None else content.figure.renamed(reader.full_name),
     )
 
 

@@ -9,6 +9,7 @@ from pydantic import Field
 from impactopt.problem_file.mistakes import Mistake
 from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import Positive
+from impactopt.sweeps.figure import Figure
 
 __all__ = ["File", "Grain", "SpanSection", "of_other_grains"]
 
@@ -61,6 +62,7 @@ class File(Section):
     grid: dict[str, Any] = Field(default_factory=dict, description="every combination")
     list: dict[str, Any] = Field(default_factory=dict, description="read side by side")
     draw: DrawSection = optional("what is drawn")
+    figure: Figure | None = optional("the picture of the table")
 
 
 def of_other_grains(content: File) -> list[Mistake]:

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, did_you_mean
 from impactopt.output import write_file
 from impactopt.sweeps.units import Columns
 
-__all__ = ["merge_kinds", "pyarrow", "unit_of", "write_table"]
+__all__ = ["merge_kinds", "pyarrow", "read_columns", "unit_of", "without_unit", "write_table"]
 
 Part = tuple[int, Columns]  # the first case, and columns of it and those after it
 
@@ -70,6 +70,36 @@ def unit_of(name: str) -> str:
             end = max(ends, key=len)
             return "N/m" if end == "_N_m" and part.startswith(("stiffness", "hardening")) else _UNITS[end]
     return ""
+
+
+def without_unit(name: str) -> str:
+    """A column's name without its unit: target.mass_kg is target.mass."""
+    parts = name.split(".")
+    for k in reversed(range(len(parts))):
+        ends = [end for end in _UNITS if parts[k].endswith(end)]
+        if ends:
+            parts[k] = parts[k].removesuffix(max(ends, key=len))
+            break
+    return ".".join(parts)
+
+
+def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Columns of a table: numbers, nan where there is none, or texts.
+
+    Raises
+    ------
+    InputError : it has no such column; it cannot be read.
+    """
+    arrow = pyarrow()
+    try:
+        there = arrow.parquet.read_schema(path).names
+        for name in names:
+            if name not in there:
+                raise InputError(f"{path} has no column {name!r}{did_you_mean(name, there)}")
+        table = arrow.parquet.read_table(path, columns=list(names))
+    except (OSError, arrow.ArrowException) as error:
+        raise InputError(f"cannot read {path}: {error}") from error
+    return {name: table[name].to_numpy() for name in table.column_names}
 
 
 def write_table(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -16,16 +16,7 @@ from impactopt.problem_file.toml import Place
 from impactopt.sweeps.design import Axis, Column, Span, column
 from impactopt.sweeps.sections import SpanSection
 
-__all__ = ["VariedKeys", "flat", "telling"]
-
-
-def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and what they hold; TOML's own dots make tables in tables."""
-    for key, what in table.items():
-        if isinstance(what, Mapping) and not what.keys() & {"from", "to"}:
-            yield from flat(what, f"{above}{key}.")
-        else:
-            yield f"{above}{key}", what
+__all__ = ["VariedKeys", "telling"]
 
 
 class VariedKeys:
@@ -51,6 +42,19 @@ class VariedKeys:
                 return None
         self._seen[place] = at
         return ".".join(map(str, place))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Full names of the keys so far."""
+        return tuple(".".join(map(str, place)) for place in self._seen)
+
+    def full_name(self, key: str) -> str:
+        """The full name of a key that varies; what is none, such as a column of results, as it is."""
+        try:
+            name = ".".join(map(str, self._place(self._base.data, key)))
+        except InputError:
+            return key
+        return name if name in self.names else key
 
     def axis(self, table: str, key: str, what: Any) -> Axis | None:
         name, at = self.name((table,), key), (table, *key.split("."))

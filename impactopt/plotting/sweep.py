@@ -36,7 +36,7 @@ FEW = 25  # points of a line, with marks
 MOST = 20_000  # points of a scatter: more are no clearer
 SCALE = "cividis"
 DASHES: Any = ("-", "--", ":")  # of contours
-_PLAIN = FuncFormatter(lambda x, _: f"{x:g}")
+_PLAIN = FuncFormatter(lambda x, _: _number(x))
 
 
 def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
@@ -129,10 +129,9 @@ def _contour(
     finite = np.isfinite(table)
     if min(table.shape) < 2 or not (table[finite].min() < level < table[finite].max()):
         return
-    axes.contour(
-        x, y, np.ma.masked_invalid(table), [level], colors="white", linewidths=3.2, linestyles=dashes
-    )
-    axes.contour(x, y, np.ma.masked_invalid(table), [level], colors=BLACK, linewidths=1.4, linestyles=dashes)
+    masked = np.ma.masked_invalid(table)
+    for colour, width, style in (("white", 3.2, "-"), (BLACK, 1.4, dashes)):
+        axes.contour(x, y, masked, [level], colors=colour, linewidths=width, linestyles=style)
 
 
 # ---------------------------------------------------------------- lines
@@ -227,3 +226,11 @@ def _scales(axes: Any, section: Section) -> None:
         set_scale = axes.set_xscale if name == "x" else axes.set_yscale
         set_scale("log")
         axis.set_major_formatter(_PLAIN)
+
+
+def _number(x: float) -> str:
+    """As it is written by hand; large and small powers of ten as such."""
+    power = round(np.log10(abs(x))) if x else 0
+    if abs(power) >= 4 and np.isclose(abs(x), 10.0**power, rtol=1e-9):
+        return f"${'-' if x < 0 else ''}10^{{{power}}}$"
+    return f"{x:g}"

@@ -27,7 +27,8 @@ __all__ = ["SweepResult", "sweep"]
 
 ACCIDENTS = {"crashed", "error", "time_limit"}  # what another run may do better
 Engine = Generator[tuple[Unit, Found], None, None]
-TOGETHER = {"collision": 16384}  # cases in a unit; one of the other grains
+TOGETHER = {"collision": 16384}  # the most cases in a unit; one of the other grains
+UNITS = 64  # at least, where there are cases for them, so that workers end together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +121,8 @@ def _run(
     tell: Callable[[str], None],
     progress: Callable[[Progress], None] | None,
 ) -> SweepResult:
-    journal, together = store.journal, TOGETHER.get(chosen.grain, 1)
+    journal = store.journal
+    together = min(TOGETHER.get(chosen.grain, 1), -(-chosen.design.cases // UNITS))
     if journal.torn:
         tell(f"the end of {journal.path} was torn, as when a run is killed; that unit is done again")
     if journal.damaged:

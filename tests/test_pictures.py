@@ -269,7 +269,7 @@ def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return lambda name: Picture(1.0, 1.0)
 
     monkeypatch.setattr(
-        "impactopt.reproduce.figures._MAKERS", dict.fromkeys(("plot", "reproduce", "bench"), maker)
+        "impactopt.reproduce.figures._MAKERS", dict.fromkeys(("plot", "reproduce", "bench", "sweep"), maker)
     )
     result = CliRunner().invoke(app, ["figures", "zmp", "fig7", "force", "--quiet", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
@@ -283,7 +283,8 @@ def test_every_figure_has_a_source_that_exists() -> None:
     from impactopt.bench.registry import BENCHES
     from impactopt.reproduce.registry import REPRODUCED
 
-    known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES}
+    studies = {path.stem for path in (ROOT / "problems" / "sweeps").glob("*.toml")}
+    known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}
     assert chosen(FIGURES) == list(FIGURES)
     for name, (how, source) in FIGURES.items():
         assert (name if how == "plot" else source) in known[how]

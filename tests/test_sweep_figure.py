@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from picture_checks import frowns
 from typer.testing import CliRunner
 
 from impactopt.cli import app
@@ -22,7 +23,9 @@ SPEED, MASS = "at_contact.speed_m_s", "target.mass_kg"
 
 
 def picture(columns: Columns, **section: Any) -> Any:
-    return sweep_picture(Figure.model_validate(section), columns)
+    drawn = sweep_picture(Figure.model_validate(section), columns)
+    assert frowns(drawn) == []
+    return drawn
 
 
 def grid_columns() -> dict[str, Any]:

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
@@ -19,13 +16,13 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.output import write_file
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMILION
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PAGE, PURPLE, SKY, VERMILION, Picture, styled
 from impactopt.plotting.sweep_columns import Columns, SweepColumns, combined, errors_against, name_of_error
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.figure import Figure as Section
 from impactopt.sweeps.table import read_columns
 
-__all__ = ["save_sweep_picture", "sweep_picture"]
+__all__ = ["drawn_table", "save_sweep_picture", "sweep_picture"]
 
 Array = NDArray[np.float64]
 
@@ -48,14 +45,18 @@ def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
     """
     if sweep.figure is None:
         return None
-    columns = read_columns(table, (*sweep.figure.columns, "reason"))
-    path = table.with_name("figure.png")
-    with matplotlib.rc_context(STYLE):
-        write_file(path, FigureCanvasAgg(sweep_picture(sweep.figure, columns)).print_png)
+    path, picture = table.with_name("figure.png"), drawn_table(sweep.figure, table)
+    write_file(path, picture.write)
     return path
 
 
-def sweep_picture(section: Section, columns: Columns) -> Figure:
+def drawn_table(section: Section, table: Path) -> Picture:
+    """`sweep_picture` of a table's file."""
+    return sweep_picture(section, read_columns(table, (*section.columns, "reason")))
+
+
+@styled
+def sweep_picture(section: Section, columns: Columns) -> Picture:
     """The picture of a sweep's table.
 
     columns : of the table by name; with those that `section` names, and `reason`.
@@ -73,12 +74,12 @@ def sweep_picture(section: Section, columns: Columns) -> Figure:
     else:
         figure = _scatter(section, data)
     if section.title:
-        figure.suptitle(section.title, x=0.01, ha="left", fontsize=12)
+        figure.suptitle(section.title, x=0.01, ha="left")
     return figure
 
 
 # ---------------------------------------------------------------- heatmap
-def _heatmap(section: Section, data: SweepColumns) -> Figure:
+def _heatmap(section: Section, data: SweepColumns) -> Picture:
     x, y = data.numbers(section.x), data.numbers(section.y[0])
     across, i = np.unique(x, return_inverse=True)
     up, j = np.unique(y, return_inverse=True)
@@ -88,7 +89,7 @@ def _heatmap(section: Section, data: SweepColumns) -> Figure:
             "take a scatter"
         )
     shown = section.colour or ["impulse_Ns"]
-    figure = Figure(figsize=(0.8 + 5.0 * len(shown), 4.6))
+    figure = Picture(PAGE, 2.9 if len(shown) < 3 else 2.4)
     panels = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, shown, strict=True):
         table = np.full((len(up), len(across)), np.nan)
@@ -117,7 +118,7 @@ def _heatmap(section: Section, data: SweepColumns) -> Figure:
         label = f"{what} {level:g} {unit.rstrip(']')}".rstrip()
         handles.append(Line2D([], [], color=BLACK, linestyle=dashes, linewidth=1.4, label=label))
     if handles:
-        figure.legend(handles=handles, loc="outside lower left", fontsize=9, ncols=len(handles))
+        figure.legend(handles=handles, loc="outside lower left", ncols=min(len(handles), 2))
     return figure
 
 
@@ -135,11 +136,11 @@ def _contour(
 
 
 # ---------------------------------------------------------------- lines
-def _lines(section: Section, data: SweepColumns) -> Figure:
+def _lines(section: Section, data: SweepColumns) -> Picture:
     x = data.numbers(section.x)
     groups, names = combined(section.colour, data)
     panel, titles = combined([section.panel] if section.panel else [], data)
-    figure = Figure(figsize=(2.6 + 4.0 * len(titles), 0.9 + 2.8 * len(section.y)))
+    figure = Picture(PAGE, 0.7 + (1.6 if len(section.y) > 1 else 2.2) * len(section.y))
     grid = figure.subplots(len(section.y), len(titles), sharex=True, sharey="row", squeeze=False)
     scale = _shades(section, data, names)
     there: dict[str, Any] = {}  # lines by what they are called
@@ -164,7 +165,9 @@ def _lines(section: Section, data: SweepColumns) -> Figure:
     if len(there) > 1:
         above = data.label(section.colour[0]) if len(section.colour) == 1 else None
         handles = list(there.values())
-        figure.legend(handles, list(there), loc="outside right upper", title=above, alignment="left")
+        figure.legend(
+            handles, list(there), loc="outside lower left", title=above, alignment="left", ncols=len(there)
+        )
     return figure
 
 
@@ -177,10 +180,10 @@ def _shades(section: Section, data: SweepColumns, names: Sequence[str]) -> list[
 
 
 # ---------------------------------------------------------------- scatter
-def _scatter(section: Section, data: SweepColumns) -> Figure:
+def _scatter(section: Section, data: SweepColumns) -> Picture:
     x, y = data.results(section.x), data.results(section.y[0])
     panel, titles = combined([section.panel] if section.panel else [], data)
-    figure = Figure(figsize=(1.6 + 4.6 * len(titles), 4.6))
+    figure = Picture(PAGE if len(titles) > 1 else 0.75 * PAGE, 3.4)
     grid = figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False)[0]
     shown = np.isfinite(x) & np.isfinite(y)
     drawn = np.flatnonzero(shown)
@@ -213,9 +216,9 @@ def _scatter(section: Section, data: SweepColumns) -> Figure:
         bar.outline.set_visible(False)
     elif len(names) > 1 and colour is not None:
         handles, labels = grid[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside right upper", title=data.label(colour))
+        figure.legend(handles, labels, loc="outside lower left", title=data.label(colour), ncols=len(labels))
     if shown.sum() > len(drawn):
-        figure.supxlabel(f"{len(drawn):,} of {shown.sum():,} rows", fontsize=8, x=0.01, ha="left")
+        figure.supxlabel(f"{len(drawn):,} of {shown.sum():,} rows", fontsize=7, x=0.01, ha="left")
     return figure
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -38,15 +39,20 @@ FIGURES: dict[str, tuple[str, str]] = {
     "collision": ("bench", "collision"),
     "scaling": ("bench", "scaling"),
     "skip": ("bench", "skip"),
+    "sweep_posture_speed": ("sweep", "collision_posture_speed"),
+    "sweep_gains": ("sweep", "collision_gains"),
+    "sweep_fidelity": ("sweep", "collision_fidelity"),
 }
 FOLDER = Path("docs/figures")
-DEAR = "bench"  # what takes many minutes is made when it is named
+DEAR = ("bench", "sweep")  # what takes minutes is made when it is named
 
 
 def figures(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Figures; all but the benchmarks' if left out."),
+        typer.Argument(
+            metavar="[NAME]...", help="Figures; all but the benchmarks' and the sweeps' if left out."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Where they are put.")] = FOLDER,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
@@ -59,7 +65,7 @@ def figures(
         from impactopt.output import make_directory, write_file
         from impactopt.screen import Progress
 
-        wanted = chosen(names or [name for name, (how, _) in FIGURES.items() if how != DEAR])
+        wanted = chosen(names or [name for name, (how, _) in FIGURES.items() if how not in DEAR])
         directory = make_directory(out)
         with Progress(console, quiet=quiet) as progress:
             for name, picture in drawn(wanted, progress.say):
@@ -123,4 +129,21 @@ def _bench(name: str, say: Say) -> Maker:
     return lambda figure: made[figure]()
 
 
-_MAKERS: dict[str, Callable[[str, Say], Maker]] = {"plot": _plot, "reproduce": _reproduce, "bench": _bench}
+def _sweep(name: str, say: Say) -> Maker:
+    """Of a sweep's file in problems/sweeps."""
+    from impactopt.plotting.sweep import drawn_table
+    from impactopt.sweeps import read_sweep_file, sweep
+
+    chosen = read_sweep_file(Path("problems") / "sweeps" / f"{name}.toml")
+    assert chosen.figure is not None  # for mypy: those that are named here have one
+    with TemporaryDirectory() as place:
+        picture = drawn_table(chosen.figure, sweep(chosen, place, report=say).table)
+    return lambda figure: picture
+
+
+_MAKERS: dict[str, Callable[[str, Say], Maker]] = {
+    "plot": _plot,
+    "reproduce": _reproduce,
+    "bench": _bench,
+    "sweep": _sweep,
+}

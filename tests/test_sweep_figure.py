@@ -44,6 +44,7 @@ def grid_columns() -> dict[str, Any]:
         ("contact.damping_N_s_m", "contact.damping", "N s/m"),
         ("robot.kd_N_m_s_rad", "robot.kd", "N m s/rad"),
         ("problem.point_m.0", "problem.point.0", "m"),
+        ("robot.kd_N_m_s_rad.elbow", "robot.kd.elbow", "N m s/rad"),
         ("zmp_margin_m", "zmp_margin", "m"),
         ("impulse_Ns", "impulse", "N s"),
         ("torque_ratio", "torque_ratio", ""),

@@ -63,7 +63,7 @@ def _label(name: str) -> str:
     unit, parts = unit_of(name), without_unit(name).split(".")
     if parts[0] == "at_contact":
         parts = parts[1:]
-        if parts[0] == "joints_rad":
+        if parts[0] == "joints":
             return f"{joint_label(parts[1])} moved by [rad]"
         parts = ["speed at contact"] if parts == ["speed"] else parts
     elif parts[0] in ("problem", "robot"):

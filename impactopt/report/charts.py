@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.output import Record
+from impactopt.report.thinning import BUCKETS, thinned
 from impactopt.support import margin
 from impactopt.validation.result import centre_of_pressure
 
-__all__ = ["charts_of", "thinned"]
+__all__ = ["charts_of"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
-BUCKETS = 400  # of a history; of each its ends, and its least and largest value are kept
 NEAR = (0.01, 0.03)  # [s] before and after contact that the force is shown over at first
 # label, prefix in a record, style; the styles are those of style.css
 SOURCES = (
@@ -47,29 +46,6 @@ def charts_of(record: Record) -> tuple[list[dict[str, Any]], Arrays]:
     return [chart for chart in charts if chart is not None], arrays
 
 
-def thinned(time: Array, *columns: Array) -> list[Array]:
-    """Time (k,) and columns at fewer instants: of each bucket its ends, and where a column is least and most.
-
-    Source: U. Jugel et al., "M4: a visualization-oriented time series data aggregation", VLDB 2014: lines
-    through these look as through all. The neighbours of the extremes are kept too: a jump stays one when seen
-    closely.
-    """
-    if len(time) <= 3 * BUCKETS:
-        return [time, *columns]
-    edges = np.linspace(0, len(time), BUCKETS + 1).astype(int)
-    kept = {*edges[:-1].tolist(), *(edges[1:] - 1).tolist()}
-    for low, high in pairwise(edges.tolist()):
-        for column in columns:
-            part = column[low:high]
-            if np.isfinite(part).any():
-                extremes = {low + int(np.nanargmin(part)), low + int(np.nanargmax(part))}
-                kept |= {k + step for k in extremes for step in (-1, 0, 1) if 0 <= k + step < len(time)}
-            if not np.isfinite(part).all():  # where a history has a gap, so has its picture
-                kept.add(low + int(np.argmin(np.isfinite(part))))
-    chosen = np.array(sorted(kept))
-    return [time[chosen], *(column[chosen] for column in columns)]
-
-
 def _bands(record: Record) -> list[list[float]]:
     """When the plan is in contact, grey in every chart."""
     return [[float(record.arrays[f"reference_contact_{which}"]) for which in ("start", "end")]]
@@ -79,10 +55,18 @@ def _chart(title: str, unit: str, series: list[dict[str, Any]], **rest: Any) -> 
     return {"kind": "lines", "title": title, "x": "time [s]", "y": unit, "series": series, **rest}
 
 
-def _series(arrays: Arrays, name: str, label: str, style: str, time: Array, values: Array) -> dict[str, Any]:
-    x, y = thinned(time, values)
+def _series(
+    record: Record, arrays: Arrays, name: str, label: str, style: str, time: Array, values: Array
+) -> dict[str, Any]:
+    x, y = thinned(time, values, whole=_close_up(record))
     arrays |= {f"{name}_x": x, f"{name}_y": y}
     return {"label": label, "style": style, "x": f"{name}_x", "y": f"{name}_y"}
+
+
+def _close_up(record: Record) -> list[float]:
+    """[s] of contact and what is near it."""
+    start, end = _bands(record)[0]
+    return [max(0.0, start - NEAR[0]), end + NEAR[1]]
 
 
 def _force(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]:
@@ -91,9 +75,8 @@ def _force(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]
         time, force = (a[f"{prefix}_time"], a.get(f"{prefix}_force"))
         if force is None:
             time, force = _at_contact(record, a["collision_force"], 0.0)
-        series.append(_series(arrays, f"force_{style}", label, style, time, force))
-    start, end = _bands(record)[0]
-    view = [max(0.0, start - NEAR[0]), end + NEAR[1]]
+        series.append(_series(record, arrays, f"force_{style}", label, style, time, force))
+    view = _close_up(record)
     return _chart("Force on the target", "force [N]", series, bands=_bands(record), view=view, include=[0.0])
 
 
@@ -108,12 +91,14 @@ def _at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array,
 def _speed(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]:
     a = record.arrays
     time, speed = _at_contact(record, a["collision_target_speed"], np.nan)
-    series = [_series(arrays, "speed_plan", "target, planned", "planned", time, speed)]
+    series = [_series(record, arrays, "speed_plan", "target, planned", "planned", time, speed)]
     for label, prefix, style in present:
         if f"{prefix}_hand_speed" in a:
             time = a[f"{prefix}_time"]
             series.append(
-                _series(arrays, f"speed_{style}", f"hand, {label}", style, time, a[f"{prefix}_hand_speed"])
+                _series(
+                    record, arrays, f"speed_{style}", f"hand, {label}", style, time, a[f"{prefix}_hand_speed"]
+                )
             )
     start, end = _bands(record)[0]
     view = [max(0.0, start - 0.2), end + 0.2]
@@ -145,7 +130,7 @@ def _zmp_margin(record: Record, arrays: Arrays, present: list[Any]) -> dict[str,
     for label, prefix, style in present:
         time, wrench = _grounds(record, prefix)
         inside = 1e3 * margin(record.arrays["polygon"], centre_of_pressure(wrench))
-        series.append(_series(arrays, f"margin_{style}", label, style, time, inside))
+        series.append(_series(record, arrays, f"margin_{style}", label, style, time, inside))
     note = "Distance of the zero-moment point from the support polygon's nearest edge; below 0 it is outside."
     limits = [{"y": 0.0, "text": "edge"}]
     return _chart(
@@ -167,7 +152,7 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
     series = []
     for label, prefix, style in present:
         time, wrench = _grounds(record, prefix)
-        t, x, y = thinned(time, *centre_of_pressure(wrench).T)
+        t, x, y = thinned(time, *centre_of_pressure(wrench).T, whole=_close_up(record))
         points, name = np.column_stack([x, y]), f"zmp_{style}"
         arrays |= {name: points, f"{name}_time": t, f"{name}_margin": 1e3 * margin(polygon, points)}
         series.append(
@@ -209,7 +194,7 @@ def _torque_ratio(record: Record, arrays: Arrays) -> dict[str, Any]:
     series = []
     for label, style, time, torque in _torque(record):
         ratio = np.abs(torque / record.arrays["torque_limit"]).max(axis=1)
-        series.append(_series(arrays, f"ratio_{style}", label, style, time, ratio))
+        series.append(_series(record, arrays, f"ratio_{style}", label, style, time, ratio))
     limits = [{"y": 1.0, "text": "limit"}]
     return _chart(
         "Torque demand over limit",
@@ -260,6 +245,7 @@ def _soles(record: Record, arrays: Arrays) -> dict[str, Any] | None:
         return None
     series = [
         _series(
+            record,
             arrays,
             f"load_{k}",
             str(name).replace("_", " "),
@@ -290,7 +276,8 @@ def _convergence(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
     for name, label, style in zip(("max_violation", "kkt"), ("violation", "optimality"), OTHERS, strict=True):
         y = np.where(np.isfinite(digits[name]), digits[name], np.nan)
         if np.isfinite(y).any():
-            series.append(_series(arrays, f"history_{name}", label, style, iteration, y))
+            arrays |= {"history_x": iteration, f"history_{name}": y}
+            series.append({"label": label, "style": style, "x": "history_x", "y": f"history_{name}"})
     if not series:
         return []
     chart = _chart("Convergence of the solver", "largest error", series, log=True, timed=False)

@@ -156,6 +156,7 @@ class Chart extends Frame {
       inside.append(svg("rect", { ...box, x: left, width: Math.max(1, this.x(to) - left), class: "band" }));
     }
     for (const { y, text } of this.spec.limits ?? []) {
+      if (y < y0 || y > y1) continue;
       inside.append(svg("line", { x1: box.x, x2: box.x + box.width, y1: this.y(y), y2: this.y(y), class: "limit" }));
       const above = this.y(y) - 4 > box.y + 10;
       inside.append(svg("text", { x: box.x + 6, y: this.y(y) + (above ? -4 : 13), class: "limit" }, text));

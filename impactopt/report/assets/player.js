@@ -1,5 +1,6 @@
 // Time and controls of the 3D view.
 const SLOWER = 10, REST = 0.8; // how much slower around contact; seconds that the end stays
+const SOON = 1e-6; // seconds that rounding may take
 const MARKS = [
   ["force", "force on the target", true], ["com", "centre of mass", false], ["zmp", "zero-moment point", false],
   ["ground", "force of the ground", false], ["polygon", "support polygon", false], ["paths", "paths", true],
@@ -147,7 +148,7 @@ class Player {
   // 10 around contact, where that is wanted, else 1
   slowness(time) {
     const { contact_start: start, contact_end: end } = this.header.tracks[this.track], { around } = this.header;
-    return this.slow.checked && start != null && time >= start - around && time < (end ?? start) + around ? SLOWER : 1;
+    return this.slow.checked && start != null && time + SOON >= start - around && time < (end ?? start) + around ? SLOWER : 1;
   }
 
   tick() {
@@ -178,7 +179,7 @@ class Player {
     if (!this.view) return;
     const track = this.header.tracks[this.track], now = this.view.draw(this.track, this.time);
     const { contact_start: start, contact_end: end } = track, slowness = this.slowness(this.time);
-    const phase = start == null || this.time < start ? "swing" : end == null || this.time < end ? "contact" : "follow-through";
+    const phase = start == null || this.time + SOON < start ? "swing" : end == null || this.time + SOON < end ? "contact" : "follow-through";
     const slow = slowness > 1 ? ` · ${slowness} x slower` : "";
     this.readout.textContent = `${this.time.toFixed(3)} s · ${phase}${slow}`;
     this.label.hidden = !(now.force > 0 && this.view.shown.force);

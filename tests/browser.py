@@ -19,7 +19,8 @@ from typing import Any
 FLAGS = (
     "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
 )
-DARK = "--blink-settings=preferredColorScheme=0"
+DARK = "--blink-settings=preferredColorScheme=0"  # who uses it prefers dark pages
+WITHOUT_3D = "--disable-3d-apis"
 READY = (
     "document.documentElement?.dataset.ready !== undefined || document.getElementById('trouble')?.innerText"
 )
@@ -46,11 +47,14 @@ class Visit:
     values: list[Any] = field(default_factory=list)
 
 
-def visit(*jobs: Job, dark: bool = False) -> list[Visit]:
-    """The jobs, one after the other, in one browser, whose user prefers light or dark pages."""
+def visit(*jobs: Job, flags: str = "") -> list[Visit]:
+    """The jobs, one after the other, in one browser; flags : DARK, WITHOUT_3D."""
     given = json.dumps([dataclasses.asdict(job) for job in jobs], default=lambda path: str(path.resolve()))
-    flags = f"{FLAGS} {DARK}" if dark else FLAGS
-    environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "QTWEBENGINE_CHROMIUM_FLAGS": flags}
+    environment = {
+        **os.environ,
+        "QT_QPA_PLATFORM": "offscreen",
+        "QTWEBENGINE_CHROMIUM_FLAGS": f"{FLAGS} {flags}",
+    }
     environment |= {"QTWEBENGINE_DISABLE_SANDBOX": "1"}
     done = subprocess.run(
         [sys.executable, __file__],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from browser import Job, Visit, visit
+from browser import DARK, WITHOUT_3D, Job, Visit, visit
 from fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution
 from small_robots import biped
 from typer.testing import CliRunner
@@ -216,7 +216,7 @@ def seen(page: Path) -> list[dict[str, Any]]:
     wide, narrow = visit(
         Job(page=page, scripts=tuple(SCRIPTS.values())), Job(page=page, width=400, scripts=(WIDE,))
     )
-    (dark,) = visit(Job(page=page, width=400, scripts=(WIDE, THEME, PAPER)), dark=True)
+    (dark,) = visit(Job(page=page, width=400, scripts=(WIDE, THEME, PAPER)), flags=DARK)
     return [
         checked(wide, SCRIPTS),
         checked(narrow, {"wide": WIDE}),
@@ -248,6 +248,20 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
     track = tracks_of(record, solution.problem)[0]
     places = np.array([pin.XYZQUATToSE3(place).homogeneous.T for place in track.places[0]])  # it stands still
     np.testing.assert_allclose(np.reshape(wide["place"], (-1, 4, 4)), places, atol=1e-5)
+
+
+def test_without_3d_the_plots_still_work(page: Path) -> None:
+    scripts = {
+        "note": "document.querySelector('.stage').innerText",
+        "charts": "document.querySelectorAll('.chart path.line').length",
+        "moved": f"({KEY % (PLOT % 0, 'ArrowRight')}, page.clock.time - page.header.tracks[0].contact_start)",
+        "value": f"{CHART % 0}.querySelector('.key b').textContent",
+    }
+    values = checked(visit(Job(page=page, scripts=tuple(scripts.values())), flags=WITHOUT_3D)[0], scripts)
+    assert "cannot be shown here: no WebGL 2" in values["note"] and values["charts"] >= 15
+    # the view is from 10 ms before the contact of 40 ms to 30 ms after it, a step a hundredth of that
+    assert values["moved"] == pytest.approx(0.08 / 100, abs=1e-6)
+    assert float(values["value"]) == pytest.approx(700 - 300 * values["moved"] / 0.01, rel=1e-3)
 
 
 def test_the_plots_work(seen: list[dict[str, Any]]) -> None:

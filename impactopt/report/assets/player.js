@@ -134,6 +134,7 @@ class Player {
   }
 
   play(on) {
+    if (!this.view) return; // without it, this is only the clock of the plots
     this.playing = on;
     const icon = svg("svg", { viewBox: "0 0 12 12", width: 12, height: 12, "aria-hidden": "true" });
     icon.append(svg("path", { d: on ? "M2 1h3v10H2zM7 1h3v10H7z" : "M2 1l9 5-9 5z", fill: "currentColor" }));

@@ -94,6 +94,7 @@ class Condenser:
     equal : which of the rows left are equalities: numbers into `rows`.
     bounded : eliminated variables with a bound, each a row of its own from number m on.
     m, n : number of rows with those of `bounded`, and of variables.
+    left : of each equality left the free variables that it touches, and places of these numbers in `J`.
     at_free : places of the numbers of free variables in what `reduce` gives, and their rows and columns.
     pattern : which of the free variables W couples (f, f), once all is eliminated, with those that an
         equality left touches.
@@ -148,14 +149,17 @@ class Condenser:
         lower = H.row >= H.col
         self._own_hessian = np.flatnonzero(lower).astype(np.int32), pairs[H.row[lower], H.col[lower]]
         self._diagonal = np.diagonal(pairs).copy()
+        at = np.flatnonzero(H.row == H.col)
+        self._curved = at, H.row[at]
         self._products = [_products(pairs, *group) for group in groups]
         self._stages = [_stage(found, rows, none, pairs, nothing) for found in systems]
         self._left = number[self.rows[self.equal]]
-        part = sp.csr_array(touches[np.ix_(self._left, self.free)])
-        at = np.repeat(self._left, np.diff(part.indptr)), self.free[part.indices]
-        self._A = rows[at], part.indices, part.indptr
         self.pattern = couples[np.ix_(self.free, self.free)]
-        for columns in np.split(part.indices, part.indptr[1:-1]):
+        of_left = touches[np.ix_(self._left, self.free)]
+        self.left = [
+            (np.flatnonzero(t), rows[k, self.free[t]]) for k, t in zip(self._left, of_left, strict=True)
+        ]
+        for columns, _ in self.left:
             self.pattern[np.ix_(columns, columns)] = True
         place = np.full(n, -1)
         place[self.free] = np.arange(self.free.size)
@@ -181,9 +185,19 @@ class Condenser:
 
     @property
     def A(self) -> Matrix:
-        """Of the equalities left, by the free variables: csr (l, f)."""
-        where, *structure = self._A
-        return sp.csr_array((self.J[where], *structure), shape=(self._left.size, self.free.size))
+        """Of the equalities left, by the free variables (l, f)."""
+        out = np.zeros((len(self.left), self.free.size))
+        for row, (columns, at) in zip(out, self.left, strict=True):
+            row[columns] = self.J[at]
+        return out
+
+    @property
+    def curvature(self) -> Vector:
+        """Of the Hessian, along the free variables (f,)."""
+        out = np.zeros(self.n)
+        at, variables = self._curved
+        out[variables] = self._hessian[at]
+        return out[self.free]
 
     def reduce(self, weights: Vector, diagonal: Vector) -> Vector:
         """H + diag(diagonal) + J' diag(weights) J, eliminated from: its values, to be read by `at_free`.

@@ -48,11 +48,11 @@ class NewtonSystem:
         places = self._matrix.places
         self._to = places(i, j).astype(np.int32)
         self._diagonal_to = places(np.arange(condenser.free.size), np.arange(condenser.free.size))
-        self._products, self._kernels, A = [], kernels, condenser.A
-        for row, (a, b) in enumerate(zip(A.indptr[:-1], A.indptr[1:], strict=True)):
-            columns, (i, j) = A.indices[a:b], np.tril_indices(b - a)
-            own = np.full(1, row, dtype=np.int32), np.arange(a, b, dtype=np.int32)[None]
-            self._products.append(Products(*own, places(columns[i], columns[j]).astype(np.int32)))
+        self._products, self._kernels = [], kernels
+        for row, (columns, at) in enumerate(condenser.left):
+            i, j = np.tril_indices(columns.size)
+            to = places(columns[i], columns[j]).astype(np.int32)
+            self._products.append(Products(np.full(1, row, dtype=np.int32), at[None], to))
         self.begin(b"")
 
     def begin(self, key: bytes) -> None:
@@ -101,15 +101,15 @@ class NewtonSystem:
                 return False
         self._last = self.shift or self._last
         if hard and c.equal.size:
-            self._spread = self._matrix.solve(np.asfortranarray(self._A.toarray().T))
+            self._spread = self._matrix.solve(self._A.T)
             self._schur = self._A @ self._spread
         return True
 
     def _penalty(self) -> Vector:
         """Weights of the equalities left: far above the curvature along them, and no farther."""
-        squares = self._A.multiply(self._A)
+        squares = self._A**2
         length = np.maximum(1e-30, squares.sum(axis=1))
-        curvature = squares @ np.abs(self._hessian.diagonal()[self.condenser.free]) / length
+        curvature = squares @ np.abs(self.condenser.curvature) / length
         out: Vector = _PENALTY * np.maximum(1.0, curvature) / np.maximum(1.0, length)
         return out
 
@@ -136,7 +136,7 @@ class NewtonSystem:
         W = c.reduce(self._weights, self._diagonal)
         self._kernels.copy(W, self._from, values, self._to)
         values[self._diagonal_to[self.held]] += _HELD
-        self._kernels.add_products(self._products, self._A.data, self._weights[c.rows[c.equal]], values)
+        self._kernels.add_products(self._products, c.J, self._weights[c.rows[c.equal]], values)
         return values
 
     def solve(self, q: Vector, r: Vector) -> tuple[Vector, Vector]:

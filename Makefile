@@ -33,7 +33,7 @@ $(STAMP): pyproject.toml
 			$(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; \
 		fi; \
 	fi
-	@echo "== installing impactopt and what it needs into $(VENV): some 400 MB to download, a few minutes the first time"
+	@echo "== installing impactopt and what it needs into $(VENV): some 550 MB to download, a few minutes the first time"
 	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	@touch $@
 	@echo "== $(VENV) is ready"

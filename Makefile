@@ -5,11 +5,11 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 BROWSER := $(VENV)/.browser
-EXTRAS := robots,validate,qp,sweep,cluster,docs,dev
+EXTRAS := robots,validate,qp,sweep,cluster,docs,notebooks,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench reproduce figures docs clean distclean
+.PHONY: help venv demo test lint types format bench reproduce figures docs notebooks clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
@@ -75,6 +75,13 @@ figures: $(STAMP) ## make the figures of docs/ anew (ARGS='strobe fig7' for some
 docs: $(STAMP) ## build the documentation, needs no internet: build/docs/index.html
 	@$(BIN)/python -m sphinx -W --keep-going -q docs build/docs
 	@echo "== open build/docs/index.html"
+
+notebooks: $(STAMP) ## execute the notebooks, some minutes; with their outputs in results/notebooks (ARGS=notebooks/3_*.ipynb for one)
+	@mkdir -p results/notebooks
+	@for file in $(or $(ARGS),notebooks/*.ipynb); do \
+		echo "== $$file"; \
+		$(BIN)/jupyter execute --timeout=600 --output=../results/notebooks/{notebook_name} $$file || exit 1; \
+	done
 
 clean: ## remove results and caches of the tools; .venv and compiled functions stay
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

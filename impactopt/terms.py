@@ -110,15 +110,17 @@ class ContactWrenchCone(Term):
     Source: Caron et al. 2015, see :mod:`impactopt.cone`.
 
     friction: coefficient that the plan may use; margin [m]: distance of the CoP from the sole's edges;
-    minimum_force [N] a sole. There are no terms for friction or the centre of pressure alone: this cone
-    bounds them foot by foot, and yaw torsion with them, which shrinks where they are used up.
+    collision_margin [m]: the same while in contact with the target, None: the ground may do then what it
+    cannot, pull too, to compare; minimum_force [N] a sole. There are no terms for friction or the centre of
+    pressure alone: this cone bounds them foot by foot, and yaw torsion with them, which shrinks where they
+    are used up.
     """
 
     name: ClassVar[str] = "contact wrench cone"
     unit: ClassVar[str] = "of weight"
     friction: float = 0.6
     margin: float = 0.02
-    collision_margin: float = 0.02
+    collision_margin: float | None = 0.02
     minimum_force: float = 50.0
 
 

@@ -384,3 +384,18 @@ def test_what_cannot_be_met_is_named(arm_plan: Planned) -> None:
     assert result.status is Status.INFEASIBLE
     assert "Rows that cannot be met" in result.message
     assert "hit point" in result.message or "velocity limit" in result.message
+
+
+def test_the_soles_rows_in_contact_can_be_left_out(biped_transcription: Transcription) -> None:
+    """And no others: what is left are the same rows, in the same order."""
+    cone = dataclasses.replace(biped_transcription.problem.term(ContactWrenchCone), collision_margin=None)
+    others = [t for t in biped_transcription.problem.terms if not isinstance(t, ContactWrenchCone)]
+    without = changed(biped_transcription, terms=(*others, cone))
+
+    def in_contact(row: Any) -> bool:
+        swinging = row.place.name.startswith(("swing", "follow", "start", "end"))
+        return row.term in (cone.name, "normal force") and not swinging
+
+    names = [str(row) for row in biped_transcription.rows.origins if not in_contact(row)]
+    assert [str(row) for row in without.rows.origins] == names
+    assert without.program.m < biped_transcription.program.m

@@ -241,8 +241,9 @@ class Collision:
             upper=self.torque_fraction,
             measure=percent("over its limit", of=self.torque_fraction),
         )
-        minimum = t.cone.minimum_force if self.scenario is None else 0.0
-        t.cone_rows(self.w[i], place, self.cone_margin, minimum)
+        if self.cone_margin is not None:
+            minimum = t.cone.minimum_force if self.scenario is None else 0.0
+            t.cone_rows(self.w[i], place, self.cone_margin, minimum)
         self._target_rows(i, place, first["force"])
 
     def _target_rows(self, i: int, place: Place, first: int) -> None:

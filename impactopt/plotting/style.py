@@ -14,6 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from numpy.typing import NDArray
 
 from impactopt.output import Record
@@ -45,6 +46,7 @@ STYLE: Any = {
     "figure.constrained_layout.use": True,
     "font.size": 8,
     "axes.titlesize": 9,
+    "axes.prop_cycle": cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK]),
     "figure.titlesize": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -7,8 +7,8 @@ from typing import Any
 from impactopt import extra_terms, terms
 from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import (
-    CaptureMargin,
     Fraction,
+    Margin,
     NotNegative,
     NotNegativeOrAny,
     PerJoint,
@@ -49,7 +49,10 @@ class ContactWrenchCone(Section):
     kind = terms.ContactWrenchCone
     friction: Positive = optional("coefficient that the soles may use")
     margin: NotNegative = optional("from the centre of pressure to the sole's edges [m]", "margin_m")
-    collision_margin: NotNegative = optional("the same, while in contact [m]", "collision_margin_m")
+    collision_margin: Margin = optional(
+        'the same, while in contact [m]; "anywhere": the ground may then do what it cannot, to compare',
+        "collision_margin_m",
+    )
     minimum_force: NotNegative = optional("that each sole keeps on the ground [N]", "minimum_force_N")
 
 
@@ -57,7 +60,7 @@ class Balance(Section):
     """What the impact may leave behind, so that the robot stays up; inf: any."""
 
     kind = terms.Balance
-    capture_margin: CaptureMargin = optional(
+    capture_margin: Margin = optional(
         'from the capture point to the support polygon\'s edges [m]; "anywhere": none is asked',
         "capture_margin_m",
     )

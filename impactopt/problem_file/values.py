@@ -74,7 +74,7 @@ def _posture(value: Any) -> Any:
     return value
 
 
-def _capture_margin(value: Any) -> float | None:
+def _margin(value: Any) -> float | None:
     """A number >= 0, or "anywhere"."""
     if value == "anywhere":
         return None
@@ -156,7 +156,7 @@ Point2 = Annotated[list[float], Field(min_length=2, max_length=2)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
 Bound = Annotated[float, Field(allow_inf_nan=True)]  # inf: none
 Range = Annotated[list[Bound], Field(min_length=2, max_length=2), AfterValidator(_ascending)]
-CaptureMargin = Annotated[Any, PlainValidator(_capture_margin)]
+Margin = Annotated[Any, PlainValidator(_margin)]
 Posture = Annotated[Any, PlainValidator(_posture)]
 Rotation = Annotated[Any, PlainValidator(_rotation)]
 Inertia = Annotated[Any, PlainValidator(_inertia)]

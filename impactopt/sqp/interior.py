@@ -34,17 +34,23 @@ from impactopt.sqp.linesearch import Filter, Progress
 from impactopt.sqp.newton import borrow, give_back
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point, TimedProgram
+from impactopt.sqp.proximal import Proximal
 from impactopt.sqp.report import Report
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
-_CLOSE = 10.0  # the barrier problem is solved to this many mu (kappa_epsilon)
-_FASTER, _POWER = 0.2, 1.5  # mu becomes min(0.2 mu, mu^1.5) (eq. 7)
-_LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
+_FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
+# the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and
+# loosely. Where elastic rows have to show that no point meets them, as in the paper.
+_CLOSE, _POWER = 30.0, 1.3
+_CLOSE_ELASTIC, _POWER_ELASTIC = 10.0, 1.5
+_PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing decides does not wander
 _COMPLEMENTARY = 1e-2  # of the tolerance: multiplier x distance to the bound at a solution
+_LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
 _NEAR = 1e-2  # violation from which on elastic rows are made hard again where they do not get further
 _CHANGES = 12  # of what is aimed at, at most
+_AGAIN = 1e-4  # the least barrier after such a change
 
 
 @dataclass
@@ -90,9 +96,11 @@ class InteriorRun:
         x = point.x
         moves = p.x_upper - p.x_lower > 1e-12
         bounded = (np.isfinite(p.x_lower) | np.isfinite(p.x_upper)) & moves
+        hessian = p.hessian(x, 1.0, np.zeros(p.m))
+        self._proximal = Proximal(hessian)
         self._newton = borrow(
             point.jacobian,
-            p.hessian(x, 1.0, np.zeros(p.m)),
+            self._proximal.add(hessian, 0.0),
             determined=self._determined,
             equal=p.g_lower == p.g_upper,
             bounded=bounded,
@@ -106,7 +114,7 @@ class InteriorRun:
         lower, upper = lower[c.rows], upper[c.rows]
         self._equal, self._unequal = np.flatnonzero(lower == upper), np.flatnonzero(lower < upper)
         self._level = lower[self._equal]
-        push = self.options.push_warm if self._warm else self.options.push
+        push = self.options.push
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         self._x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self._mu)
         x = x.copy()
@@ -207,7 +215,7 @@ class InteriorRun:
             self._sigma = 0.0
         else:
             return Status.INFEASIBLE
-        self._mu = max(self._mu, self.options.barrier_warm)
+        self._mu = max(self._mu, _AGAIN)
         self._filter = None
         return None
 
@@ -274,7 +282,8 @@ class InteriorRun:
 
     def _step(self, residual: Vector) -> _Step | None:
         point = self.point
-        hessian = self.program.hessian(point.x, self._sigma, self.y)
+        self._weight = 0.0 if self._elastic is not None else _PROXIMAL * self._mu
+        hessian = self._proximal.add(self.program.hessian(point.x, self._sigma, self.y), self._weight)
         found = self._newton.factor(
             point.jacobian, hessian, self._x.stiffness(), self._weights, hard=self._elastic is None
         )
@@ -283,7 +292,7 @@ class InteriorRun:
     def _weights(self, shift: float) -> Vector:
         """Of the rows (k,), and their offsets: of the slacks' barrier, shifted too, and of elastic rows."""
         soft, self._offsets = np.zeros(self._condenser.rows.size), np.zeros(self._condenser.rows.size)
-        self._stiffness = self._s.stiffness() + shift
+        self._stiffness = self._s.stiffness() + self._weight + shift
         soft[self._unequal] = 1.0 / self._stiffness
         self._offsets[self._unequal] = self._s.slope(self._mu) / self._stiffness
         if self._elastic is not None:
@@ -431,8 +440,10 @@ class InteriorRun:
 
     def _lower_barrier(self, residual: Vector) -> None:
         least = _COMPLEMENTARY * self.options.kkt_tolerance / 11.0
-        while self._mu > least and self._error(self._mu, residual) <= _CLOSE * self._mu:
-            self._mu = max(least, min(_FASTER * self._mu, self._mu**_POWER))
+        hard = self._elastic is None
+        close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
+        while self._mu > least and self._error(self._mu, residual) <= close * self._mu:
+            self._mu = max(least, min(_FASTER * self._mu, self._mu**power))
             self._filter = None
 
     def _out_of_time(self) -> bool:

@@ -36,7 +36,7 @@ class SQPOptions:
         eigenvalues rather than by a shift, QPs solved by the dense active-set method.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
     barrier, barrier_warm : with "interior", of the first QP's barrier, without and with multipliers given.
-    push, push_warm : with "interior", how far the start is moved inside its bounds, likewise.
+    push : with "interior", how far the start is moved inside its bounds.
     """
 
     qp_solver: str = "interior"
@@ -56,9 +56,8 @@ class SQPOptions:
     dense_limit: int = 300
     second_order_correction: bool = True
     barrier: float = 3e-2
-    barrier_warm: float = 1e-4
+    barrier_warm: float = 1e-5
     push: float = 1e-2
-    push_warm: float = 1e-4
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant.

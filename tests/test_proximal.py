@@ -5,23 +5,10 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from textbook import INF, Textbook
 
 from impactopt.program import Status
 from impactopt.sqp import solve_sqp
-from impactopt.sqp.proximal import Proximal
-
-
-def test_the_weight_is_added_to_a_diagonal_that_the_pattern_may_lack():
-    dense = np.array([[2.0, 0.0, -1.0], [0.0, 0.0, 3.0], [-1.0, 3.0, 0.0]])
-    matrix = sp.csc_array(dense)
-    proximal = Proximal(matrix)
-    for weight in (0.0, 0.25):
-        found = proximal.add(matrix, weight)
-        assert np.array_equal(found.toarray(), dense + weight * np.eye(3))
-        assert found.nnz == matrix.nnz + 2  # zeros stay: the pattern is the same for every weight
-        assert found.has_canonical_format
 
 
 def test_directions_that_nothing_decides_are_left_alone():

@@ -34,7 +34,6 @@ from impactopt.sqp.linesearch import Filter, Progress
 from impactopt.sqp.newton import borrow, give_back
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point, TimedProgram
-from impactopt.sqp.proximal import Proximal
 from impactopt.sqp.report import Report
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
@@ -97,10 +96,9 @@ class InteriorRun:
         moves = p.x_upper - p.x_lower > 1e-12
         bounded = (np.isfinite(p.x_lower) | np.isfinite(p.x_upper)) & moves
         hessian = p.hessian(x, 1.0, np.zeros(p.m))
-        self._proximal = Proximal(hessian)
         self._newton = borrow(
             point.jacobian,
-            self._proximal.add(hessian, 0.0),
+            hessian,
             determined=self._determined,
             equal=p.g_lower == p.g_upper,
             bounded=bounded,
@@ -282,17 +280,23 @@ class InteriorRun:
 
     def _step(self, residual: Vector) -> _Step | None:
         point = self.point
-        self._weight = 0.0 if self._elastic is not None else _PROXIMAL * self._mu
-        hessian = self._proximal.add(self.program.hessian(point.x, self._sigma, self.y), self._weight)
+        hessian = self.program.hessian(point.x, self._sigma, self.y)
+        hard = self._elastic is None
         found = self._newton.factor(
-            point.jacobian, hessian, self._x.stiffness(), self._weights, hard=self._elastic is None
+            point.jacobian,
+            hessian,
+            self._x.stiffness(),
+            self._weights,
+            hard=hard,
+            proximal=_PROXIMAL * self._mu if hard else 0.0,
         )
         return self._solve(residual) if found else None
 
-    def _weights(self, shift: float) -> Vector:
-        """Of the rows (k,), and their offsets: of the slacks' barrier, shifted too, and of elastic rows."""
+    def _weights(self, more: float) -> Vector:
+        """Of the rows (k,), and their offsets: of the slacks' barrier, with more curvature, and of elastic
+        rows."""
         soft, self._offsets = np.zeros(self._condenser.rows.size), np.zeros(self._condenser.rows.size)
-        self._stiffness = self._s.stiffness() + self._weight + shift
+        self._stiffness = self._s.stiffness() + more
         soft[self._unequal] = 1.0 / self._stiffness
         self._offsets[self._unequal] = self._s.slope(self._mu) / self._stiffness
         if self._elastic is not None:

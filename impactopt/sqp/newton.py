@@ -68,11 +68,12 @@ class NewtonSystem:
         weights: Callable[[float], Vector],
         *,
         hard: bool,
+        proximal: float = 0.0,
     ) -> bool:
         """Factor, shifted as far as it takes.
 
-        diagonal : (f,) of the free variables; weights : gives those of the rows left (k,) for a shift; hard :
-        equalities among them have none.
+        diagonal : (f,) of the free variables; weights : gives those of the rows left (k,) for more curvature
+        of all variables and slacks: proximal and shift; hard : equalities among them have none.
 
         False: nothing helps.
         """
@@ -89,9 +90,10 @@ class NewtonSystem:
         everywhere[c.free] = diagonal
         self.shift = self._first()
         while True:
-            self._diagonal = everywhere + self.shift
+            more = proximal + self.shift
+            self._diagonal = everywhere + more
             self._weights = np.zeros(c.m)
-            self._weights[c.rows] = weights(self.shift)
+            self._weights[c.rows] = weights(more)
             if hard:
                 self._weights[c.rows[c.equal]] = penalty
             if self._matrix.factor(self._values()):

@@ -14,16 +14,25 @@ NOT_SOLVED = 1  # exit code
 
 def complete_problem(incomplete: str) -> list[str]:
     """Names of problems, and files, that begin like this: for the shell, which waits for it."""
-    from impactopt._folders import FOLDERS
+    return _complete(incomplete, "")
 
-    folder = next((folder for folder in FOLDERS if folder.is_dir()), None)
-    names = [] if folder is None else sorted(path.stem for path in folder.glob("*.toml"))
+
+def complete_sweep(incomplete: str) -> list[str]:
+    """The same of sweeps."""
+    from impactopt._folders import SWEEPS
+
+    return _complete(incomplete, SWEEPS)
+
+
+def _complete(incomplete: str, folder: str) -> list[str]:
+    from impactopt._folders import named_files
+
     typed = Path(incomplete)
     inside = typed if incomplete.endswith("/") else typed.parent
     beside = sorted(inside.iterdir()) if inside.is_dir() else []
     files = [f"{path}/" if path.is_dir() else str(path) for path in beside]
     fit = [file for file in files if file.endswith((".toml", "/"))]
-    return [name for name in (*names, *fit) if name.startswith(incomplete)]
+    return [name for name in (*named_files(folder), *fit) if name.startswith(incomplete)]
 
 
 ProblemPath = Annotated[

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt._command_options import NOT_SOLVED, AsJson, Quiet
+from impactopt._command_options import NOT_SOLVED, AsJson, Quiet, complete_sweep
 from impactopt.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -21,7 +21,14 @@ BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewr
 
 
 def sweep(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The sweep file; see docs/sweeps.md.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SWEEP",
+            help="A sweep file, or the name of one that comes with the package; see docs/sweeps.md.",
+            autocompletion=complete_sweep,
+        ),
+    ],
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="DIR", help="Where results go, and are found again.")
     ],

@@ -172,7 +172,11 @@ app.command(
 )(validate)
 app.command(epilog=examples("impactopt show results/punch --open"))(show)
 app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
-app.command(epilog=examples("impactopt sweep my_sweep.toml --out results/s --workers 2"))(sweep)
+app.command(
+    epilog=examples(
+        "impactopt sweep my.toml --out results/s", "impactopt sweep collision_target --out results/t"
+    )
+)(sweep)
 app.command(epilog=examples("impactopt reproduce table3", "impactopt reproduce all --out results/r"))(
     reproduce
 )

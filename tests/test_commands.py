@@ -231,8 +231,9 @@ def test_help_and_completion_load_nothing_heavy() -> None:
         "import sys\n"
         "from typer.testing import CliRunner\n"
         "from impactopt.cli import app\n"
-        "from impactopt._command_options import complete_problem\n"
+        "from impactopt._command_options import complete_problem, complete_sweep\n"
         "assert 'punch' in complete_problem('pun')\n"
+        "assert complete_sweep('collision_t') == ['collision_target']\n"
         "for arguments in (['--help'], ['solve', '--help'], ['collide', '-h'], ['bench', '--help'], []):\n"
         "    CliRunner().invoke(app, arguments)\n"
         # pydantic is not in it: newer versions of typer import it themselves

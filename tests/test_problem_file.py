@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,11 @@ from impactopt.errors import InputError
 from impactopt.problem import COLLISIONS, ImpactProblem, Phase
 from impactopt.problem_file import load_problem, read_problem_file
 from impactopt.problem_file.mistakes import key_lines
-from impactopt.problem_file.section import Section
+from impactopt.problem_file.section import Section, attribute_docs
 from impactopt.robot import Tool
 from impactopt.scenario import Scenario
 from impactopt.shapes import Capsule
+from impactopt.sqp import SQPOptions
 from impactopt.stance import FixedBase, OneSole
 
 TARGETS_AND_LAWS = (
@@ -125,6 +127,13 @@ def test_the_commented_keys_of_the_demos_file_show_the_defaults(tmp_path: Path) 
     for field in dataclasses.fields(ImpactProblem):
         if field.name not in ("robot", "point", "normal"):
             assert getattr(a, field.name) == getattr(b, field.name), field.name
+
+
+def test_what_a_docstring_says_of_options_is_read_with_and_without_its_margin() -> None:
+    said = attribute_docs(SQPOptions)
+    assert {*said} == {option.name for option in dataclasses.fields(SQPOptions)}
+    bare = type("Bare", (), {"__doc__": cleandoc(SQPOptions.__doc__ or "")})  # as Python 3.13 keeps it
+    assert attribute_docs(bare) == said
 
 
 def test_all_that_a_file_says_reaches_the_problem(tmp_path: Path) -> None:

@@ -128,6 +128,17 @@ def test_a_file_names_its_problem_relative_to_itself(tmp_path: Path) -> None:
     assert found.problem.path == tmp_path / "arm.toml"
 
 
+def test_sweeps_of_the_package_go_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = read_sweep_file("collision_target")
+    assert found.design.cases == 10_000 and found.problem.path.name == "punch.toml"
+    listed = r"no sweep 'colision_target' .did you mean 'collision_target'.*collision_million.*path of a file"
+    with pytest.raises(InputError, match=listed):
+        read_sweep_file("colision_target")
+    with pytest.raises(InputError, match=r"cannot read collision_target\.toml: No such file"):
+        read_sweep_file("collision_target.toml")
+
+
 def test_all_mistakes_are_told_with_their_lines(tmp_path: Path) -> None:
     text = TEXT.replace('grain = "strike"', 'grain = "strik"\nworkers = 2')
     said = message(written(tmp_path, text))

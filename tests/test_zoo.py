@@ -14,7 +14,17 @@ import pinocchio as pin
 import pytest
 from small_plans import planned, transcribed
 
-from impactopt import Tool, arm7, load_problem, load_robot, planar_arm, problem_names, robot_names, standin
+from impactopt import (
+    Tool,
+    _folders,
+    arm7,
+    load_problem,
+    load_robot,
+    planar_arm,
+    problem_names,
+    robot_names,
+    standin,
+)
 from impactopt._arms import ARM7, arm_model
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
@@ -69,12 +79,16 @@ def test_a_wheel_has_them_inside_the_package(monkeypatch: pytest.MonkeyPatch, tm
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     kept = wheel["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert {str(ROOT / inside): ROOT / folder for folder, inside in kept.items()} == {
-        str(names.FOLDERS[0]): FILES["punch"].parent
+        str(_folders.FOLDERS[0]): FILES["punch"].parent
     }
     (tmp_path / "_problems").mkdir()
     (tmp_path / "_problems" / "inside.toml").write_text("# What it is.\n", encoding="utf-8")
-    monkeypatch.setattr(names, "FOLDERS", (tmp_path / "_problems", *names.FOLDERS[1:]))
+    (tmp_path / "_problems" / "sweeps").mkdir()
+    (tmp_path / "_problems" / "sweeps" / "many.toml").touch()
+    monkeypatch.setattr(_folders, "FOLDERS", (tmp_path / "_problems", *_folders.FOLDERS[1:]))
     assert problem_names() == ("inside",) and names.problem_summary("inside") == "What it is"
+    assert names.sweep_names() == ("many",)
+    assert names.sweep_file("many") == tmp_path / "_problems" / "sweeps" / "many.toml"
 
 
 # ---- one foot

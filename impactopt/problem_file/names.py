@@ -1,19 +1,20 @@
-"""Problems by name: the files that come with the package."""
+"""Problems and sweeps by name: the files that come with the package."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
-from impactopt._folders import FOLDERS
+from impactopt._folders import SWEEPS, named_files
 from impactopt.errors import InputError, did_you_mean
 
-__all__ = ["problem_file", "problem_names", "problem_summary"]
+__all__ = ["problem_file", "problem_names", "problem_summary", "sweep_file", "sweep_names"]
 
 
 def problem_names() -> tuple[str, ...]:
     """Names of the problems that come with the package, as `load_problem` takes them."""
-    return tuple(sorted(_named()))
+    return tuple(named_files())
 
 
 def problem_file(name: str | os.PathLike[str]) -> Path:
@@ -25,16 +26,17 @@ def problem_file(name: str | os.PathLike[str]) -> Path:
     ------
     InputError : an unknown name.
     """
-    path = Path(name)
-    if path.suffix or len(path.parts) != 1 or path.is_file():
-        return path
-    named = _named()
-    if path.name not in named:
-        raise InputError(
-            f"there is no problem {path.name!r}{did_you_mean(path.name, named)}; problems are "
-            f"{', '.join(sorted(named))}; or give the path of a file"
-        )
-    return named[path.name]
+    return _file(name, named_files(), "problem")
+
+
+def sweep_names() -> tuple[str, ...]:
+    """Names of the sweeps that come with the package, as `read_sweep_file` takes them."""
+    return tuple(named_files(SWEEPS))
+
+
+def sweep_file(name: str | os.PathLike[str]) -> Path:
+    """The file of a sweep's name, as `problem_file` of a problem's."""
+    return _file(name, named_files(SWEEPS), "sweep")
 
 
 def problem_summary(name: str) -> str:
@@ -47,6 +49,13 @@ def problem_summary(name: str) -> str:
     return " ".join(words).split(". ")[0].rstrip(".:")
 
 
-def _named() -> dict[str, Path]:
-    folder = next((folder for folder in FOLDERS if folder.is_dir()), None)
-    return {} if folder is None else {path.stem: path for path in folder.glob("*.toml")}
+def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) -> Path:
+    path = Path(name)
+    if path.suffix or len(path.parts) != 1 or path.is_file():
+        return path
+    if path.name not in named:
+        raise InputError(
+            f"there is no {kind} {path.name!r}{did_you_mean(path.name, named)}; {kind}s are "
+            f"{', '.join(named)}; or give the path of a file"
+        )
+    return named[path.name]

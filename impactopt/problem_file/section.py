@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, ClassVar
@@ -24,8 +25,9 @@ def required(about: str, key: str | None = None) -> Any:
 
 def attribute_docs(kind: type) -> dict[str, str]:
     """What a class's docstring says of each attribute, on one line; `a, b : text` is said of both."""
-    section = re.split(r"\n *Attributes\n *-+\n", kind.__doc__ or "")[-1]
-    entries = re.split(r"\n(?=    [a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
+    said = inspect.cleandoc(kind.__doc__ or "")  # Python 3.13 takes the margin away, older ones keep it
+    section = re.split(r"\nAttributes\n-+\n", said)[-1]
+    entries = re.split(r"\n(?=[a-z_]+(?: \[\w+\])?(?:, [a-z_]+(?: \[\w+\])?)* : )", "\n" + section)
     out: dict[str, str] = {}
     for entry in entries[1:]:
         names, _, text = entry.partition(" : ")

@@ -130,11 +130,11 @@ def _bench(name: str, say: Say) -> Maker:
 
 
 def _sweep(name: str, say: Say) -> Maker:
-    """Of a sweep's file in problems/sweeps."""
+    """Of a sweep that comes with the package."""
     from impactopt.plotting.sweep import drawn_table
     from impactopt.sweeps import read_sweep_file, sweep
 
-    chosen = read_sweep_file(Path("problems") / "sweeps" / f"{name}.toml")
+    chosen = read_sweep_file(name)
     assert chosen.figure is not None  # for mypy: those that are named here have one
     with TemporaryDirectory() as place:
         picture = drawn_table(chosen.figure, sweep(chosen, place, report=say).table)

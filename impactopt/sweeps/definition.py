@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
-from impactopt.problem_file.names import problem_file
+from impactopt.problem_file.names import problem_file, sweep_file
 from impactopt.problem_file.toml import TOMLError, plain_value
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
@@ -69,13 +69,14 @@ class Sweep:
 
 
 def read_sweep_file(path: str | os.PathLike[str]) -> Sweep:
-    """The sweep of a file.
+    """The sweep of a file, or by name one that comes with the package.
 
     Raises
     ------
-    InputError : the file cannot be read, or it is wrong; one message with all mistakes and their lines.
+    InputError : an unknown name; the file cannot be read, or is wrong; one message with all mistakes and
+        their lines.
     """
-    path = Path(path)
+    path = sweep_file(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

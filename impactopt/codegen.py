@@ -135,11 +135,7 @@ def cached(
     if compiler is None:
         _warn_no_compiler()
         return _graphs(_by_name(build()))
-    try:
-        directory = private_directory(cache_directory())
-    except (UnsafePath, OSError) as error:
-        directory = temporary_private_directory()
-        _warn(f"{error}; compiling into a temporary directory, for this process only")
+    directory = _directory()
     entry = f"{_slug(name)}-{_entry_key(name, recipe, compiler)}"
     functions = _load_entry(directory, entry)
     if functions is not None:
@@ -157,10 +153,7 @@ def compiled_library(name: str, code: str, *, level: str = _NATIVE_LEVEL) -> Pat
     compiler = find_compiler()
     if compiler is None:
         return None
-    try:
-        directory = private_directory(cache_directory())
-    except (UnsafePath, OSError):
-        directory = temporary_private_directory()
+    directory = _directory()
     try:
         with (
             locked(directory / f"{_slug(name)}.lock", on_wait=lambda: None),
@@ -178,15 +171,21 @@ def library_path(name: str, recipe: tuple[Any, ...], function: str) -> Path | No
     compiler = find_compiler()
     if compiler is None:
         return None
-    try:
-        directory = private_directory(cache_directory())
-    except (UnsafePath, OSError):
-        directory = temporary_private_directory()
+    directory = _directory()
     entry = f"{_slug(name)}-{_entry_key(name, recipe, compiler)}"
     if _load_entry(directory, entry) is None:
         return None
     listing = json.loads((directory / f"{entry}.json").read_text(encoding="utf-8"))
     return directory / str(listing["functions"][function][0])
+
+
+def _directory() -> Path:
+    """The cache, or where it cannot be used a directory of this process."""
+    try:
+        return private_directory(cache_directory())
+    except (UnsafePath, OSError) as error:
+        _warn(f"{error}; compiling into a temporary directory, for this process only")
+        return temporary_private_directory()
 
 
 def cache_directory() -> Path:

@@ -8,7 +8,6 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from small_plans import biped_problem, transcribed
 
 from impactopt.nlp.start import first_iterate
 from impactopt.sqp.cholesky import BlockCholesky
@@ -148,13 +147,8 @@ def test_the_factor_in_blocks_against_dense_algebra(algebra, seed, n, wide):
     assert not matrix.factor(values(K - 1.01 * np.linalg.eigvalsh(K)[-1] * np.eye(n)))
 
 
-@pytest.fixture(scope="module")
-def motion():
-    return transcribed(biped_problem())
-
-
-def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, motion):
-    t = motion
+def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, biped_transcription):
+    t = biped_transcription
     p = t.program
     rng = np.random.default_rng(0)
     x = first_iterate(t) + 1e-3 * rng.normal(size=p.n)

@@ -392,8 +392,11 @@ class InteriorRun:
 
     def _give_way(self, residual: Vector) -> str | Status:
         """What to do where no step is progress: let rows be violated at a price, or end."""
-        if self._error(0.0, residual) <= self.options.acceptable_tolerance and self._elastic is None:
-            return Status.ACCEPTABLE
+        if self._error(0.0, residual) <= self.options.acceptable_tolerance:
+            if self._elastic is None:
+                return Status.ACCEPTABLE
+            if not self._sigma:  # the violation is least, but for rounding
+                return self._verdict() or "rows are hard again"
         point = self.point
         if self._elastic is None:
             self._elastic = Elastic(residual[self._condenser.rows], self._price, self._mu)

@@ -69,9 +69,11 @@ class _Writer:
                     self._header(f"[[{_dotted(inner)}]]", self.comment(inner) if i == 0 else "")
                     self._keys(entry, (*inner, i))
                 continue
-            # a table of tables alone needs no line of its own
+            # a table of tables alone needs no line of its own; its comment stands above the first of them
             if not value or not all(_is_table(v) or _is_list_of_tables(v) for v in value.values()):
                 self._header(f"[{_dotted(inner)}]", self.comment(inner))
+            elif self.comment(inner):
+                self.lines.extend(["", f"# {self.comment(inner)}"])
             self.table(value, inner)
 
     def _keys(self, table: Mapping[str, Any], place: Place) -> None:
@@ -81,7 +83,11 @@ class _Writer:
             self.lines.append(f"{line:<{_COMMENTS_FROM}} # {said}" if said else line)
 
     def _header(self, header: str, comment: str) -> None:
-        self.lines.extend(["", *([f"# {comment}"] if comment else []), header])
+        said = [f"# {comment}"] if comment else []
+        above = self.lines[-2:-1] == [""] and self.lines[-1].startswith(
+            "# "
+        )  # the comment of all such tables
+        self.lines.extend([*([] if above else [""]), *said, header])
 
 
 def _is_table(value: Any) -> bool:

@@ -20,22 +20,31 @@ HEIGHT = 620  # pixels, in a notebook
 
 
 @dataclass(frozen=True)
-class Animation:
-    """A page with the moving robot, contact force, ZMP, support polygon and centre of mass.
-
-    A notebook shows it where it is the value of a cell.  html : the whole page; it needs no network.
-    """
+class Page:
+    """A page.  html : all of it; it needs no network."""
 
     html: str
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it as one HTML file.
+        """Write it as one HTML file; its folder is there already.
 
         Raises
         ------
         InputError : it cannot be written, or its name does not end in .html.
         """
-        return save_page(self.html, Path(path))
+        path = Path(path)
+        if path.suffix.lower() not in (".html", ".htm"):
+            raise InputError(f"a page is HTML: give {path.name!r} the ending .html")
+        write_file(path, lambda file: file.write(self.html.encode()))
+        return path
+
+
+@dataclass(frozen=True)
+class Animation(Page):
+    """A page with the moving robot, contact force, ZMP, support polygon and centre of mass.
+
+    A notebook shows it where it is the value of a cell.  html : the whole page; it needs no network.
+    """
 
     def _repr_html_(self) -> str:
         """A frame of its own, so that the notebook's styles and scripts stay apart from its."""
@@ -57,16 +66,3 @@ def animation_of(record: Record, problem: ImpactProblem) -> Animation:
     header, arrays = stage_of(record, problem)
     name = str(record.summary.get("problem", {}).get("name", "")) or "motion"
     return Animation(html_page(title=name, kind="alone", body=BODY, header=header, arrays=arrays))
-
-
-def save_page(html: str, path: Path) -> Path:
-    """Write a page; its folder is there already.
-
-    Raises
-    ------
-    InputError : it cannot be written, or its name does not end in .html.
-    """
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"a page is HTML: give {path.name!r} the ending .html")
-    write_file(path, lambda file: file.write(html.encode()))
-    return path

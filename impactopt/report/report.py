@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 from typing import Any
 
 from impactopt.output import Record
 from impactopt.problem import ImpactProblem
-from impactopt.report.animation import save_page
+from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
 from impactopt.report.stage import stage_of
@@ -23,19 +21,8 @@ NARROW = "\u202f"  # between a number and its unit: no line ends there
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(Page):
     """A page; `save` writes it.  html : all of it; it needs no network."""
-
-    html: str
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it as one HTML file.
-
-        Raises
-        ------
-        InputError : it cannot be written, or its name does not end in .html.
-        """
-        return save_page(self.html, Path(path))
 
 
 def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable, Sequence
 from importlib.resources import files
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -78,45 +77,24 @@ class CompiledKernels(Kernels):
 
     def __init__(self, library: Any):
         self._c = library
-        self._made: WeakKeyDictionary[Any, tuple[Any, ...]] = WeakKeyDictionary()
-        self._lists: dict[int, tuple[Any, ...]] = {}
+        self._made: dict[int, tuple[Any, Any]] = {}
 
     # ------------------------------------------------------------------ what C needs to know
-    def _of(self, thing: Any, make: Callable[[Any], tuple[Any, ...]]) -> Any:
-        """The structure for a stage or panels, made once; what it points to is kept with it."""
-        if thing not in self._made:
-            self._made[thing] = make(thing)
-        return ctypes.byref(self._made[thing][0])
+    def _of(self, thing: Any, make: Callable[[Any], Any]) -> Any:
+        """What C takes for a thing, made once, and kept with it and with what it points to."""
+        found = self._made.get(id(thing))
+        if found is None:
+            found = self._made[id(thing)] = thing, make(thing)
+        return found[1]
 
     @staticmethod
     def _stage(a: Stage) -> tuple[Any, ...]:
         k, nt, nc = a.tc.shape
         r, nu = a.q.shape[1], a.u.shape[1]
         work = np.zeros(max(nt * nc, r * nu + nc * nu, r + max(nt, nc, nu)) + 1)
-        arrays = [
-            getattr(a, name)
-            for name in [
-                "q",
-                "e",
-                "t",
-                "u",
-                "qe",
-                "qc",
-                "te",
-                "tc",
-                "hee",
-                "heu",
-                "hcu",
-                "lu",
-                "pivots",
-                "X",
-                "T",
-                "H",
-                "G",
-                "x0",
-            ]
-        ]
-        return _Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)]), work
+        arrays = [getattr(a, name) for name in _OF_STAGES]
+        made = _Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)])
+        return ctypes.byref(made), work
 
     @staticmethod
     def _panels(p: Panels) -> tuple[Any, ...]:
@@ -126,59 +104,56 @@ class CompiledKernels(Kernels):
         below = np.concatenate([np.zeros(0, np.int32), *p.below])
         work = np.zeros(rest * max(rest, p.start[-1]) + 1)
         keep = size, p.height, first, below, p.row_at, p.start, p.at, work
-        return _Panels(size.size, *[x.ctypes.data for x in keep]), keep
+        return ctypes.byref(_Panels(size.size, *[x.ctypes.data for x in keep])), keep
 
-    def _groups(self, products: Sequence[Products]) -> tuple[Any, ...]:
-        key = id(products)
-        if key not in self._lists:
-            empty = [np.zeros(0, np.int32)]
-            parts = (
-                np.array([p.rows.size for p in products], dtype=np.int32),
-                np.array([p.values.shape[1] for p in products], dtype=np.int32),
-                np.concatenate(empty + [p.rows for p in products]),
-                np.concatenate(empty + [p.values.ravel() for p in products]),
-                np.concatenate(empty + [p.to for p in products]),
-            )
-            work = np.zeros(max([p.to.size for p in products], default=0) + 1)
-            self._lists[key] = products, parts, work
-        return self._lists[key]
+    @staticmethod
+    def _groups(products: Sequence[Products]) -> tuple[Any, ...]:
+        empty = [np.zeros(0, np.int32)]
+        parts = (
+            np.array([p.rows.size for p in products], dtype=np.int32),
+            np.array([p.values.shape[1] for p in products], dtype=np.int32),
+            np.concatenate(empty + [p.rows for p in products]),
+            np.concatenate(empty + [p.values.ravel() for p in products]),
+            np.concatenate(empty + [p.to for p in products]),
+        )
+        return parts, np.zeros(max([p.to.size for p in products], default=0) + 1)
 
     # ------------------------------------------------------------------ the operations
     def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
         self._c.newton_copy(_at(values), _at(source), _at(to), _at(places), ctypes.c_int64(source.size))
 
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
-        _, parts, work = self._groups(products)
+        parts, work = self._of(products, self._groups)
         groups = ctypes.c_int64(len(products))
         self._c.newton_products(groups, *map(_at, parts), _at(values), _at(weights), _at(W), _at(work))
 
     def eliminate(self, a: Stage, J: Vector) -> None:
-        if self._c.newton_eliminate(self._of(a, self._stage), _at(J), _last(J)):
+        if self._c.newton_eliminate(self._of(a, self._stage)[0], _at(J), _last(J)):
             raise np.linalg.LinAlgError("rows do not determine their variables")
 
     def reduce(self, a: Stage, W: Vector) -> None:
-        self._c.newton_reduce(self._of(a, self._stage), _at(W), _last(W))
+        self._c.newton_reduce(self._of(a, self._stage)[0], _at(W), _last(W))
 
     def forward(self, a: Stage, g: Vector, off: Vector) -> None:
-        self._c.newton_forward(self._of(a, self._stage), _at(g), _last(g), _at(off), _last(off))
+        self._c.newton_forward(self._of(a, self._stage)[0], _at(g), _last(g), _at(off), _last(off))
 
     def expand(self, a: Stage, d: Vector) -> None:
-        self._c.newton_expand(self._of(a, self._stage), _at(d))
+        self._c.newton_expand(self._of(a, self._stage)[0], _at(d))
 
     def pull(self, a: Stage, v: Vector) -> Stack:
         own = np.empty(a.e.shape)
-        self._c.newton_pull(self._of(a, self._stage), _at(v), _last(v), _at(own))
+        self._c.newton_pull(self._of(a, self._stage)[0], _at(v), _last(v), _at(own))
         return own
 
     def duals(self, a: Stage, own: Stack, y: Vector) -> None:
-        self._c.newton_duals(self._of(a, self._stage), _at(own), _at(y))
+        self._c.newton_duals(self._of(a, self._stage)[0], _at(own), _at(y))
 
     def factor(self, p: Panels, values: Vector) -> bool:
-        return not self._c.newton_cholesky(self._of(p, self._panels), _at(values))
+        return not self._c.newton_cholesky(self._of(p, self._panels)[0], _at(values))
 
     def solve(self, p: Panels, values: Vector, x: Stack) -> Stack:
         shape = (ctypes.c_int64(x.shape[0]), ctypes.c_int64(x.shape[1]))
-        self._c.newton_solve(self._of(p, self._panels), _at(values), _at(x), *shape)
+        self._c.newton_solve(self._of(p, self._panels)[0], _at(values), _at(x), *shape)
         return x
 
 

@@ -184,7 +184,7 @@ class Condenser:
             self._kernels.eliminate(stage, self.J)
 
     @property
-    def A(self) -> Matrix:
+    def A(self) -> Vector:
         """Of the equalities left, by the free variables (l, f)."""
         out = np.zeros((len(self.left), self.free.size))
         for row, (columns, at) in zip(out, self.left, strict=True):

@@ -110,8 +110,7 @@ class InteriorRun:
         upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
         self._gone = lower[c.eliminated]
         lower, upper = lower[c.rows], upper[c.rows]
-        self._equal, self._unequal = np.flatnonzero(lower == upper), np.flatnonzero(lower < upper)
-        self._level = lower[self._equal]
+        self._unequal, self._level = np.flatnonzero(lower < upper), lower[c.equal]
         push = self.options.push
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
         self._x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self._mu)
@@ -274,7 +273,7 @@ class InteriorRun:
         slacks."""
         out, c = self._all(point), self._condenser
         out[c.eliminated] -= self._gone
-        out[c.rows[self._equal]] -= self._level
+        out[c.rows[c.equal]] -= self._level
         out[c.rows[self._unequal]] -= slack
         return out
 

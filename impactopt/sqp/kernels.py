@@ -185,10 +185,8 @@ class Kernels:
     def solve(self, p: Panels, values: Vector, x: Stack) -> Stack:
         """(L L')^-1 x for columns (n, k)."""
         blocks = [slice(a, b) for a, b in zip(p.start[:-1], p.start[1:], strict=True)]
-        under = [
-            np.concatenate([np.arange(p.start[-1])[blocks[i]] for i in [*b]] or [[]]).astype(int)
-            for b in p.below
-        ]
+        every = np.arange(p.start[-1])
+        under = [np.concatenate([every[:0], *[every[blocks[i]] for i in below]]) for below in p.below]
         panels = _split(p, values)
         for panel, own, rows in zip(panels, blocks, under, strict=True):
             size = own.stop - own.start

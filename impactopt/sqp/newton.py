@@ -42,6 +42,7 @@ class NewtonSystem:
         it touch each other, None: to be found.
         """
         self.condenser, self.held = condenser, held
+        self._equal = condenser.rows[condenser.equal]  # numbers of the equalities left
         order = None if sequence is None else sequence[condenser.free]
         self._matrix = BlockCholesky(condenser.pattern, order, kernels)
         self._from, i, j = condenser.at_free
@@ -85,24 +86,24 @@ class NewtonSystem:
         self._jacobian, self._hessian, self._hard = jacobian, hessian, hard
         self._transposed = jacobian.T
         self._A = c.A
-        penalty = self._penalty()
         everywhere = np.zeros(c.n)
         everywhere[c.free] = diagonal
+        penalty = self._penalty() if hard else None
         self.shift = self._first()
         while True:
             more = proximal + self.shift
             self._diagonal = everywhere + more
             self._weights = np.zeros(c.m)
             self._weights[c.rows] = weights(more)
-            if hard:
-                self._weights[c.rows[c.equal]] = penalty
+            if penalty is not None:
+                self._weights[self._equal] = penalty
             if self._matrix.factor(self._values()):
                 break
             self.shift = self._next()
             if self.shift > _MOST:
                 return False
         self._last = self.shift or self._last
-        if hard and c.equal.size:
+        if hard and self._equal.size:
             self._spread = self._matrix.solve(self._A.T)
             self._schur = self._A @ self._spread
         return True
@@ -138,15 +139,14 @@ class NewtonSystem:
         W = c.reduce(self._weights, self._diagonal)
         self._kernels.copy(W, self._from, values, self._to)
         values[self._diagonal_to[self.held]] += _HELD
-        self._kernels.add_products(self._products, c.J, self._weights[c.rows[c.equal]], values)
+        self._kernels.add_products(self._products, c.J, self._weights[self._equal], values)
         return values
 
     def solve(self, q: Vector, r: Vector) -> tuple[Vector, Vector]:
         """The step (n,) and the new multipliers (m,) of all rows, for a gradient (n,) and the rows' residuals
         (m,): what they are off by, with weights.
         """
-        c, w = self.condenser, self._weights.copy()
-        equal = c.rows[c.equal]
+        c, w, equal = self.condenser, self._weights.copy(), self._equal
         w[equal] = 0.0
         exact = np.concatenate([c.eliminated, equal]) if self._hard else c.eliminated
         d, y, rows, dual = self._respond(q + self._pulled(w * r), r, w)
@@ -165,8 +165,7 @@ class NewtonSystem:
         """Step for a gradient and the residuals of equalities; multipliers, of rows with weights w what the
         step changes; how all rows change; gradient of the Lagrangian without the equalities.
         """
-        c = self.condenser
-        equal = c.rows[c.equal]
+        c, equal = self.condenser, self._equal
         own = self._weights[equal]
         by_free, off = c.forward(g, r)
         by_free += self._A.T @ (own * off)
@@ -174,7 +173,8 @@ class NewtonSystem:
         free = -self._matrix.solve(by_free)
         extra = np.zeros(equal.size)
         if self._hard and equal.size:
-            extra = np.linalg.lstsq(self._schur, self._A @ free + off, rcond=None)[0]
+            found = np.linalg.lstsq(self._schur, self._A @ free + off, rcond=None)[0]
+            extra = np.asarray(found, dtype=np.float64)
             free -= self._spread @ extra
         free[self.held] = 0.0
         d = c.expand(free)

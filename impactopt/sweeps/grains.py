@@ -33,35 +33,23 @@ _PLAIN = (
 _UNITS = {"N s": "_Ns", "N": "_N", "J": "_J", "m": "_m", "s": "_s", "(N m s)^2": "_N2m2s2"}
 
 
-def _solve(work: Work, unit: Unit, alarm: Alarm) -> Rows:
+def _plan(work: Work, unit: Unit, alarm: Alarm) -> Rows:
     file = _file(work, unit)
     problem = file.build()
-    solution = solve(
-        problem,
-        start=work.start,
-        starts=work.starts,
-        seed=work.seed,
-        report=alarm.building,
-        callback=alarm.iteration,
+    options = {
+        "starts": work.starts,
+        "seed": work.seed,
+        "report": alarm.building,
+        "callback": alarm.iteration,
         **_arguments(file, work),
-    )
+    }
     # the record's summary says why a motion that was stopped early has none
-    record = record_of(solution, problem=file.text, problem_path=file.path)
-    return _row(record.summary, problem), {unit.first: record} if work.trajectories else {}
-
-
-def _strike(work: Work, unit: Unit, alarm: Alarm) -> Rows:
-    file = _file(work, unit)
-    problem = file.build()
-    solution = optimize_strike(
-        problem,
-        starts=work.starts,
-        seed=work.seed,
-        report=alarm.building,
-        callback=alarm.iteration,
-        **_arguments(file, work),
-    )
-    record = record_of_strike(solution, problem=file.text, problem_path=file.path)
+    if work.grain == "strike":
+        strike = optimize_strike(problem, **options)
+        record = record_of_strike(strike, problem=file.text, problem_path=file.path)
+    else:
+        solution = solve(problem, start=work.start, **options)
+        record = record_of(solution, problem=file.text, problem_path=file.path)
     return _row(record.summary, problem), {unit.first: record} if work.trajectories else {}
 
 
@@ -77,8 +65,8 @@ def _collide(work: Work, unit: Unit, alarm: Alarm) -> Rows:
 
 _kept: tuple[Work, Collisions] | None = None
 GRAINS: dict[str, Callable[[Work, Unit, Alarm], Rows]] = {
-    "solve": _solve,
-    "strike": _strike,
+    "solve": _plan,
+    "strike": _plan,
     "collision": _collide,
 }
 

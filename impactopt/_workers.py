@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import itertools
 import multiprocessing
 import os
 import signal
@@ -208,12 +209,14 @@ def _interrupts_held_back() -> Iterator[None]:
 
 def _serve(pipe: Connection, function: Callable[[Any, Any], Any], shared: Any, parent: int) -> None:
     _end_with(parent)
-    gc.freeze()  # modules stay, and need not be gone through for garbage again and again
     try:
         pipe.send((None, None))  # ready
-        while True:
+        for done in itertools.count():
             index, given = pipe.recv()
             pipe.send((index, function(shared, given)))
+            if not done:  # what it loaded stays, and need not be gone through for garbage again and again
+                gc.collect()
+                gc.freeze()
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return  # nobody asks any more
 

@@ -38,6 +38,7 @@ __all__ = [
     "record_of_strike",
     "replay_arrays",
     "save_record",
+    "summary_of",
     "write_file",
 ]
 
@@ -124,6 +125,13 @@ def record_of_strike(
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     summary = plain(solution.summary())
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
+    """That of the solution's record; where nothing else of it is kept, its arrays need not be made."""
+    return plain(
+        solution.summary() if isinstance(solution, StrikeSolution) else _summary(solution, None, None)
+    )
 
 
 def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:

@@ -37,18 +37,10 @@ class Affine:
         return cls.constant(np.zeros(size))
 
     def __add__(self, other: Affine) -> Affine:
-        if other.size != self.size:
-            raise ValueError(f"affine expressions of sizes {self.size} and {other.size} do not add")
-        return Affine(
-            self.size,
-            np.concatenate([self.rows, other.rows]),
-            np.concatenate([self.cols, other.cols]),
-            np.concatenate([self.vals, other.vals]),
-            self.const + other.const,
-        )
+        return add([self, other])
 
     def __mul__(self, factor: ArrayLike) -> Affine:
-        k = np.broadcast_to(np.asarray(factor, dtype=float), (self.size,))
+        k = np.asarray(factor, dtype=float) + np.zeros(self.size)
         return Affine(self.size, self.rows, self.cols, self.vals * k[self.rows], self.const * k)
 
     __rmul__ = __mul__
@@ -81,6 +73,19 @@ def select(expression: Affine, keep: NDArray[np.intp]) -> Affine:
     where = np.concatenate(out) if out else np.zeros(0, dtype=np.intp)
     rows = np.repeat(np.arange(len(keep)), [len(o) for o in out])
     return Affine(len(keep), rows, expression.cols[where], expression.vals[where], expression.const[keep])
+
+
+def add(parts: Sequence[Affine]) -> Affine:
+    """The sum of one expression or more, of one size."""
+    if len(sizes := dict.fromkeys(p.size for p in parts)) > 1:
+        raise ValueError(f"affine expressions of sizes {' and '.join(map(str, sizes))} do not add")
+    return Affine(
+        parts[0].size,
+        np.concatenate([p.rows for p in parts]),
+        np.concatenate([p.cols for p in parts]),
+        np.concatenate([p.vals for p in parts]),
+        np.sum([p.const for p in parts], axis=0),
+    )
 
 
 def stack(parts: Sequence[Affine]) -> Affine:

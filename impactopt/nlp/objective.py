@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
 from impactopt.nlp.collision import Collision
-from impactopt.nlp.layout import Affine, Array, Group, Layout
+from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
 from impactopt.objectives import (
     AngularMomentum,
     Effort,
@@ -151,8 +151,8 @@ def wrench_prices(t: ContactProgram, groups: list[tuple[Group, int]]) -> Array:
 def motion_prices(t: Transcription) -> Prices:
     """Of accelerations, of sole wrenches and of ending away from the start posture."""
     p, n = t.problem, t.layout.n
-    quadratic = sp.csr_array((n, n))
     linear, diagonal, constant = np.zeros(n), np.zeros(n), 0.0
+    accelerations: list[Affine] = []
     for control, breaks, nodes, bounds in (
         (t.swing_control, t.swing_breaks, t.swing_nodes, p.swing.duration),
         *((f.control, t.follow_breaks, t.follow_nodes, p.follow.duration) for f in t.follows),
@@ -160,12 +160,12 @@ def motion_prices(t: Transcription) -> Prices:
         typical = float(np.mean(bounds))
         lengths = np.gradient(nodes)
         for at, length in zip(nodes, lengths, strict=True):
-            acc = t.at(control, breaks, at)[2] * (1 / typical**2)
             weight = p.smoothness * typical * length
-            m = acc.matrix(n)
-            quadratic = quadratic + 2 * weight * (m.T @ m)
-            linear += 2 * weight * (m.T @ acc.const)
-            constant += weight * float(acc.const @ acc.const)
+            accelerations.append(t.at(control, breaks, at)[2] * (np.sqrt(2 * weight) / typical**2))
+    weighted = stack(accelerations)
+    m = weighted.matrix(n)
+    linear += m.T @ weighted.const
+    constant += float(weighted.const @ weighted.const) / 2
     groups = (t.swing_w, t.coast_w, *[part.w for part in (*t.follows, *t.collisions)])
     diagonal += wrench_prices(t, [(group, group.count) for group in groups])
     for follow in t.follows:  # price (y_end - y_start)^2: rest near the start posture
@@ -173,4 +173,4 @@ def motion_prices(t: Transcription) -> Prices:
         diagonal[end] += 2 * p.return_price
         linear[end] -= 2 * p.return_price * t.y0
         constant += p.return_price * float(t.y0 @ t.y0)
-    return Prices(quadratic + sp.diags_array(diagonal), linear, constant)
+    return Prices(m.T @ m + sp.diags_array(diagonal), linear, constant)

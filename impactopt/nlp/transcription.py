@@ -24,7 +24,7 @@ from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.lanes import in_lanes
-from impactopt.nlp.layout import Affine, Array, Group, stack
+from impactopt.nlp.layout import Affine, Array, Group, add, stack
 from impactopt.nlp.mesh import with_middles
 from impactopt.nlp.objective import Prices, motion_prices
 from impactopt.nlp.rows import Index, Measure, Place, along, degrees, millimetres, percent, rates
@@ -129,13 +129,10 @@ class Transcription(ContactProgram):
 
     def at(self, control: Callable[[int], Affine], breaks: Array, s: float) -> tuple[Affine, Affine, Affine]:
         """y, y', y'' at s of the spline with these control points."""
-        out = []
-        for weights in basis(breaks, s):
-            expression = Affine.zeros(self.ny)
-            for j in np.flatnonzero(weights[0]):
-                expression = expression + control(int(j)) * weights[0, j]
-            out.append(expression)
-        return out[0], out[1], out[2]
+        y, yd, ydd = (
+            add([control(int(j)) * row[0, j] for j in np.flatnonzero(row[0])]) for row in basis(breaks, s)
+        )
+        return y, yd, ydd
 
     def swing_place(self, s: float) -> Place:
         return Place(f"swing, {100 * s:.0f} %", "swing at {s}", self.swing_T[0] * s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from impactopt.output import Record, plain, record_of, record_of_strike
+from impactopt.output import Record, plain, record_of, record_of_strike, summary_of
 from impactopt.planner import solve
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile, problem_file_from_data
@@ -43,14 +43,16 @@ def _plan(work: Work, unit: Unit, alarm: Alarm) -> Rows:
         "callback": alarm.iteration,
         **_arguments(file, work),
     }
-    # the record's summary says why a motion that was stopped early has none
+    from_file: Any = {"problem": file.text, "problem_path": file.path}
     if work.grain == "strike":
         strike = optimize_strike(problem, **options)
-        record = record_of_strike(strike, problem=file.text, problem_path=file.path)
+        kept = record_of_strike(strike, **from_file) if work.trajectories else None
+        summary = summary_of(strike) if kept is None else kept.summary
     else:
         solution = solve(problem, start=work.start, **options)
-        record = record_of(solution, problem=file.text, problem_path=file.path)
-    return _row(record.summary, problem), {unit.first: record} if work.trajectories else {}
+        kept = record_of(solution, **from_file) if work.trajectories else None
+        summary = summary_of(solution) if kept is None else kept.summary
+    return _row(summary, problem), {} if kept is None else {unit.first: kept}
 
 
 def _collide(work: Work, unit: Unit, alarm: Alarm) -> Rows:

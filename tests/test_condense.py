@@ -116,7 +116,11 @@ def test_systems_that_the_hessian_couples_are_refused():
 def test_variables_without_rows_of_their_own_stay_free():
     J = sp.csc_array(np.array([[1.0, 1, 0], [0, 0, 1]]))
     equal = np.array([True, False])
-    wanted = [Determined(0, np.array([0, 1])), Determined(0, np.array([2])), Determined(1, np.array([1]))]
+    wanted = [
+        Determined((0,), np.array([0, 1])),
+        Determined((0,), np.array([2])),
+        Determined((1,), np.array([1])),
+    ]
     (found,) = find_eliminations(J, equal, wanted)
     assert (found.rows.tolist(), found.variables.tolist()) == ([[0]], [[1]])
 

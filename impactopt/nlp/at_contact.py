@@ -15,7 +15,7 @@ from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group
 from impactopt.nlp.mesh import contact_mesh
 from impactopt.nlp.objective import Prices, assemble, quantities
-from impactopt.nlp.rows import Index, Measure, Place, millimetres, percent
+from impactopt.nlp.rows import Index, Measure, Place, Rank, millimetres, percent
 from impactopt.nlp.structured import StructuredProgram
 from impactopt.objectives import AngularMomentum, Objective
 from impactopt.plan import PlannedScenario
@@ -237,23 +237,24 @@ class ContactProgram(Builder):
         )
 
     # ------------------------------------------------------------------ structure
-    def _determined(self) -> list[tuple[int, Index]]:
+    def _determined(self) -> list[tuple[Rank, Index]]:
         """What rows determine by themselves, with its rank in the elimination.
 
         Where there are rows to choose from, what stands first here takes the rows that stand first.
         """
-        out = [(0, node) for node in self._nodes()]
-        out += [(1, group.index(0)) for group, _ in self._lifted]
+        out = [((0, k), part) for parts in self._nodes() for k, part in enumerate(parts, -len(parts))]
+        out += [((1, 0), group.index(0)) for group, _ in self._lifted]
         found = [c.determined() for c in self.collisions]
-        out += [(4, legs) for stages, _ in found for legs in stages]
-        out += [(5 + k, part) for _, steps in found for k, parts in enumerate(steps) for part in parts]
-        out.append((3, self.feedforward.index(0)))
-        last = 5 + max(len(steps) for _, steps in found)
-        out += [(last, c.after.index(0)) for c in self.scenarios]
-        return out + [(last, start) for start in self._starts()]
+        out += [((4, k), legs) for stages, _ in found for parts in stages for k, legs in enumerate(parts)]
+        out += [((5, k), part) for _, steps in found for k, parts in enumerate(steps) for part in parts]
+        out.append(((3, 0), self.feedforward.index(0)))
+        out += [((6, 0), c.after.index(0)) for c in self.scenarios]
+        return out + [((6, 0), start) for start in self._starts()]
 
-    def _nodes(self) -> list[Index]:
-        """Variables that the rows of each node determine: its legs, and the first sole's wrench."""
+    def _nodes(self) -> list[list[Index]]:
+        """Variables that the rows of each node determine, one after the other: of each leg, and the first
+        sole's wrench.
+        """
         raise NotImplementedError
 
     def _starts(self) -> list[Index]:

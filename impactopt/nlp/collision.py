@@ -17,7 +17,7 @@ from impactopt.nlp.blocks import FORCE_SCALE, typical_state
 from impactopt.nlp.guess import blow, effective_mass
 from impactopt.nlp.layout import Affine, Array, Group
 from impactopt.nlp.mesh import Stage, contact_phases
-from impactopt.nlp.rows import Index, Measure, Place, along, percent, rates
+from impactopt.nlp.rows import Index, Measure, Place, along, by_leg, percent, rates
 from impactopt.plan import PlannedCollision, total_ground_wrench
 from impactopt.scenario import Scenario
 
@@ -154,14 +154,15 @@ class Collision:
         before = start if begins else group[s.previous]
         return group[i], slope + before * s.start
 
-    def determined(self) -> tuple[list[Index], list[list[Index]]]:
-        """Variables that the rows of each stage determine; and step by step those that rows of elements do.
+    def determined(self) -> tuple[list[list[Index]], list[list[Index]]]:
+        """Variables that the rows of each stage determine, leg by leg; and step by step those that rows of
+        elements do.
 
         An element's travel comes first, by linear rows; last come the ways as one, if a target breaks.
         """
         stages, last = range(len(self.stages)), self.end[-1]
         legs = [
-            np.concatenate([g.index(i) for g in (self.coast_legs, self.coast_rates, self.legs)])
+            [leg for g in (self.coast_legs, self.coast_rates, self.legs) for leg in by_leg(g.index(i))]
             for i in stages
         ]
         groups = (self.u, self.w, self.f, self.state, self.helpers, self.xt, self.p)

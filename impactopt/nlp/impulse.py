@@ -53,7 +53,7 @@ class InstantImpact:
         numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
         return {"impact": ([slots], [np.concatenate([numbers, t.robot.torque_limit, t.units])])}
 
-    def determined(self) -> tuple[list[Index], list[list[Index]]]:
+    def determined(self) -> tuple[list[list[Index]], list[list[Index]]]:
         """As of :meth:`impactopt.nlp.collision.Collision.determined`."""
         return [], [[np.concatenate([g.index(0) for g in (self.du, self.w, self.blow)])]]
 

@@ -15,6 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.nlp.layout import Affine, Array
 
 Index = NDArray[np.intp]
+Rank = tuple[int, int]  # of variables that rows determine: those of lower rank are eliminated first
+
+
+def by_leg(joints: Index) -> list[Index]:
+    """Numbers of leg joints (6 a leg), leg by leg."""
+    return list(joints.reshape(-1, 6))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.layout import Affine, Array
 from impactopt.nlp.objective import Prices, wrench_prices
-from impactopt.nlp.rows import Index, Measure, Place, along
+from impactopt.nlp.rows import Index, Measure, Place, along, by_leg
 from impactopt.objectives import Effort
 from impactopt.plan import total_ground_wrench
 from impactopt.planned_strike import PlannedStrike
@@ -57,8 +57,8 @@ class StrikeTranscription(ContactProgram):
             tuple(o for o in problem.objectives if not isinstance(o, OF_MOTIONS)),
         )
 
-    def _nodes(self) -> list[Index]:
-        return [np.concatenate([self.legs.index(0), self.w.index(0)[:6]])]
+    def _nodes(self) -> list[list[Index]]:
+        return [[*by_leg(self.legs.index(0)), self.w.index(0)[:6]]]
 
     def _after(self, fastest: Array) -> None:
         """The state that each target leaves behind is one to go on from."""

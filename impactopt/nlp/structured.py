@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from impactopt.nlp.batched import BatchedFunction
 from impactopt.nlp.layout import Affine, Array, Layout, stack
-from impactopt.nlp.rows import Index, Rows
+from impactopt.nlp.rows import Index, Rank, Rows
 
 
 @dataclass
@@ -84,7 +84,7 @@ class StructuredProgram:
         objective: Affine,
         quadratic: sp.spmatrix | sp.sparray,
         linear: Array,
-        determined: Sequence[tuple[int, Index]] = (),
+        determined: Sequence[tuple[Rank, Index]] = (),
         sequence: Array | None = None,
     ) -> None:
         """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds.

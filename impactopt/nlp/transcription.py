@@ -27,7 +27,18 @@ from impactopt.nlp.lanes import in_lanes
 from impactopt.nlp.layout import Affine, Array, Group, add, stack
 from impactopt.nlp.mesh import with_middles
 from impactopt.nlp.objective import Prices, motion_prices
-from impactopt.nlp.rows import Index, Measure, Place, along, degrees, millimetres, percent, rates
+from impactopt.nlp.rows import (
+    Index,
+    Measure,
+    Place,
+    Rank,
+    along,
+    by_leg,
+    degrees,
+    millimetres,
+    percent,
+    rates,
+)
 from impactopt.nlp.structured import derivative_functions
 from impactopt.objectives import Effort
 from impactopt.plan import Plan
@@ -314,13 +325,13 @@ class Transcription(ContactProgram):
         return motion_prices(self)
 
     # ------------------------------------------------------------------ structure
-    def _determined(self) -> list[tuple[int, Index]]:
-        return [*super()._determined(), (2, self.u0.index(0))]
+    def _determined(self) -> list[tuple[Rank, Index]]:
+        return [*super()._determined(), ((2, 0), self.u0.index(0))]
 
-    def _nodes(self) -> list[Index]:
+    def _nodes(self) -> list[list[Index]]:
         nodes = [(self.swing_legs, self.swing_w), *[(f.legs, f.w) for f in self.follows]]
-        out = [np.concatenate([legs.index(k), w.index(k)[:6]]) for legs, w in nodes for k in range(w.count)]
-        return out + [self.coast_w.index(k)[:6] for k in range(self.coast_w.count)]
+        out = [[*by_leg(legs.index(k)), w.index(k)[:6]] for legs, w in nodes for k in range(w.count)]
+        return out + [[self.coast_w.index(k)[:6]] for k in range(self.coast_w.count)]
 
     def _starts(self) -> list[Index]:
         return [follow.determined() for follow in self.follows]

@@ -55,8 +55,8 @@ def _pointer(module: Any, name: str) -> int:
 
 
 _OF_STAGES = (
-    *("q", "e", "t", "u", "qe", "qc", "te", "tc", "hee", "heu", "hcu"),
-    *("lu", "pivots", "X", "T", "H", "G", "x0"),
+    *("q", "e", "t", "u", "qe", "qc", "te", "tc", "hee", "heu", "hcc", "hcv"),
+    *("lu", "pivots", "X", "T", "H", "G", "x0", "own"),
 )
 _OF_PANELS = ("size", "height", "first", "below", "row_at", "start", "at")
 
@@ -88,13 +88,16 @@ class CompiledKernels(Kernels):
         return found[1]
 
     @staticmethod
-    def _stage(a: Stage) -> tuple[Any, ...]:
-        k, nt, nc = a.tc.shape
-        r, nu = a.q.shape[1], a.u.shape[1]
-        work = np.zeros(max(nt * nc, r * nu + nc * nu, r + max(nt, nc, nu)) + 1)
-        arrays = [getattr(a, name) for name in _OF_STAGES]
-        made = _Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)])
-        return ctypes.byref(made), work
+    def _all(stages: Sequence[Stage]) -> tuple[Any, ...]:
+        made, keep = [], []
+        for a in stages:
+            k, nt, nc = a.tc.shape
+            r, nu = a.q.shape[1], a.u.shape[1]
+            work = np.zeros(max(nt * nc, r * nu + nc * nu, r + max(nt, nc, nu)) + 1)
+            arrays = [getattr(a, name) for name in _OF_STAGES]
+            made.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)]))
+            keep.append(work)
+        return (_Stage * len(made))(*made), ctypes.c_int64(len(made)), keep
 
     @staticmethod
     def _panels(p: Panels) -> tuple[Any, ...]:
@@ -127,26 +130,21 @@ class CompiledKernels(Kernels):
         groups = ctypes.c_int64(len(products))
         self._c.newton_products(groups, *map(_at, parts), _at(values), _at(weights), _at(W), _at(work))
 
-    def eliminate(self, a: Stage, J: Vector) -> None:
-        if self._c.newton_eliminate(self._of(a, self._stage)[0], _at(J), _last(J)):
+    def eliminate(self, stages: Sequence[Stage], J: Vector) -> None:
+        if self._c.newton_eliminate(*self._of(stages, self._all)[:2], _at(J), _last(J)):
             raise np.linalg.LinAlgError("rows do not determine their variables")
 
-    def reduce(self, a: Stage, W: Vector) -> None:
-        self._c.newton_reduce(self._of(a, self._stage)[0], _at(W), _last(W))
+    def reduce(self, stages: Sequence[Stage], W: Vector) -> None:
+        self._c.newton_reduce(*self._of(stages, self._all)[:2], _at(W), _last(W))
 
-    def forward(self, a: Stage, g: Vector, off: Vector) -> None:
-        self._c.newton_forward(self._of(a, self._stage)[0], _at(g), _last(g), _at(off), _last(off))
+    def forward(self, stages: Sequence[Stage], g: Vector, off: Vector) -> None:
+        self._c.newton_forward(*self._of(stages, self._all)[:2], _at(g), _last(g), _at(off), _last(off))
 
-    def expand(self, a: Stage, d: Vector) -> None:
-        self._c.newton_expand(self._of(a, self._stage)[0], _at(d))
+    def expand(self, stages: Sequence[Stage], d: Vector) -> None:
+        self._c.newton_expand(*self._of(stages, self._all)[:2], _at(d))
 
-    def pull(self, a: Stage, v: Vector) -> Stack:
-        own = np.empty(a.e.shape)
-        self._c.newton_pull(self._of(a, self._stage)[0], _at(v), _last(v), _at(own))
-        return own
-
-    def duals(self, a: Stage, own: Stack, y: Vector) -> None:
-        self._c.newton_duals(self._of(a, self._stage)[0], _at(own), _at(y))
+    def multipliers(self, stages: Sequence[Stage], v: Vector, y: Vector) -> None:
+        self._c.newton_multipliers(*self._of(stages, self._all)[:2], _at(v), _last(v), _at(y))
 
     def factor(self, p: Panels, values: Vector) -> bool:
         return not self._c.newton_cholesky(self._of(p, self._panels)[0], _at(values))

@@ -9,6 +9,7 @@ treated together. What is left is a Newton system in the free variables (Nocedal
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -36,7 +37,7 @@ class Elimination(NamedTuple):
 class Determined(NamedTuple):
     """Variables that equality rows of their own determine; those of lower rank are eliminated first."""
 
-    rank: int
+    rank: tuple[int, ...]
     variables: Index
 
 
@@ -48,7 +49,7 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     """
     touches = jacobian.tocsc()
     taken = ~equal
-    found: dict[tuple[int, int], list[tuple[Index, Index]]] = {}
+    found: dict[tuple[tuple[int, ...], int], list[tuple[Index, Index]]] = {}
     for rank, variables in determined:
         part = touches[:, variables]
         rows = np.unique(part.indices)
@@ -180,8 +181,7 @@ class Condenser:
         self.J[:] = 0.0
         where, to = self._own_jacobian
         self._kernels.copy(self._jacobian, where, self.J, to)
-        for stage in self._stages:
-            self._kernels.eliminate(stage, self.J)
+        self._kernels.eliminate(self._stages, self.J)
 
     @property
     def A(self) -> Vector:
@@ -211,8 +211,7 @@ class Condenser:
         bounds = self._diagonal[self.bounded]
         self.W[bounds] += weights[self.m - self.bounded.size :]
         self._kernels.add_products(self._products, self._jacobian, weights, self.W)
-        for stage in self._stages:
-            self._kernels.reduce(stage, self.W)
+        self._kernels.reduce(self._stages, self.W)
         return self.W
 
     def forward(self, gradient: Vector, residual: Vector) -> tuple[Vector, Vector]:
@@ -222,16 +221,14 @@ class Condenser:
         gradient : (n,) of what belongs to W; residual (m,).
         """
         g, off = np.append(gradient, 0.0), np.append(residual[self._equations], 0.0)
-        for stage in self._stages:
-            self._kernels.forward(stage, g, off)
+        self._kernels.forward(self._stages, g, off)
         return g[self.free], off[self._left]
 
     def expand(self, step: Vector) -> Vector:
         """The step of all variables (n,) for one of the free ones (f,), after `forward`."""
         d = np.zeros(self.n + 1)
         d[self.free] = step
-        for stage in reversed(self._stages):
-            self._kernels.expand(stage, d)
+        self._kernels.expand(self._stages, d)
         return d[:-1]
 
     def multipliers(self, dual: Vector, y: Vector) -> Vector:
@@ -241,9 +238,7 @@ class Condenser:
         """
         v, out = np.append(dual, 0.0), np.zeros(self._equations.size + 1)
         out[self._left] = y
-        own = [self._kernels.pull(stage, v) for stage in self._stages]
-        for stage, values in zip(reversed(self._stages), reversed(own), strict=True):
-            self._kernels.duals(stage, values, out)
+        self._kernels.multipliers(self._stages, v, out)
         everything = np.zeros(self.m)
         everything[self._equations] = out[:-1]
         return everything[self.eliminated]
@@ -300,8 +295,11 @@ def _numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
     return out, i.size
 
 
+_lower = functools.cache(np.tril_indices)
+
+
 def _products(pairs: Places, columns: Index, rows: Index, values: Places) -> Products:
-    i, j = np.tril_indices(columns.size)
+    i, j = _lower(columns.size)
     return Products(rows=rows.astype(np.int32), values=values, to=pairs[columns[i], columns[j]])
 
 
@@ -316,7 +314,9 @@ def _stage(systems: list[_Touched], rows: Places, none: int, pairs: Places, noth
 
     q, e, t, u = places(r, fill=m), places(r, fill=n), places(nt, fill=m), places(nu, fill=n)
     qe, qc, te, tc = (places(*s, fill=none) for s in ((r, r), (nc, r), (nt, r), (nt, nc)))
-    hee, heu, hcu = (places(*s, fill=nothing) for s in ((r, r), (nu, r), (nc, nu)))
+    hee, heu, hcc, hcv = (
+        places(*s, fill=nothing) for s in ((r, r), (nu, r), (nc * (nc + 1) // 2,), (nc, nu - nc))
+    )
     for i, s in enumerate(systems):
         c, own_t = slice(s.c.size), slice(s.t.size)
         at = np.concatenate([np.arange(s.c.size), nc + np.arange(s.u.size - s.c.size)])
@@ -324,5 +324,7 @@ def _stage(systems: list[_Touched], rows: Places, none: int, pairs: Places, noth
         qe[i], qc[i, c] = rows[np.ix_(s.q, s.e)].T, rows[np.ix_(s.q, s.c)].T
         te[i, own_t], tc[i, own_t, c] = rows[np.ix_(s.t, s.e)], rows[np.ix_(s.t, s.c)]
         hee[i], heu[i, at] = pairs[np.ix_(s.e, s.e)], pairs[np.ix_(s.u, s.e)]
-        hcu[i][np.ix_(np.arange(s.c.size), at)] = pairs[np.ix_(s.c, s.u)]
-    return Stage(q=q, e=e, t=t, u=u, qe=qe, qc=qc, te=te, tc=tc, hee=hee, heu=heu, hcu=hcu)
+        lower = _lower(s.c.size)
+        hcc[i, : lower[0].size] = pairs[np.ix_(s.c, s.c)][lower]
+        hcv[i, c, : s.u.size - s.c.size] = pairs[np.ix_(s.c, s.u[s.c.size :])]
+    return Stage(q=q, e=e, t=t, u=u, qe=qe, qc=qc, te=te, tc=tc, hee=hee, heu=heu, hcc=hcc, hcv=hcv)

@@ -31,9 +31,10 @@ class Stage:
         that these touch; u (k, nu) : of the variables that rows or Hessian couple to e, first those, nc, that
         the rows touch.
     qe (k, column, row), qc (k, nc, r), te (k, nt, r), tc (k, nt, nc) : places in the equalities' values.
-    hee (k, r, r), heu (k, nu, r), hcu (k, nc, nu) : places in the values of W's lower triangle.
+    hee (k, r, r), heu (k, nu, r), hcv (k, nc, nu - nc) : places in the values of W's lower triangle; hcc (k,
+        nc (nc + 1) / 2) : of the lower triangle of the variables that the rows touch.
     lu, pivots : factors of B = the part qe. X (k, nc, r) : of B^-1 N, transposed. T (k, nt, r) : part te.
-    H (k, r, r), G (k, nu, r) : parts hee and heu. x0 (k, r) : B^-1 residual.
+    H (k, r, r), G (k, nu, r) : parts hee and heu. x0 (k, r) : B^-1 residual. own (k, r) : a gradient's part.
     """
 
     q: Places
@@ -46,7 +47,8 @@ class Stage:
     tc: Places
     hee: Places
     heu: Places
-    hcu: Places
+    hcc: Places
+    hcv: Places
     lu: Stack = field(init=False)
     pivots: Places = field(init=False)
     X: Stack = field(init=False)
@@ -54,13 +56,15 @@ class Stage:
     H: Stack = field(init=False)
     G: Stack = field(init=False)
     x0: Stack = field(init=False)
+    own: Stack = field(init=False)
 
     def __post_init__(self) -> None:
         k, nt, nc = self.tc.shape
         r, nu = self.q.shape[1], self.u.shape[1]
         self.lu, self.pivots = np.zeros((k, r, r)), np.zeros((k, r), dtype=np.int32)
         self.X, self.T = np.zeros((k, nc, r)), np.zeros((k, nt, r))
-        self.H, self.G, self.x0 = np.zeros((k, r, r)), np.zeros((k, nu, r)), np.zeros((k, r))
+        self.H, self.G = np.zeros((k, r, r)), np.zeros((k, nu, r))
+        self.x0, self.own = np.zeros((k, r)), np.zeros((k, r))
 
     @property
     def c(self) -> Places:
@@ -116,53 +120,55 @@ class Kernels:
             i, j = np.tril_indices(part.shape[1])
             W[p.to] += ((part.T * weights[p.rows]) @ part)[i, j]
 
-    def eliminate(self, a: Stage, J: Vector) -> None:
+    def eliminate(self, stages: Sequence[Stage], J: Vector) -> None:
         """X = B^-1 N, and the other equalities' values with the step -X d_c in place of d_e.
 
         Raises
         ------
         LinAlgError : B is singular.
         """
-        a.T[:] = J[a.te]
-        for i, (B, N) in enumerate(zip(J[a.qe], J[a.qc], strict=True)):
-            lu, pivots, info = la.lapack.dgetrf(B.T)
-            if info:
-                raise np.linalg.LinAlgError("rows do not determine their variables")
-            a.lu[i], a.pivots[i] = lu.T, pivots
-            a.X[i] = la.lapack.dgetrs(lu, pivots, N.T)[0].T
-        _add(J, a.tc, -(a.T @ a.X.swapaxes(1, 2)))
+        for a in stages:
+            a.T[:] = J[a.te]
+            for i, (B, N) in enumerate(zip(J[a.qe], J[a.qc], strict=True)):
+                lu, pivots, info = la.lapack.dgetrf(B.T)
+                if info:
+                    raise np.linalg.LinAlgError("rows do not determine their variables")
+                a.lu[i], a.pivots[i] = lu.T, pivots
+                a.X[i] = la.lapack.dgetrs(lu, pivots, N.T)[0].T
+            _add(J, a.tc, -(a.T @ a.X.swapaxes(1, 2)))
 
-    def reduce(self, a: Stage, W: Vector) -> None:
+    def reduce(self, stages: Sequence[Stage], W: Vector) -> None:
         """W with -X d_c in place of d_e."""
-        a.H[:], a.G[:] = W[a.hee], W[a.heu]
-        G, nc = -a.G, a.X.shape[1]
-        G[:, :nc] += 0.5 * a.X @ a.H
-        C = a.X @ G.swapaxes(1, 2)
-        both = np.arange(nc)
-        C[:, both, both] *= 2.0
-        _add(W, a.hcu, C)
+        for a in stages:
+            a.H[:], a.G[:] = W[a.hee], W[a.heu]
+            G, nc = -a.G, a.X.shape[1]
+            G[:, :nc] += 0.5 * a.X @ a.H
+            C = a.X @ G.swapaxes(1, 2)
+            i, j = np.tril_indices(nc)
+            _add(W, a.hcc, C[:, i, j] + C[:, j, i])
+            _add(W, a.hcv, C[:, :, nc:])
 
-    def forward(self, a: Stage, g: Vector, off: Vector) -> None:
+    def forward(self, stages: Sequence[Stage], g: Vector, off: Vector) -> None:
         """Gradient and residual with d_e = -(x0 + X d_c)."""
-        a.x0[:] = self._solve(a, off[a.q], 0)
-        _add(off, a.t, -(a.T @ a.x0[..., None])[..., 0])
-        own = g[a.e] - (a.H @ a.x0[..., None])[..., 0]
-        _add(g, a.c, -(a.X @ own[..., None])[..., 0])
-        _add(g, a.u, -(a.G @ a.x0[..., None])[..., 0])
+        for a in stages:
+            a.x0[:] = self._solve(a, off[a.q], 0)
+            _add(off, a.t, -(a.T @ a.x0[..., None])[..., 0])
+            own = g[a.e] - (a.H @ a.x0[..., None])[..., 0]
+            _add(g, a.c, -(a.X @ own[..., None])[..., 0])
+            _add(g, a.u, -(a.G @ a.x0[..., None])[..., 0])
 
-    def expand(self, a: Stage, d: Vector) -> None:
-        """d_e."""
-        d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
+    def expand(self, stages: Sequence[Stage], d: Vector) -> None:
+        """d_e of all stages, the last one first."""
+        for a in reversed(stages):
+            d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
 
-    def pull(self, a: Stage, v: Vector) -> Stack:
-        """A gradient's part v_e, and what it adds to that by c."""
-        own: Stack = v[a.e]
-        _add(v, a.c, -(a.X @ own[..., None])[..., 0])
-        return own
-
-    def duals(self, a: Stage, own: Stack, y: Vector) -> None:
-        """Multipliers of the stage's rows, from those of the other rows and what `pull` gave."""
-        y[a.q] = -self._solve(a, own + (y[a.t][:, None] @ a.T)[:, 0], 1)
+    def multipliers(self, stages: Sequence[Stage], v: Vector, y: Vector) -> None:
+        """Those of the stages' rows, from a gradient, which is spent, and from those of the other rows."""
+        for a in stages:
+            a.own[:] = v[a.e]
+            _add(v, a.c, -(a.X @ a.own[..., None])[..., 0])
+        for a in reversed(stages):
+            y[a.q] = -self._solve(a, a.own + (y[a.t][:, None] @ a.T)[:, 0], 1)
 
     def factor(self, p: Panels, values: Vector) -> bool:
         """The panels of L in place of those of L L'; False: the matrix is not positive definite."""

@@ -215,9 +215,8 @@ def borrow(
     """
     arrays = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
     arrays += [variables for _, variables in determined]
-    ranks = np.array([rank for rank, _ in determined])
-    arrays += [ranks, equal, bounded, moves, np.zeros(0) if sequence is None else sequence]
-    digest = hashlib.sha256()
+    arrays += [equal, bounded, moves, np.zeros(0) if sequence is None else sequence]
+    digest = hashlib.sha256(repr([rank for rank, _ in determined]).encode())
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -35,10 +35,10 @@ EXPORT void newton_setup(void **f) {
 /* One stage: k systems of r rows, nt other rows, nc and nu variables touched. */
 typedef struct {
     int64_t k, r, nt, nc, nu;
-    int32_t *q, *e, *t, *u, *qe, *qc, *te, *tc, *hee, *heu, *hcu;
+    int32_t *q, *e, *t, *u, *qe, *qc, *te, *tc, *hee, *heu, *hcc, *hcv;
     double *lu;
     int32_t *pivots;
-    double *X, *T, *H, *G, *x0, *work;
+    double *X, *T, *H, *G, *x0, *own, *work;
 } stage;
 
 static void take(const double *from, const int32_t *at, int64_t count, double *to) {
@@ -72,7 +72,7 @@ EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, 
     }
 }
 
-EXPORT int newton_eliminate(stage *a, double *J, int64_t none) {
+static int eliminate(stage *a, double *J, int64_t none) {
     int r = a->r, nc = a->nc, nt = a->nt, info;
     for (int64_t k = 0; k < a->k; ++k) {
         double *lu = a->lu + k * r * r, *X = a->X + k * nc * r, *T = a->T + k * nt * r;
@@ -92,7 +92,7 @@ EXPORT int newton_eliminate(stage *a, double *J, int64_t none) {
     return 0;
 }
 
-EXPORT void newton_reduce(stage *a, double *W, int64_t none) {
+static void reduce(stage *a, double *W, int64_t none) {
     int r = a->r, nc = a->nc, nu = a->nu;
     double *G = a->work, *C = G + r * nu;
     for (int64_t k = 0; k < a->k; ++k) {
@@ -103,9 +103,12 @@ EXPORT void newton_reduce(stage *a, double *W, int64_t none) {
         if (!nc) continue;
         gemm("N", "N", &r, &nc, &r, &half, H, &r, X, &r, &one, G, &r);
         gemm("T", "N", &nu, &nc, &r, &one, G, &r, X, &r, &zero, C, &nu);
-        for (int i = 0; i < nc; ++i) C[i * nu + i] *= 2.0;
-        const int32_t *to = a->hcu + k * nc * nu;
-        for (int64_t i = 0; i < nc * nu; ++i) W[to[i]] += C[i];
+        const int32_t *to = a->hcc + k * nc * (nc + 1) / 2;
+        for (int i = 0; i < nc; ++i)
+            for (int j = 0; j <= i; ++j) W[*to++] += C[i * nu + j] + C[j * nu + i];
+        to = a->hcv + k * nc * (nu - nc);
+        for (int i = 0; i < nc; ++i)
+            for (int j = nc; j < nu; ++j) W[*to++] += C[i * nu + j];
         W[none] = 0.0;
     }
 }
@@ -118,7 +121,7 @@ static void pull(int r, int n, double *M, double *v, double *to, const int32_t *
     for (int i = 0; i < n; ++i) to[at[i]] -= work[i];
 }
 
-EXPORT void newton_forward(stage *a, double *g, int64_t n, double *off, int64_t m) {
+static void forward(stage *a, double *g, int64_t n, double *off, int64_t m) {
     int r = a->r, nc = a->nc, nt = a->nt, nu = a->nu, info;
     double *own = a->work, *work = own + r;
     for (int64_t k = 0; k < a->k; ++k) {
@@ -135,7 +138,7 @@ EXPORT void newton_forward(stage *a, double *g, int64_t n, double *off, int64_t 
     }
 }
 
-EXPORT void newton_expand(stage *a, double *d) {
+static void expand(stage *a, double *d) {
     int r = a->r, nc = a->nc;
     double *own = a->work, *others = own + r;
     for (int64_t k = 0; k < a->k; ++k) {
@@ -146,8 +149,9 @@ EXPORT void newton_expand(stage *a, double *d) {
     }
 }
 
-EXPORT void newton_pull(stage *a, double *v, int64_t n, double *own) {
+static void own_duals(stage *a, double *v, int64_t n) {
     int r = a->r, nc = a->nc;
+    double *own = a->own;
     for (int64_t k = 0; k < a->k; ++k, own += r) {
         take(v, a->e + k * r, r, own);
         pull(r, nc, a->X + k * nc * r, own, v, a->u + k * a->nu, a->work);
@@ -155,16 +159,40 @@ EXPORT void newton_pull(stage *a, double *v, int64_t n, double *own) {
     }
 }
 
-EXPORT void newton_duals(stage *a, const double *own, double *y) {
+static void duals(stage *a, double *y) {
     int r = a->r, nt = a->nt, info;
     double *sum = a->work, *others = sum + r;
     for (int64_t k = 0; k < a->k; ++k) {
-        memcpy(sum, own + k * r, sizeof(double) * r);
+        memcpy(sum, a->own + k * r, sizeof(double) * r);
         take(y, a->t + k * nt, nt, others);
         if (nt) gemv("N", &r, &nt, &one, a->T + k * nt * r, &r, others, &unit, &one, sum, &unit);
         getrs("T", &r, &unit, a->lu + k * r * r, &r, a->pivots + k * r, sum, &r, &info);
         for (int i = 0; i < r; ++i) y[a->q[k * r + i]] = -sum[i];
     }
+}
+
+/* ---------------------------------------------------------------- all stages, one after the other */
+EXPORT int newton_eliminate(stage *a, int64_t stages, double *J, int64_t none) {
+    int info = 0;
+    for (int64_t i = 0; i < stages && !info; ++i) info = eliminate(a + i, J, none);
+    return info;
+}
+
+EXPORT void newton_reduce(stage *a, int64_t stages, double *W, int64_t none) {
+    for (int64_t i = 0; i < stages; ++i) reduce(a + i, W, none);
+}
+
+EXPORT void newton_forward(stage *a, int64_t stages, double *g, int64_t n, double *off, int64_t m) {
+    for (int64_t i = 0; i < stages; ++i) forward(a + i, g, n, off, m);
+}
+
+EXPORT void newton_expand(stage *a, int64_t stages, double *d) {
+    for (int64_t i = stages - 1; i >= 0; --i) expand(a + i, d);
+}
+
+EXPORT void newton_multipliers(stage *a, int64_t stages, double *v, int64_t n, double *y) {
+    for (int64_t i = 0; i < stages; ++i) own_duals(a + i, v, n);
+    for (int64_t i = stages - 1; i >= 0; --i) duals(a + i, y);
 }
 
 /* ---------------------------------------------------------------- the factor of what is left */

@@ -78,10 +78,12 @@ docs: $(STAMP) ## build the documentation, needs no internet: build/docs/index.h
 
 notebooks: $(STAMP) ## execute the notebooks, some minutes; with their outputs in results/notebooks (ARGS=notebooks/3_*.ipynb for one)
 	@mkdir -p results/notebooks
-	@for file in $(or $(ARGS),notebooks/*.ipynb); do \
-		echo "== $$file"; \
-		$(BIN)/jupyter execute --timeout=600 --output=../results/notebooks/{notebook_name} $$file || exit 1; \
-	done
+	@echo "== executing notebooks, two at a time"
+	@printf '%s\n' $(or $(ARGS),notebooks/*.ipynb) | xargs -P 2 -I FILE sh -c ' \
+		log=results/notebooks/$$(basename FILE .ipynb).log; \
+		if $(BIN)/jupyter execute --timeout=600 --output=../results/notebooks/{notebook_name} FILE >$$log 2>&1; \
+		then echo "== FILE"; \
+		else cat $$log; echo "== FILE failed"; exit 1; fi'
 
 clean: ## remove results and caches of the tools; .venv and compiled functions stay
 	rm -rf results build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -90,3 +92,26 @@ def test_the_search_works_from_disk_and_asks_nobody(site: Path) -> None:
     assert any("api/contact.html" in link for link in visited.values[0])
     assert [url for url in visited.requests if not url.startswith("file:")] == []
     assert visited.console == []
+
+
+def test_a_notebook_is_shown_as_executed_until_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = importlib.util.spec_from_file_location("gathering", DOCS / "_ext" / "notebooks.py")
+    assert spec is not None and spec.loader is not None
+    gathering = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gathering)
+    source, executed = tmp_path / "notebooks" / "1_one.ipynb", tmp_path / "results" / "1_one.ipynb"
+    pages = tmp_path / "pages"
+    for name, value in (("ROOT", tmp_path), ("EXECUTED", executed.parent), ("PAGES", pages)):
+        monkeypatch.setattr(gathering, name, value)
+    for file, text in ((source, "stripped"), (executed, "executed [see](../docs/limits.md)")):
+        file.parent.mkdir()
+        file.write_text(text, encoding="utf-8")
+    os.utime(source, (0, 0))
+    gathering.gather(None, None)
+    assert (pages / "1_one.ipynb").read_text(encoding="utf-8") == "executed [see](../limits.md)"
+    os.utime(source)
+    os.utime(executed, (0, 0))
+    gathering.gather(None, None)
+    assert (pages / "1_one.ipynb").read_text(encoding="utf-8") == "stripped"

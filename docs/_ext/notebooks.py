@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from sphinx.application import Sphinx
@@ -11,7 +10,8 @@ from sphinx.config import Config
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTED = ROOT / "results" / "notebooks"
 PAGES = ROOT / "docs" / "_notebooks"  # made here, not kept in git
-
+# how a notebook in notebooks/ links to a page of docs/, and how a page in docs/_notebooks does
+LINK, HERE = "](../docs/", "](../"
 
 HEAD = """# Notebooks
 
@@ -30,9 +30,10 @@ def gather(app: Sphinx, config: Config) -> None:
     for name, source in sources.items():
         done = EXECUTED / name
         chosen = done if done.is_file() and done.stat().st_mtime >= source.stat().st_mtime else source
+        text = chosen.read_text(encoding="utf-8").replace(LINK, HERE)
         page = PAGES / name
-        if not page.is_file() or page.read_bytes() != chosen.read_bytes():
-            shutil.copyfile(chosen, page)
+        if not page.is_file() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
     listed = "\n".join(["```{toctree}", "", *(name.removesuffix(".ipynb") for name in sources), "```"])
     (PAGES / "index.md").write_text(HEAD + (listed if sources else "None yet.") + "\n", encoding="utf-8")
 

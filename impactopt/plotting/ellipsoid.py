@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from impactopt.output import Record
 from impactopt.plotting.style import BLACK, BLUE, GREEN, PAGE, VERMILION, Array, Picture, styled, title
@@ -102,3 +103,8 @@ def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
         axes.annotate("", tip, fist, arrowprops=arrow, zorder=4)
     axes.margins(0.08)
     axes.set_aspect("equal")
+    # one length between ticks on both axes: those of a narrow view alone would run into each other
+    largest_span = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+    spacing = np.diff(MaxNLocator(4).tick_values(0.0, largest_span))[0]
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(spacing))

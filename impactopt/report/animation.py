@@ -16,7 +16,7 @@ from impactopt.report.stage import stage_of
 __all__ = ["Animation", "animation_of"]
 
 BODY = '<main><div id="trouble"></div><div id="animation"></div></main>'
-HEIGHT = 620  # pixels, in a notebook
+HEIGHT = 660  # pixels, in a notebook
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Animation(Page):
         """A frame of its own, so that the notebook's styles and scripts stay apart from its."""
         return (
             f'<iframe srcdoc="{escape(self.html)}" title="animation" width="100%" height="{HEIGHT}" '
-            'style="border: 0" allow="fullscreen"></iframe>'
+            'style="border: 0"></iframe>'
         )
 
 

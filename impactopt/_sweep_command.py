@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt._command_options import NOT_SOLVED, AsJson, Quiet, complete_sweep
+from impactopt._command_options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep
 from impactopt.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -42,8 +42,20 @@ def sweep(
     again: Annotated[
         bool, typer.Option("--again", help="Do cases once more that crashed or ran out of time before.")
     ] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Another value for a key of the sweep file, as draw.count=100; of the problem's, as "
+            "set.target.mass=8; may be repeated.",
+        ),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="A line after every case, and the traceback of an error.")
+    ] = False,
 ) -> None:
     """Do every case of a sweep file, and write one table of them: DIR/table.parquet, and DIR/figure.png.
 
@@ -51,12 +63,14 @@ def sweep(
     case that fails is a row with its reason. Exit code: 0 done, 1 no case has a usable result, 2 bad input.
     """
     interrupted = f"interrupted; what is finished is in {out}, and the same command goes on from there"
-    with plain_errors(interrupted) as console:
+    with plain_errors(interrupted, verbose=verbose) as console:
+        from impactopt.problem_file import parse_settings
         from impactopt.sweeps import read_sweep_file
         from impactopt.sweeps import sweep as run
 
-        chosen = read_sweep_file(file)
-        with _Screen(console, quiet=quiet) as screen:
+        check_loudness(quiet, verbose)
+        chosen = read_sweep_file(file, parse_settings(settings or ()))
+        with _Screen(console, quiet=quiet, verbose=verbose) as screen:
             told: dict[str, Any] = {"report": screen.say, "progress": screen.progress}
             result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
         if as_json:
@@ -76,10 +90,11 @@ def sweep(
 class _Screen:
     """Lines about what is going on, and a live bar; where there is no terminal, a line now and then."""
 
-    def __init__(self, console: Console, *, quiet: bool) -> None:
+    def __init__(self, console: Console, *, quiet: bool, verbose: bool) -> None:
         self._console, self._quiet, self._last = console, quiet, -BETWEEN
+        self._between = 0.0 if verbose else BETWEEN
         self._live = None
-        if console.is_terminal and not quiet:
+        if console.is_terminal and not (quiet or verbose):
             from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
             from rich.progress import Progress as Bar
 
@@ -108,7 +123,7 @@ class _Screen:
             text += f", best {now.best:.2f} N s (case {now.best_case})"
         if self._live is not None:
             self._live.update(self._task, completed=now.done, total=now.cases, description=text)
-        elif time.perf_counter() - self._last >= BETWEEN:
+        elif time.perf_counter() - self._last >= self._between:
             self._last = time.perf_counter()
             self.say(f"{now.done} of {now.cases}, {text}")
 

@@ -128,6 +128,19 @@ def test_a_file_names_its_problem_relative_to_itself(tmp_path: Path) -> None:
     assert found.problem.path == tmp_path / "arm.toml"
 
 
+def test_settings_stand_in_for_what_the_file_says(tmp_path: Path) -> None:
+    settings = {"grid.target.mass_kg": [0.2], "grid.contact.damping": [50.0, 60.0], "set.problem.name": "b"}
+    found = read_sweep_file(written(tmp_path), settings)
+    assert cases(found) == [(0.2, 50.0), (0.2, 60.0)]
+    assert found.problem.content.problem.name == "b"
+    again = tmp_path / "as_it_was_kept.toml"
+    again.write_text(found.text, encoding="utf-8")
+    assert read_sweep_file(again).hash == found.hash != read_sweep_file(written(tmp_path)).hash
+    for key, value in (("sweep.grain", "collisions"), ("grid", 3), ("draw", "much"), ("draw.over", 1)):
+        with pytest.raises(InputError, match=key.split(".")[-1]):
+            read_sweep_file(written(tmp_path), {key: value})
+
+
 def test_sweeps_of_the_package_go_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = read_sweep_file("collision_target")

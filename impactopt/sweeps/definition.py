@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import ValidationError
@@ -21,7 +22,7 @@ from impactopt.problem_file.toml import TOMLError, plain_value
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column
-from impactopt.sweeps.dotted import flat
+from impactopt.sweeps.dotted import flat, put
 from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.sections import File, Grain, of_other_grains
 from impactopt.sweeps.varied import VariedKeys, telling
@@ -68,8 +69,12 @@ class Sweep:
         return hashlib.sha256(both.encode() + self.design.content()).hexdigest()[:16]
 
 
-def read_sweep_file(path: str | os.PathLike[str]) -> Sweep:
+def read_sweep_file(
+    path: str | os.PathLike[str], settings: Mapping[str, Any] = MappingProxyType({})
+) -> Sweep:
     """The sweep of a file, or by name one that comes with the package.
+
+    settings : other values, by dotted keys of the sweep's file, such as "draw.count".
 
     Raises
     ------
@@ -82,22 +87,39 @@ def read_sweep_file(path: str | os.PathLike[str]) -> Sweep:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise InputError(f"cannot read {path}: {reason}") from error
-    return parse_sweep(text, path)
+    return parse_sweep(text, path, settings)
 
 
-def parse_sweep(text: str, path: Path) -> Sweep:
-    """The sweep of a file's text; the problem's file is named relative to the folder of `path`."""
+def parse_sweep(text: str, path: Path, settings: Mapping[str, Any] = MappingProxyType({})) -> Sweep:
+    """The sweep of a file's text, with settings as of `read_sweep_file`; the problem's file is named relative
+    to the folder of `path`.
+    """
     try:
         data = read_toml(text)
     except TOMLError as error:
         raise InputError(f"{path} is not TOML: {error}") from error
-    return _checked(data, path, text)
+    for key, value in settings.items():
+        put(data, key, value)
+    return _checked(data, path, _written(data) if settings else text)
 
 
 def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = "sweep") -> Sweep:
     """The sweep that the data of a file describe; see `parse_sweep`."""
     plain: dict[str, Any] = plain_value(data)
-    return _checked(plain, Path(where), write_toml(plain))
+    return _checked(plain, Path(where), _written(plain))
+
+
+def _written(data: Mapping[str, Any]) -> str:
+    """As a file. What varies is written by dotted keys: its order counts, and TOML has tables last."""
+
+    def with_flat(table: Any, *names: str) -> Any:
+        if not isinstance(table, Mapping):  # a mistake, which is told later
+            return table
+        tables = {name: table[name] for name in names if isinstance(table.get(name), Mapping)}
+        return {**table, **{name: dict(flat(inner)) for name, inner in tables.items()}}
+
+    out = with_flat(data, "grid", "list", "set")
+    return write_toml({**out, "draw": with_flat(data["draw"], "over")} if "draw" in data else out)
 
 
 def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
@@ -145,7 +167,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     return Sweep(
         path=path,
         text=text,
-        content={name: table for name, table in data.items() if name != "figure"},
+        content={name: dict(flat(table)) for name, table in data.items() if name != "figure"},
         problem=base,
         design=design,
         name=given.name or path.stem,

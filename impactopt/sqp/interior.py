@@ -3,9 +3,8 @@
 The QPs of a whole motion have thousands of rows; solving each of them exactly costs more than the functions.
 So the barrier of the rows is kept from one QP to the next, and every QP gets one Newton step: the primal-dual
 interior-point method of Waechter and Biegler (Mathematical Programming 106, 2006), with its filter line
-search, second-order correction and inertia control. What is ours is the Newton system: rows that determine
-variables of their own are eliminated first (`condense`), inequality rows enter a banded matrix of what is
-left (`normal`).
+search, second-order correction and inertia control. What is ours is the Newton system (`newton`): rows that
+determine variables of their own are eliminated first (`condense`), and what is left gets a Cholesky factor.
 
 Where no step is progress any more the rows become elastic: they may be violated at a price, as in Sl1QP
 (Nocedal and Wright 2006, section 18.5), so that an infeasible program ends at a point of least violation.
@@ -33,8 +32,8 @@ from impactopt.sqp.elastic import Elastic
 from impactopt.sqp.linesearch import Filter, Progress
 from impactopt.sqp.newton import borrow, give_back
 from impactopt.sqp.options import SQPOptions
-from impactopt.sqp.point import Point, TimedProgram
-from impactopt.sqp.report import Report
+from impactopt.sqp.point import Point
+from impactopt.sqp.run import Run
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
@@ -63,7 +62,7 @@ class _Step:
     gone: Vector
 
 
-class InteriorRun:
+class InteriorRun(Run):
     """One solve with `qp_solver="interior"`.
 
     Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s.
@@ -78,10 +77,7 @@ class InteriorRun:
         y: Vector,
         z: Vector,
     ):
-        self.report = Report(program, options.violation_tolerance, callback)
-        self.program, self.options = TimedProgram(program), options
-        self.y, self.z = y, z
-        self.point = self.program.unknown(x)
+        super().__init__(program, options, callback, x, y, z)
         self._determined: Sequence[Determined] = getattr(program, "determined", ())
         self._sequence: Vector | None = getattr(program, "sequence", None)
         self._sigma, self._price = 1.0, options.price  # of the objective; of elastic rows
@@ -144,7 +140,6 @@ class InteriorRun:
 
     # ------------------------------------------------------------------ the loop
     def iterate(self) -> Status:
-        """From the start until a status is reached."""
         self.point = self.program.point(self.point.x)
         if not self.point.differentiable:
             return Status.FAILED
@@ -451,9 +446,6 @@ class InteriorRun:
         while self._mu > least and self._error(self._mu, residual) <= close * self._mu:
             self._mu = max(least, min(_FASTER * self._mu, self._mu**power))
             self._filter = None
-
-    def _out_of_time(self) -> bool:
-        return self.options.time_limit is not None and self.report.elapsed() > self.options.time_limit
 
 
 @dataclass

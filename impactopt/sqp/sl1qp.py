@@ -7,82 +7,29 @@ The method is Fletcher's Sl1QP with a second-order correction (Nocedal and Wrigh
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
-from impactopt.errors import check_array
 from impactopt.program import (
     Callback,
     NonlinearProgram,
-    SolverResult,
     Status,
     Vector,
-    check_program,
     complementarity,
     is_stationary_violation,
     stationarity,
 )
 from impactopt.sqp.hessian import QuadraticModel, make_hessian
-from impactopt.sqp.interior import InteriorRun
 from impactopt.sqp.merit import Filter, Merit
 from impactopt.sqp.options import SQPOptions
-from impactopt.sqp.point import Point, TimedProgram
+from impactopt.sqp.point import Point
 from impactopt.sqp.qp import make_qp_solver
-from impactopt.sqp.report import Report
+from impactopt.sqp.run import Run
 from impactopt.sqp.subproblem import Step, Subproblem
 from impactopt.sqp.trust_region import TrustRegion
 
 _ROUNDING = 1e-13  # changes of the merit function below this, relatively, are noise
 
 
-def solve_sqp(
-    program: NonlinearProgram,
-    x0: npt.ArrayLike,
-    *,
-    options: SQPOptions | None = None,
-    callback: Callback | None = None,
-    multipliers: npt.ArrayLike | None = None,
-    bound_multipliers: npt.ArrayLike | None = None,
-) -> SolverResult:
-    """Solve a nonlinear program by sequential quadratic programming.
-
-    Parameters
-    ----------
-    program : the program; its rows and variables should be of order one.
-    x0 : start (n,); moved into the variables' bounds, where every iterate stays.
-    options : see `SQPOptions`.
-    callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
-    multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
-
-    Returns
-    -------
-    The result; infeasible programs, interruption (Ctrl-C) and limits are statuses, not exceptions.
-
-    Raises
-    ------
-    InputError : wrong shapes, NaN, crossing bounds.
-    """
-    x0 = check_program(program, x0)
-    y = np.zeros(program.m) if multipliers is None else check_array("multipliers", multipliers, (program.m,))
-    z = (
-        np.zeros(program.n)
-        if bound_multipliers is None
-        else check_array("bound_multipliers", bound_multipliers, (program.n,))
-    )
-    x0 = np.clip(x0, program.x_lower, program.x_upper)
-    options = options or SQPOptions()
-    interior = options.qp_solver == "interior"
-    run = (InteriorRun if interior else _Run)(program, options, callback, x0, y, z)
-    # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
-    with threadpool_limits(limits=1 if interior else None, user_api="blas"):
-        try:
-            status = run.iterate()
-        except KeyboardInterrupt:
-            status = Status.INTERRUPTED
-    return run.report.result(status, run.program, run.point, run.y, run.z)
-
-
-class _Run:
+class Sl1QPRun(Run):
     """One solve. Between iterations: the point, its multipliers, the trust region, the merit function."""
 
     def __init__(
@@ -94,19 +41,15 @@ class _Run:
         y: Vector,
         z: Vector,
     ):
-        self.report = Report(program, options.violation_tolerance, callback)
-        self.program, self.options = TimedProgram(program), options
+        super().__init__(program, options, callback, x, y, z)
         self.hessian = make_hessian(self.program, options)
         self.subproblem = Subproblem(self.program, make_qp_solver(options.qp_solver))
         self.subproblem.start_from(y, z)
         self.merit = Merit(price=options.price, price_max=options.price_max)
         self.filter = Filter()
         self.region = TrustRegion(options.radius, options.radius_max, options.levenberg, options.levenberg)
-        self.point = self.program.unknown(x)
-        self.y, self.z = y, z
 
     def iterate(self) -> Status:
-        """From the start until a status is reached."""
         self.point = self.program.point(self.point.x)
         if not self.point.differentiable:
             return Status.FAILED
@@ -280,6 +223,3 @@ class _Run:
 
     def _inside(self, x: Vector) -> Vector:
         return np.clip(x, self.program.x_lower, self.program.x_upper)
-
-    def _out_of_time(self) -> bool:
-        return self.options.time_limit is not None and self.report.elapsed() > self.options.time_limit

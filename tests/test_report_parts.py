@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from fake_solution import still_solution
+from scipy.integrate import trapezoid
 
 from impactopt.contact import FreeMass
 from impactopt.contact.nail import Nail
@@ -273,3 +274,20 @@ def test_charts_hold_the_records_numbers(record: Record) -> None:
     for chart in charts:
         for s in chart["series"]:
             assert {s[key] for key in ("x", "y", "xy", "time", "margin") if key in s} <= set(arrays)
+
+
+def test_the_planned_hand_is_as_fast_as_the_plan_says(biped_plan: Any) -> None:
+    plan, problem = biped_plan.plan, biped_plan.problem
+    solved = still_solution(problem=problem)
+    made = record_of(type(solved)(**{**vars(solved), "plan": plan}))
+    charts, arrays = charts_of(made, problem)
+    (chart,) = (chart for chart in charts if chart["title"].startswith("Speed of hand"))
+    (hand,) = (s for s in chart["series"] if s["label"] == "hand, planned")
+    time, speed = arrays[hand["x"]], arrays[hand["y"]]
+    assert speed[0] == pytest.approx(0.0, abs=1e-6), "from rest"
+    assert np.nanmax(speed[time <= plan.contact_start]) == pytest.approx(plan.hand_speed, rel=1e-3)
+    assert np.isnan(speed[(time > plan.contact_start) & (time < plan.contact_end)]).all()
+    # what it covers in the swing is its way from the start to the target
+    swing = np.isfinite(speed) & (time <= plan.contact_start)
+    way = problem.normal @ (problem.point - tracks_of(made, problem)[0].hand[0])
+    assert trapezoid(speed[swing], time[swing]) == pytest.approx(way, abs=2e-3)

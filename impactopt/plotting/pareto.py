@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, Picture, styled
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PAGE, PURPLE, SKY, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
 
@@ -38,7 +38,7 @@ def pareto_picture(rows: Sequence[Row]) -> Picture:
     """One panel a robot; rows of `impactopt.bench.collision` that have a time and an error."""
     known = [r for r in rows if r["time_us"] is not None and r["impulse_error_pct"] is not None]
     robots = list(dict.fromkeys(r["robot"] for r in known))
-    figure = Picture(3.4 * max(1, len(robots)) + 0.4, 4.0)
+    figure = Picture(PAGE, 4.0)
     panels = figure.subplots(1, max(1, len(robots)), sharex=True, sharey=True, squeeze=False)[0]
     for axes, robot in zip(panels, robots, strict=False):
         own = [r for r in known if r["robot"] == robot]

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, Picture, styled
+from impactopt.plotting.style import BLACK, BLUE, GREEN, ORANGE, PAGE, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
 _FORMULA = {"linestyle": ":", "linewidth": 1.2}
@@ -30,15 +30,15 @@ _METHODS = (
 @styled
 def scaling_picture(rows: Sequence[Row], exponents: Sequence[Row]) -> Picture:
     """Three panels over joints, three over step and batch; rows of `impactopt.bench.scaling`."""
-    figure = Picture(10.4, 6.6)
+    figure = Picture(PAGE, 8.4)
     of = {over: [r for r in rows if r["over"] == over] for over in ("dof", "step", "batch")}
-    grid = figure.subplots(2, 3)
-    for axes, part, title in zip(grid[0], _PARTS, _TITLES, strict=True):
+    grid = figure.subplots(3, 2).ravel()
+    for axes, part, title in zip(grid[:3], _PARTS, _TITLES, strict=True):
         _over_dof(axes, of["dof"], exponents, *part)
         axes.set_title(title, loc="left")
-    _over_step(grid[1, 0], of["step"])
-    _errors(grid[1, 1], of["step"])
-    _over_batch(grid[1, 2], of["batch"])
+    _over_step(grid[3], of["step"])
+    _errors(grid[4], of["step"])
+    _over_batch(grid[5], of["batch"])
     return figure
 
 
@@ -64,7 +64,7 @@ def _over_dof(
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
-    _head_room(axes, 20.0)
+    _head_room(axes, 60.0)
     axes.legend(fontsize=6.5, loc="upper left")
 
 

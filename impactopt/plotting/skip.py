@@ -29,5 +29,8 @@ def skip_picture(rows: Sequence[Row]) -> Picture:
     panels[1].barh(places, step, left=freeze, color=ORANGE, label="one step")
     panels[1].set_xlabel("instructions")
     panels[1].legend()
-    panels[0].set_yticks(places, [r["skipped"] for r in timed])
+    panels[0].set_yticks(places, [r["skipped"].replace("everything", "nothing") for r in timed])
+    panels[0].set_ylabel("left out")
+    for axes in panels:
+        axes.grid(axis="y", visible=False)
     return figure

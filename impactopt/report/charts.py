@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.output import Record
+from impactopt.problem import ImpactProblem
 from impactopt.report.thinning import BUCKETS, thinned
+from impactopt.report.tracks import planned_hand_speed
 from impactopt.support import margin
 from impactopt.validation.result import centre_of_pressure
 
@@ -26,15 +28,15 @@ SOURCES = (
 OTHERS = ("one", "two")  # styles of what is no motion
 
 
-def charts_of(record: Record) -> tuple[list[dict[str, Any]], Arrays]:
-    """Descriptions, in the order of the page, and arrays by name."""
+def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[list[dict[str, Any]], Arrays]:
+    """Descriptions, in the order of the page, and arrays by name; problem: for the planned hand's speed."""
     arrays: Arrays = {}
     charts: list[dict[str, Any] | None] = []
     if record.completed:
         present = [s for s in SOURCES if f"{s[1]}_time" in record.arrays]
         charts += [
             _force(record, arrays, present),
-            _speed(record, arrays, present),
+            _speed(record, arrays, present, problem),
             _zmp_margin(record, arrays, present),
             _zmp_path(record, arrays, present),
             _torque_ratio(record, arrays),
@@ -88,18 +90,20 @@ def _at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array,
     return time, np.concatenate([[otherwise] * 2, values, [otherwise] * 2])
 
 
-def _speed(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]:
-    a = record.arrays
+def _speed(
+    record: Record, arrays: Arrays, present: list[Any], problem: ImpactProblem | None
+) -> dict[str, Any]:
+    a, hands = record.arrays, {p: f"{p}_hand_speed" for _, p, _ in present}
+    known = {prefix: a[name] for prefix, name in hands.items() if name in a}
+    if problem is not None:
+        known["reference"] = planned_hand_speed(record, problem)
+    series = [
+        _series(record, arrays, f"speed_{style}", f"hand, {label}", style, a[f"{prefix}_time"], known[prefix])
+        for label, prefix, style in present
+        if prefix in known
+    ]
     time, speed = _at_contact(record, a["collision_target_speed"], np.nan)
-    series = [_series(record, arrays, "speed_plan", "target, planned", "planned", time, speed)]
-    for label, prefix, style in present:
-        if f"{prefix}_hand_speed" in a:
-            time = a[f"{prefix}_time"]
-            series.append(
-                _series(
-                    record, arrays, f"speed_{style}", f"hand, {label}", style, time, a[f"{prefix}_hand_speed"]
-                )
-            )
+    series.append(_series(record, arrays, "speed_target", "target, planned", OTHERS[0], time, speed))
     start, end = _bands(record)[0]
     view = [max(0.0, start - 0.2), end + 0.2]
     return _chart(

@@ -27,7 +27,7 @@ class Report(Page):
 
 def report_of(record: Record, problem: ImpactProblem | None = None) -> Report:
     """The record as a page; with the animation, if the problem is given and there is a motion."""
-    charts, arrays = charts_of(record)
+    charts, arrays = charts_of(record, problem)
     header: dict[str, Any] = {}
     if problem is not None and record.completed:
         header, solids = stage_of(record, problem)

@@ -13,7 +13,7 @@ from impactopt.output import Record
 from impactopt.problem import ImpactProblem
 from impactopt.validation.result import centre_of_pressure
 
-__all__ = ["AROUND", "Track", "tracks_of"]
+__all__ = ["AROUND", "Track", "planned_hand_speed", "tracks_of"]
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -148,3 +148,21 @@ def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, 
     if "depth_m" in record.summary.get("target", {}):  # a nail stays in its wood
         speed = np.where(since > hit[-1], 0.0, speed)
     return wrench, force, speed
+
+
+def planned_hand_speed(record: Record, problem: ImpactProblem) -> Array:
+    """(k,) [m/s] along the normal, at the reference's instants.
+
+    It is nan in contact: there the servo's reference coasts, and the plan does not.
+    """
+    a, robot = record.arrays, problem.robot
+    model, data = robot.model, robot.model.createData()
+    striker = model.getFrameId(robot.striker(problem.striker).model_frame)
+    speed = np.full(len(a["reference_time"]), np.nan)
+    # the first instant in contact still has the swing's velocity
+    known = (a["reference_phase"] != 1) | (a["reference_time"] <= float(a["reference_contact_start"]))
+    for k in np.flatnonzero(known):
+        pin.forwardKinematics(model, data, a["reference_q"][k], a["reference_v"][k])
+        moved = pin.getFrameVelocity(model, data, striker, pin.LOCAL_WORLD_ALIGNED)
+        speed[k] = problem.normal @ moved.linear
+    return speed

@@ -46,7 +46,10 @@ _PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing
 _COMPLEMENTARY = 1e-2  # of the tolerance: multiplier x distance to the bound at a solution
 _LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
-_NEAR = 1e-2  # violation from which on elastic rows are made hard again where they do not get further
+# violation from which on elastic rows are made hard again where they do not get further, or this part of what
+# it was when nothing else began to count
+_NEAR, _LESS = 1e-2, 1e-2
+_RESTORED = 1e-3  # violation from which on they are where nothing else counted
 _CHANGES = 12  # of what is aimed at, at most
 _AGAIN = 1e-4  # the least barrier after such a change
 
@@ -82,6 +85,7 @@ class InteriorRun(Run):
         self._sequence: Vector | None = getattr(program, "sequence", None)
         self._sigma, self._price = 1.0, options.price  # of the objective; of elastic rows
         self._changes = 0
+        self._began = 0.0  # violation where only that began to count
         self._warm = bool(np.any(y) or np.any(z))
         self._mu = options.barrier_warm if self._warm else options.barrier
 
@@ -165,6 +169,9 @@ class InteriorRun(Run):
                 if verdict is not None:
                     return verdict
                 continue
+            if self._restored():
+                self._change_aim(met=True)
+                continue
             if self._out_of_time():
                 return Status.TIME_LIMIT
             self._lower_barrier(residual)
@@ -181,6 +188,13 @@ class InteriorRun(Run):
         if met and self._sigma:
             return Status.SOLVED
         return self._change_aim(met=met)
+
+    def _restored(self) -> bool:
+        """Whether the violation, which alone counts, is so small that hard rows get further with it."""
+        elastic = self._elastic
+        if elastic is None or self._sigma or elastic.price >= self.options.price_max:
+            return False
+        return self.point.max_violation <= _RESTORED
 
     def _start_is_solution(self) -> bool:
         """Whether the start with the multipliers given meets all tolerances."""
@@ -204,7 +218,7 @@ class InteriorRun(Run):
             self._elastic, self._sigma = None, 1.0  # from where the rows are met, as if nothing had been
             self._price = min(10.0 * price, self.options.price_max)
         elif self._sigma:
-            self._sigma = 0.0
+            self._sigma, self._began = 0.0, self.point.max_violation
         else:
             return Status.INFEASIBLE
         self._mu = max(self._mu, _AGAIN)
@@ -397,7 +411,7 @@ class InteriorRun(Run):
             self._y, self._gone_y = self._elastic.clip(self._y), np.zeros_like(self._gone_y)
             self._filter = None
             return "rows become elastic"
-        near = point.max_violation <= _NEAR
+        near = point.max_violation <= max(_NEAR, _LESS * self._began)
         if self._sigma or near:
             end = self._change_aim(met=near)
             if end is not None:

@@ -105,6 +105,6 @@ def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
     axes.set_aspect("equal")
     # one length between ticks on both axes: those of a narrow view alone would run into each other
     largest_span = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
-    spacing = np.diff(MaxNLocator(4).tick_values(0.0, largest_span))[0]
+    spacing = np.diff(MaxNLocator(6).tick_values(0.0, largest_span))[0]
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(spacing))

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from impactopt.plotting.style import BLACK, BLUE, VERMILION, Picture, styled
+from impactopt.plotting.style import BLACK, BLUE, PAGE, VERMILION, Picture, styled
 
-COLUMNS = 4
+COLUMNS = 3
 Row = Mapping[str, Any]
 
 
@@ -24,11 +24,11 @@ def margins_picture(rows: Sequence[Row]) -> Picture:
     """
     options = list(dict.fromkeys(r["option"] for r in rows))
     lines = -(-(len(options) + 1) // COLUMNS)  # one place is the legend's
-    height = 2.8 * lines + 0.5
+    height = 2.5 * lines + 0.5
     # by hand: an automatic layout would make panels with long labels smaller than the others
-    figure = Picture(8.8, height)
+    figure = Picture(PAGE, height)
     figure.set_layout_engine("none")
-    edges = {"left": 0.075, "right": 0.985, "bottom": 0.8 / height, "top": 1 - 0.28 / height}
+    edges = {"left": 0.1, "right": 0.985, "bottom": 0.8 / height, "top": 1 - 0.28 / height}
     outer = figure.add_gridspec(lines, COLUMNS, wspace=0.1, hspace=0.27, **edges)
     impulses = [r["impulse_planned_Ns"] for r in rows if r["impulse_planned_Ns"] is not None]
     span = (min(impulses), max(impulses)) if impulses else (0.0, 1.0)
@@ -54,7 +54,7 @@ def margins_picture(rows: Sequence[Row]) -> Picture:
         else:
             upper.tick_params(labelleft=False)
             lower.tick_params(labelleft=False)
-    _legend(figure.add_subplot(outer[lines - 1, COLUMNS - 1]))
+    _legend(figure.add_subplot(outer[lines - 1, len(options) % COLUMNS]))
     return figure
 
 

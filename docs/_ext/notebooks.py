@@ -15,7 +15,7 @@ LINK, HERE = "](../docs/", "](../"
 
 HEAD = """# Notebooks
 
-They are in `notebooks/` of the repository; `make notebooks` executes them.
+They are in `notebooks/`. `make notebooks` executes them, and these pages then show their outputs.
 
 """
 

@@ -85,6 +85,12 @@ def in_words(times: Times) -> str:
 
 def draw(rows: list[dict[str, Any]]) -> Picture:
     """Formulas as lines, measured ratios as marks."""
+    from impactopt.plotting.style import styled
+
+    return styled(_drawn)(rows)
+
+
+def _drawn(rows: list[dict[str, Any]]) -> Picture:
     from impactopt.plotting.style import BLUE, PAGE, VERMILION, Picture
 
     figure = Picture(PAGE, 3.6)

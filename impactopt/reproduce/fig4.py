@@ -92,6 +92,12 @@ def run(say: Say, *, measured: Sequence[int] = MEASURED) -> Report:
 
 def draw(rows: list[dict[str, Any]]) -> Picture:
     """Formulas as lines, measured ratios as marks."""
+    from impactopt.plotting.style import styled
+
+    return styled(_drawn)(rows)
+
+
+def _drawn(rows: list[dict[str, Any]]) -> Picture:
     from impactopt.plotting.style import BLACK, BLUE, PAGE, VERMILION, Picture
 
     figure = Picture(PAGE, 3.6)

@@ -66,8 +66,14 @@ def check_collision(problem: Any) -> None:
             f'{type(problem.target).__name__}; take collision="dynamics"'
         )
     if problem.collision == "dynamics":  # refuses what has switches
-        still = [[0.0] * k for k in (problem.target.n_states, len(problem.target.helpers))]
-        problem.target.smooth(still[0], 0.0, still[1], False)
+        target, law = problem.target, problem.law
+        target.smooth([0.0] * target.n_states, 0.0, 0)
+        if not target.turns and law.formula()[0] != law.formula()[1]:
+            raise InputError(
+                f"a plan for a {type(target).__name__} needs a law that is the same in compression and "
+                f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
+                "approach and part several times in a blow"
+            )
 
 
 def check_names(robot: Robot, term: Term) -> None:

@@ -113,8 +113,12 @@ class Effort(Objective):
 DEFAULT_OBJECTIVES: tuple[Objective, ...] = (Impulse(),)
 
 
-def check_objectives(objectives: object, *, contact: bool, balance: bool) -> tuple[Objective, ...]:
-    """The objectives as a tuple; ``contact``: the contact lasts; ``balance``: the robot has one to keep.
+def check_objectives(
+    objectives: object, *, contact: bool, turns: bool, balance: bool
+) -> tuple[Objective, ...]:
+    """The objectives as a tuple.
+
+    ``contact``: it lasts; ``turns``: its compression has one end; ``balance``: the robot has one to keep.
 
     Raises
     ------
@@ -134,6 +138,8 @@ def check_objectives(objectives: object, *, contact: bool, balance: bool) -> tup
             raise InputError(
                 f'{kind.__name__} is of a contact that lasts: give collision="dynamics", or leave it out'
             )
+        if isinstance(o, Penetration) and not turns:
+            raise InputError("Penetration has no peak in the blow on a nail: take PeakForce or TargetEnergy")
         if isinstance(o, AngularMomentum) and not balance:
             raise InputError("AngularMomentum is of a robot that stands: leave it out on a fixed base")
     return tuple(objectives)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
@@ -14,7 +15,7 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, Mistakes, check_array
-from impactopt.extra_terms import HitCone, SelfCollision
+from impactopt.extra_terms import HandOrientation, HitCone, SelfCollision
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem_hash import problem_hash
 from impactopt.reach import reach
@@ -69,16 +70,17 @@ class ImpactProblem:
     point (3,) [m] : where the striking point meets the target, world; the ground is z = 0 and the start
         posture's soles are centred on the origin.
     normal (3,) : unit vector of the blow, world: the target is pushed along it.
-    law, target : contact law and target. A plan breaks a `Board`, in compression; it lets a `Nail` creep
-        where it should stand (`Nail.smooth`).
+    law, target : contact law and target. A plan breaks a `Board`, in compression; it drives a `Nail`
+        once, which stands again before the striker leaves it.
     stance : which soles are held.
     start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
-    contact_duration : bounds [s] of each of compression and restitution; of what a break makes of
-        compression, the shortest is a tenth.
+    contact_duration : bounds [s] of each of compression (until a nail stands) and restitution; what a break
+        or a start makes two of may each be shorter (`Target.shares`).
     collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
-        sum to 1; those of compression before and after a break. They are halved for a nail and a board.
+        sum to 1; those of compression before and after a break or a start. They are halved for a nail and a
+        board.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
     collision : "dynamics", the whole equation of motion while the contact lasts; "rigid", an impact in no
         time with ``coefficient_of_restitution`` (speed of separation over that of approach); "virtual mass",
@@ -130,11 +132,12 @@ class ImpactProblem:
         if found.attempt(self._check_scenarios):
             for scenario in self.scenarios:
                 found.attempt(partial(scenario.numbers, self.law, self.target))
-        if found.attempt(self._check_terms):
+        termed = found.attempt(self._check_terms)
+        if termed:
             for term in self.terms:
                 found.attempt(partial(check_names, self.robot, term))
         found.attempt(self._check_objectives)
-        if hits and aimed and stands:
+        if hits and aimed and stands and termed:
             found.attempt(lambda: self.contact_posture)
         found.raise_if_any("the problem")
 
@@ -204,7 +207,8 @@ class ImpactProblem:
 
     def _check_objectives(self) -> None:
         lasts, stands = self.collision == "dynamics", self.robot.floating
-        checked = check_objectives(self.objectives, contact=lasts, balance=stands)
+        turns = not isinstance(self.target, Target) or self.target.turns
+        checked = check_objectives(self.objectives, contact=lasts, turns=turns, balance=stands)
         object.__setattr__(self, "objectives", checked)
 
     def _check_start(self) -> None:
@@ -255,9 +259,16 @@ class ImpactProblem:
     def contact_posture(self) -> Array:
         """Some posture (nq,) with the striking point at ``point`` and the soles in place.
 
+        The hand has the orientation that is asked for, as nearly as may be.
+
         Raises InputError if none is found: the point is out of reach.
         """
-        return reach(self.coordinates, self.striker, self.point, self.start_posture)
+        given = self.coordinates, self.striker, self.point, self.start_posture
+        if (hand := self.extra(HandOrientation)) is not None:
+            direction = self.normal if hand.direction is None else np.array(hand.direction)
+            with suppress(InputError):
+                return reach(*given, facing=(np.array(hand.axis), direction))
+        return reach(*given)
 
     def describe(self) -> dict[str, Any]:
         """The problem in a few plain words and numbers, for reports."""

@@ -10,6 +10,8 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError
 
 Array = NDArray[np.float64]
+TURNING, WISH = 100, 0.1  # steps that also turn the hand, and how much that is damped
+ASIDE, ABOUT = 0.1, 0.3  # [rad] how far postures are drawn from the guess: the first one that turns; others
 
 
 def reach(
@@ -18,13 +20,15 @@ def reach(
     point: Array,
     guess: Array,
     *,
+    facing: tuple[Array, Array] | None = None,
     margin: float = 0.02,
     starts: int = 8,
     tolerance: float = 1e-8,
 ) -> Array:
     """A pin configuration (nq,) with the striking point at ``point`` (3,) [m], the soles in place.
 
-    Joints are inside their limits by ``margin`` [rad].
+    Joints are inside their limits by ``margin`` [rad].  facing : an axis of the striker's frame, and the
+    direction (world) that it is to have, as nearly as may be; unit vectors (3,).
 
     Damped least squares on soles and striking point, from ``guess`` and then from postures about it. The
     soles of ``coordinates`` stay.
@@ -49,9 +53,10 @@ def reach(
     best_gap = np.inf
     for k in range(starts):
         q = guess.copy()
-        if k:
-            q = pin.integrate(model, q, np.concatenate([np.zeros(base), 0.3 * rng.standard_normal(robot.n)]))
-        for _ in range(200):
+        if k or facing is not None:  # what is in a plane of symmetry would stay there
+            drawn = (ABOUT if k else ASIDE) * rng.standard_normal(robot.n)
+            q = pin.integrate(model, q, np.concatenate([np.zeros(base), drawn]))
+        for turn in range(200):
             q[place] = np.clip(q[place], lower[limited], upper[limited])
             pin.computeJointJacobians(model, data, q)
             pin.updateFramePlacements(model, data)
@@ -63,12 +68,21 @@ def reach(
             gap = point - data.oMf[fid].translation
             errors.append(gap)
             hand = pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)
-            jacs.append(np.reshape(hand, (6, model.nv))[:3])  # pin drops an axis where nv is 1
-            e, jac = np.concatenate(errors), np.vstack(jacs)
-            off = float(np.abs(e).max())
+            hand = np.reshape(hand, (6, model.nv))  # pin drops an axis where nv is 1
+            jacs.append(hand[:3])
+            off = float(np.abs(np.concatenate(errors)).max())
             best_gap = min(best_gap, off)
-            if off < tolerance:
+            turning = facing is not None and turn < TURNING
+            if off < tolerance and not turning:
                 return q
+            damping = np.full(6 * len(coordinates.legs) + 3, 1e-8)
+            if facing is not None and turning:
+                axis = data.oMf[fid].rotation @ facing[0]
+                across = np.linalg.svd(axis[None])[2][1:]  # turning about the axis changes nothing
+                errors.append(across @ _turn(axis, facing[1], across[0]))
+                jacs.append(across @ hand[3:])
+                damping = np.concatenate([damping, [WISH, WISH]])
+            e, jac = np.concatenate(errors), np.vstack(jacs)
             # joints at a limit that would leave it are held for this step
             step = np.zeros(model.nv)
             free = np.ones(model.nv, dtype=bool)
@@ -76,7 +90,7 @@ def reach(
                 j = jac[:, free]
                 step[:] = 0.0
                 jw = j * ease[free]
-                step[free] = jw.T @ np.linalg.solve(jw @ j.T + 1e-8 * np.eye(len(e)), e)
+                step[free] = jw.T @ np.linalg.solve(jw @ j.T + np.diag(damping), e)
                 joint = step[base:][limited]
                 out = np.zeros(robot.n, dtype=bool)
                 out[limited] = ((q[place] >= upper[limited] - 1e-9) & (joint > 0)) | (
@@ -93,3 +107,12 @@ def reach(
         f"the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
         f"{np.round(start, 3).tolist()} m); move the point nearer"
     ) from None
+
+
+def _turn(axis: Array, direction: Array, across: Array) -> Array:
+    """The least rotation (3,) [rad] from one unit vector to another; ``across``: one at right angles."""
+    cross, along = np.cross(axis, direction), float(axis @ direction)
+    sine = float(np.linalg.norm(cross))
+    if sine < 1e-9:
+        return np.zeros(3) if along > 0 else np.pi * across
+    return np.asarray(cross * (np.arctan2(sine, along) / sine))

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from impactopt import blows
 from impactopt.blows import drive_nail
 from impactopt.cli import app
-from impactopt.contact import FreeMass, Nail, SpringDamper
+from impactopt.contact import FreeMass, KelvinVoigt, Nail
 from impactopt.errors import InputError
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile
@@ -36,7 +36,7 @@ def nailing(**changes: Any) -> ImpactProblem:
         "stance": FixedBase(),
         "point": striking_point(robot, "start", "hand") + np.array([0.05, 0.05, 0.1]),
         "normal": [0.0, 1.0, 0.0],
-        "law": SpringDamper(stiffness=1e5, damping=100.0),
+        "law": KelvinVoigt(stiffness=1e5, damping=100.0),
         "target": NAIL,
     }
     return ImpactProblem(**{**given, **changes})

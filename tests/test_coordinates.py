@@ -426,6 +426,26 @@ def test_reach_turns_a_continuous_joint_past_half_a_turn() -> None:
     assert robot.joint_positions(q)[0] == pytest.approx(-2.9, abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["planar_arm", "arm7"])
+def test_a_reach_turns_the_hand(name: str) -> None:
+    """As asked where joints allow; else as nearly as may be, with the point met all the same."""
+    robot = load_robot(name)
+    c, posture = StanceCoordinates(robot, (), robot.posture("ready")), robot.posture("ready")
+    frame, data = robot.model.getFrameId("striker:hammer"), robot.model.createData()
+    face, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    point = np.array([0.7, 0.0, 0.75]) if name == "planar_arm" else np.array([0.65, 0.0, 0.4])
+    along = []
+    for facing in (None, (face, down)):
+        q = reach(c, "hammer", point, posture, facing=facing)
+        pin.framesForwardKinematics(robot.model, data, q)
+        np.testing.assert_allclose(data.oMf[frame].translation, point, atol=1e-7)
+        along.append(float(down @ data.oMf[frame].rotation @ face))
+        assert (robot.joint_positions(q) <= robot.upper - 0.02 + 1e-9).all()
+    assert along[0] < 0.96 and along[1] > along[0] + 0.05
+    if name == "planar_arm":
+        assert along[1] == pytest.approx(1.0, abs=1e-6)
+
+
 def test_out_of_reach_says_how_far_off() -> None:
     case = made("arm")
     with pytest.raises(InputError, match=r"out of reach of 'hand'.*off by .*starts at"):

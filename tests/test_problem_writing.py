@@ -191,8 +191,15 @@ CHANGES = st.fixed_dictionaries(
 )
 
 
+def goes_together(changes: dict[str, Any]) -> bool:
+    """A plan for a nail, which the problem has if nothing else is drawn, wants a law of one branch."""
+    nail = isinstance(changes.get("target"), contact.Nail) or "target" not in changes
+    peaks = any(isinstance(o, objectives.Penetration) for o in changes.get("objectives", ()))
+    return not nail or not (isinstance(changes.get("law"), contact.SpringDamper) or peaks)
+
+
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(changes=CHANGES, turn=st.floats(-0.05, 0.05))
+@given(changes=CHANGES.filter(goes_together), turn=st.floats(-0.05, 0.05))
 def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any], turn: float) -> None:
     start = nailing.start_posture + turn
     problem = dataclasses.replace(nailing, start=start if turn > 0 else "ready", **changes)

@@ -14,7 +14,7 @@ from small_plans import LAW, OPTIONS, Planned, changed, planned
 
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.ipopt import solve_ipopt
-from impactopt.nlp import transcription as nlp
+from impactopt.nlp import clearance as nlp
 from impactopt.nlp.start import first_iterate
 from impactopt.nlp.transcription import Transcription
 from impactopt.plan import PlannedCollision, PlannedScenario

@@ -42,7 +42,8 @@ class Board(Target):
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("broken",)
     typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
-    breaks: ClassVar[bool] = True
+    events: ClassVar[tuple[str, ...]] = ("break",)
+    phases: ClassVar[tuple[str, ...]] = ("compression", "compression after the break", "restitution")
 
     def __post_init__(self) -> None:
         positive("Board: mass [kg]", self.mass)
@@ -60,17 +61,23 @@ class Board(Target):
         return [(force - held) / p["mass"], state[0]]
 
     def smooth(
-        self, state: Any, force: Any, helpers: Any, broken: bool, parameters: Parameters | None = None
-    ) -> tuple[list[Any], list[Any]]:
+        self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
+    ) -> tuple[Any, list[Any]]:
         """One branch until it breaks, one after."""
         p = self.parameters if parameters is None else parameters
         bending = p["stiffness"] * state[1] + p["damping"] * state[0]
-        return [(force - (0.0 if broken else bending)) / p["mass"], state[0]], []
+        return state[0], [(force - (0.0 if phase else bending)) / p["mass"], state[0]]
 
-    def breaking(self, state: Any, parameters: Parameters | None = None) -> Any:
+    def event(
+        self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
+    ) -> Any:
         """The spring's force over that of the break, less 1."""
         p = self.parameters if parameters is None else parameters
         return p["stiffness"] * state[1] / p["breaking_force"] - 1.0
+
+    def lasting(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
+        """It does not break too early."""
+        return [] if phase else [-self.event(state, force, 0.0, phase, parameters)]
 
     def _beyond(self, state: Any, p: Parameters) -> Any:
         return state[1] - p["breaking_force"] / p["stiffness"]

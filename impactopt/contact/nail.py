@@ -10,7 +10,7 @@ from .targets import Target
 
 __all__ = ["Nail"]
 
-CREEP = 1e-3  # [m/s] of a nail at rest in a plan, with nothing pushing; see `Nail.smooth`
+SOON, LEFT = 1e-3, 1e-4  # of a plan's start: the unit of time [s], and what is left; see `Nail.event`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +45,10 @@ class Nail(Target):
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("depth",)
     typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
-    helpers: ClassVar[tuple[str, ...]] = ("unused resistance",)
-    forward_only: ClassVar[bool] = True
+    events: ClassVar[tuple[str, ...]] = ("start", "stop")
+    phases: ClassVar[tuple[str, ...]] = ("press", "drive", "release")
+    at_once: ClassVar[bool] = True
+    stays: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         positive("Nail: mass [kg]", self.mass)
@@ -75,19 +77,33 @@ class Nail(Target):
         return [choose(state[0] > 0, state[0], choose(beyond > 0, state[0], beyond))]
 
     def smooth(
-        self, state: Any, force: Any, helpers: Any, broken: bool, parameters: Parameters | None = None
-    ) -> tuple[list[Any], list[Any]]:
-        """The nail never quite stands: it creeps at v = CREEP / h under R (1 - h), h >= 0, v >= 0.
+        self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
+    ) -> tuple[Any, list[Any]]:
+        """It is pressed, driven, and let go; it moves once."""
+        p = self.parameters if parameters is None else parameters
+        if phase != 1:
+            return 0.0 * state[0], [0.0 * state[0], 0.0 * state[0]]
+        return state[0], [(force - self._resistance(state, p)) / p["mass"], state[0]]
 
-        The helper h is the fraction of the wood's resistance that is not used: nearly 0 while the nail moves
-        and 1 - f / R while it stands, which is dry friction's complementarity v h = 0, relaxed. A nail that
-        moves at v feels (1 - CREEP / v) R. Source: Scholtes, SIAM J. Optim. 11 (2001) 918-936.
+    def event(
+        self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
+    ) -> Any:
+        """It starts where the force is what the wood holds, or at once if it is more from the first touch on.
+
+        The first is f = R and late > 0, the second late = 0 and f > R: complementarity, relaxed to
+        late (f / R - 1) = SOON LEFT, both above zero. It stops at v = 0.
+        Source: Scholtes, SIAM J. Optim. 11 (2001) 918-936.
         """
         p = self.parameters if parameters is None else parameters
-        v, unused = state[0], helpers[0]
-        resisted = self._resistance(state, p) * (1.0 - unused)
-        meet = v + unused - ((v - unused) ** 2 + 4.0 * CREEP) ** 0.5
-        return [(force - resisted) / p["mass"], v], [meet]
+        if phase == 1:
+            return state[0]
+        wait, beyond = late / SOON, force / self._resistance(state, p) - 1.0
+        return wait + beyond - ((wait - beyond) ** 2 + 4.0 * LEFT) ** 0.5
+
+    def lasting(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
+        """Driven it does not move back, and released it is not pushed hard enough to move again."""
+        p = self.parameters if parameters is None else parameters
+        return [[], [state[0]], [1.0 - force / self._resistance(state, p)]][phase]
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
         """Kinetic energy, and the work done against the wood."""

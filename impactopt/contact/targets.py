@@ -29,23 +29,27 @@ class Target(ABC):
     results : names of what `result` gives.
     analytic : whether there are derivatives of all orders between switches, as Taylor steps need them.
     typical : sizes of the state's numbers, for scaling; ones if not given.
-    breaks : whether it breaks: it switches once, in the first half of a blow, and for good. A plan breaks it.
-    helpers : names of what a plan finds beside the state at each instant, all >= 0; see `smooth`.
-    forward_only : whether the state's numbers and the helpers are never below zero.
+    events : what a plan has in the place of switches: what happens to it in a blow, in this order, each of
+        which ends a phase of the contact; see `smooth`.
+    phases : the contact's phases in a plan, three if there are events, which end the first of them; what is
+        left before the last ends with compression, the last with contact.
+    at_once : whether the first event may come with the first touch, so that the phase before it is none.
+    stays : whether it waits where a blow has left it, so that the striker must keep off it afterwards.
     """
 
     n_states: int
     results: ClassVar[tuple[str, ...]] = ()
     analytic: ClassVar[bool] = True
     typical: ClassVar[tuple[float, ...]] = ()
-    breaks: ClassVar[bool] = False
-    helpers: ClassVar[tuple[str, ...]] = ()
-    forward_only: ClassVar[bool] = False
+    events: ClassVar[tuple[str, ...]] = ()
+    phases: ClassVar[tuple[str, ...]] = ("compression", "restitution")
+    at_once: ClassVar[bool] = False
+    stays: ClassVar[bool] = False
 
     @property
-    def switching(self) -> bool:
-        """Whether its motion has switches, so that a plan has something in their place."""
-        return self.breaks or bool(self.helpers)
+    def turns(self) -> bool:
+        """Whether a phase ends with compression: events do not end all phases but the last."""
+        return len(self.events) < len(self.phases) - 1
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -72,12 +76,12 @@ class Target(ABC):
         return []
 
     def smooth(
-        self, state: Any, force: Any, helpers: Any, broken: bool, parameters: Parameters | None = None
-    ) -> tuple[list[Any], list[Any]]:
-        """The motion as a plan has it, where nothing may switch: d(state)/dt, and what is zero [of order 1].
+        self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
+    ) -> tuple[Any, list[Any]]:
+        """Velocity and d(state)/dt in a phase of the contact as a plan has them, where nothing may switch.
 
-        A target without switches moves as it is. One with switches says here what takes their place: a branch
-        before and one after the break (`broken`), or a smooth law with as many equations as `helpers`.
+        A target without switches moves as it is. One with switches goes in a plan through `events` in a given
+        order, between which it is smooth.
 
         Raises
         ------
@@ -88,11 +92,20 @@ class Target(ABC):
                 f"the target {type(self).__name__} has switches, which a plan cannot have: give it a method "
                 "`smooth`, or plan for FreeMass, RigidWall, Nail or Board"
             )
-        return self.derivative(state, force, parameters), []
+        return self.velocity(state, parameters), self.derivative(state, force, parameters)
 
-    def breaking(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Of a target that `breaks`: below zero until it does, zero when it does; of order 1."""
-        raise NotImplementedError(f"{type(self).__name__} does not break")
+    def event(
+        self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
+    ) -> Any:
+        """Zero where a phase ends, of those that `events` end; of order 1.
+
+        late : by how much [s] it has lasted longer than it has to.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no events")
+
+    def lasting(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
+        """What is not below zero while a phase lasts, one expression of order 1 or none."""
+        return []
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         """What the blow has brought, from the state at separation; named by `results`."""
@@ -116,13 +129,14 @@ class Target(ABC):
             "switches": self.switches(state, force, numbers),
             "result": self.result(state, numbers),
         }
-        helpers = [ca.SX.sym(f"helper_{i}") for i in range(len(self.helpers))]
-        if self.helpers or self.breaks:
-            for broken in (False, True):
-                moves, rows = self.smooth(state, force, helpers, broken, numbers)
-                parts[f"smooth, {'after' if broken else 'before'} a break"] = [*moves, *rows]
-        if self.breaks:
-            parts["breaking"] = [self.breaking(state, numbers)]
+        for k, phase in enumerate(self.phases if self.events else ()):
+            speed, rates = self.smooth(state, force, k, numbers)
+            parts[phase] = [
+                speed,
+                *rates,
+                *([self.event(state, force, ca.SX.sym("T"), k, numbers)] if k < len(self.events) else []),
+                *self.lasting(state, force, k, numbers),
+            ]
         made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
         return (*made, f"results: {', '.join(self.results)}")
 
@@ -170,6 +184,7 @@ class RigidWall(Target):
     """A wall that never moves: it takes impulse, but no energy. It has no state and no numbers."""
 
     n_states = 0
+    stays: ClassVar[bool] = True
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
         return 0.0

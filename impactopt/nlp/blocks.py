@@ -53,12 +53,12 @@ def sizes(c: StanceCoordinates, target: Target, block: str) -> dict[str, int]:
             "target": target.n_states,
             "travel": 1,
             "impulse": 1,
-            "helpers": len(target.helpers),
             "rate": 1,
             "penetration": 1,
             "separation": 1,
             "speed": 1,
-            "breaking": int(target.breaks),
+            "event": int(bool(target.events)),
+            "lasting": int(bool(target.events)),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
         "join": {"travel": 1},
@@ -197,50 +197,58 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
 def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -> BlockExpression:
     """Contact law and target at one collocation point (equations 14 to 17, integrated).
 
-    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; the target's state and its slope (in s); its
-        helpers; travel x of its surface, x' and x1 as d, u and d1; slope p' of the impulse.
-    p = point (3), normal (3), 1 in restitution else 0, 1 after the break else 0, the law's parameters, the
-        target's.
+    z = y0; d1, T1, d, T, u as in :func:`collision`; f [N]; the target's state and its slope (in s); travel x
+        of its surface, x' and x1 as d, u and d1; slope p' of the impulse.
+    p = point (3), normal (3), 1 in restitution else 0, the law's parameters, the target's; of a target with
+        events before them, of each phase, 1 in it else 0, and how long [s] it has to last.
     out = (f - law) / 100 N, state' - T d(state)/dt over its typical size, x' - speed [m/s], p' - T f [N s],
-        rows of the helpers, approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N,
-        speed of the target's surface [m/s], what is zero at the break.
+        approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N, speed of the target's
+        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts.
     """
     ny, n = c.ny, target.n_states
     y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
     state, slope = ca.SX.sym("state", n), ca.SX.sym("slope", n)
-    helpers = ca.SX.sym("helpers", len(target.helpers))
     x, rate_x, x1, rate_p = (ca.SX.sym(s) for s in ("x", "rate_x", "x1", "rate_p"))
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("n", 3)
-    restituting, broken = ca.SX.sym("restituting"), ca.SX.sym("broken")
+    restituting, phases = ca.SX.sym("restituting"), range(len(target.phases) if target.events else 0)
+    within, shortest = ca.SX.sym("within", len(phases)), ca.SX.sym("shortest", min(len(phases), 1))
     of_law = ca.SX.sym("law", len(law.parameters))
     of_target = ca.SX.sym("target", len(target.parameters))
     q, vel, _ = c.upper_motion(y0 + T1 * d1 + T * d, u, ca.SX.zeros(ny))
     place, twist, _ = striker_kinematics(c, striker)(q, vel, ca.SX.zeros(c.rb.nv))
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
-    speed = ca.SX(target.velocity(state, numbers))
+    pieces = [target.smooth(state, f, k, numbers) for k in phases or (0,)]
+    speed, moves = ca.SX(pieces[0][0]), ca.vertcat(ca.SX(0, 1), *pieces[0][1])
+    event = lasting = ca.SX(0, 1)
+
+    def of_phase(parts: list[list[Any]]) -> Any:
+        return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
+
+    if target.events:
+        speed, moves = of_phase([[v] for v, _ in pieces]), of_phase([rates for _, rates in pieces])
+        event = of_phase(
+            [[target.event(state, f, T - shortest, k, numbers)] for k in range(len(target.events))]
+        )
+        lasting = of_phase([target.lasting(state, f, k, numbers) for k in phases])
     penetration = ca.dot(normal, place - point) - (T1 * x1 + T * x)
     rate = ca.dot(normal, twist) - speed
     compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
-    before, rows = target.smooth(state, f, helpers, False, numbers)
-    after, _ = target.smooth(state, f, helpers, True, numbers) if target.breaks else (before, rows)
-    moves = ca.vertcat(ca.SX(0, 1), *before) * (1 - broken) + ca.vertcat(ca.SX(0, 1), *after) * broken
-    breaking = [target.breaking(state, numbers)] if target.breaks else []
     out = {
         "law": (f - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE,
         "target": (slope - T * moves) / np.array(typical_state(target)),
         "travel": rate_x - speed,
         "impulse": rate_p - T * f,
-        "helpers": ca.vertcat(ca.SX(0, 1), *rows),
         "rate": rate,
         "penetration": penetration / DEPTH_SCALE,
         "separation": ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE,
         "speed": speed,
-        "breaking": ca.vertcat(ca.SX(0, 1), *breaking),
+        "event": event,
+        "lasting": lasting,
     }
-    z = [y0, d1, T1, d, T, u, f, state, slope, helpers, x, rate_x, x1, rate_p]
-    return make_block(z, [point, normal, restituting, broken, of_law, of_target], out)
+    z = [y0, d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
+    return make_block(z, [point, normal, restituting, within, shortest, of_law, of_target], out)
 
 
 def typical_state(target: Target) -> tuple[float, ...]:
@@ -363,7 +371,7 @@ def builders(
     }
     if c.legs:
         hit["coasting"] = lambda: coasting(c)
-    if target.breaks:
+    if target.events:
         hit["join"] = join
     return {
         "node": lambda: node(c),

@@ -1,7 +1,7 @@
 """The contact's phases in the program: Radau IIA collocation of the whole equation of motion.
 
-Compression and restitution, each of which is smooth; the break of a target that breaks parts compression in
-two. One contact for the expected target, one for each scenario. They share the state at contact, the
+Compression and restitution, each of which is smooth, or the phases of a target with events. One contact for
+the expected target, one for each scenario. They share the state at contact, the
 feed-forward and the servo; durations, motion, force and wrenches are each one's own.
 """
 
@@ -16,16 +16,28 @@ from impactopt.errors import InputError
 from impactopt.nlp.blocks import FORCE_SCALE, typical_state
 from impactopt.nlp.guess import blow, effective_mass
 from impactopt.nlp.layout import Affine, Array, Group
-from impactopt.nlp.mesh import Stage, contact_phases
+from impactopt.nlp.mesh import Stage
 from impactopt.nlp.rows import Index, Measure, Place, along, by_leg, percent, rates
 from impactopt.plan import PlannedCollision, total_ground_wrench
+from impactopt.problem import ImpactProblem
 from impactopt.scenario import Scenario
 
 if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
 
+# of the shortest compression that each of the two may last which an event makes of it, and the first of them
+# where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
+SHARE, AT_ONCE = 0.1, 0.05
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
-SHARE = 0.1  # of the shortest compression that each of the two may last which a break makes of it
+
+
+def shortest_phases(problem: ImpactProblem) -> list[float]:
+    """How long [s] each phase of the contact lasts at least."""
+    shortest, target = problem.contact_duration[0], problem.target
+    shares = [SHARE if target.events else 1.0] * (len(target.phases) - 1) + [1.0]
+    if target.at_once:
+        shares[0] = AT_ONCE
+    return [share * shortest for share in shares]
 
 
 class Collision:
@@ -40,8 +52,8 @@ class Collision:
     ) -> None:
         self.t, self.scenario, self.stages = t, scenario, t.stages
         p, c = t.problem, t.coordinates
-        phases = contact_phases(p.target.breaks)
-        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in range(len(phases))]
+        phases = range(len(p.target.phases))
+        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in phases]
         named = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.law, self.target = p.law.parameters, p.target.parameters
@@ -54,10 +66,10 @@ class Collision:
         def add(name: str, size: int, **options: Any) -> Group:
             return t.layout.add(named + name, n, size, **options)
 
-        shortest, longest = p.contact_duration
-        bounds = (SHARE * shortest if p.target.breaks else shortest, longest), p.contact_duration
+        shortest, longest = shortest_phases(p), p.contact_duration[1]
         self.T = [
-            t.duration(f"{named}{name} duration", bounds[int(name == "restitution")], 0.01) for name in phases
+            t.duration(f"{named}{name} duration", (least, longest), 0.01)
+            for name, least in zip(p.target.phases, shortest, strict=True)
         ]
         self.coast_legs = add("coasting legs", t.nl, labels=c.leg_labels)
         self.coast_rates = add("coasting leg rates", t.nl, labels=c.leg_labels)
@@ -66,16 +78,14 @@ class Collision:
         self.legs = add("collision legs", t.nl, **t.of_legs)
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
-        least = 0.0 if p.target.switching or t.law_pulls else np.where(last, 0.0, -np.inf)
+        least = 0.0 if p.target.events or t.law_pulls else np.where(last, 0.0, -np.inf)
         most = np.where(last, 0.0, np.inf)
         self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
-        lower, helpers = (0.0 if p.target.forward_only else -np.inf), p.target.helpers
-        self.state = add("target state", p.target.n_states, scale=typical_state(p.target), lower=lower)
-        self.helpers = add("target", len(helpers), lower=0.0, labels=helpers)
+        self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1)
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", t.nw, **t.of_wrenches)
-        joined = int(p.target.breaks)
+        joined = int(bool(p.target.events))
         self.joined = t.layout.add(f"{named}travel in compression", joined, t.ny, labels=c.labels)
         self.joined_x = t.layout.add(f"{named}target travel in compression", joined, 1)
         wanted = int(after is not None)
@@ -104,6 +114,8 @@ class Collision:
         t, p, r = self.t, self.t.problem, self.t.robot
         y, u0, ff = t.contact_state[0], t.u0[0], t.feedforward[0]
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
+        phases = np.column_stack([np.eye(len(self.end)), shortest_phases(p)])
+        within = phases if p.target.events else phases[:, :0]
         gains = np.concatenate([r.kp, r.kd, r.torque_limit, t.units])
         coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
         for i, s in enumerate(self.stages):
@@ -114,13 +126,13 @@ class Collision:
             T, (T1, d1, x1) = self.T[s.phase][0], self._before(s.phase)
             coast, travel = [self.coast_legs[i], self.coast_rates[i]], [d1, T1, self.d[i], T]
             hit = [self.legs[i], self.f[i], self.w[i]]
-            after, broken = float(s.phase > 0), float(p.target.breaks and s.phase > 0)
+            after = float(s.phase > 0)
             coasting.append([y, u0, T1, T, *coast])
             coasting_p.append([s.place, after])
             collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
             collision_p.append(np.concatenate([p.normal, [s.place, after], gains]))
-            force.append([y, *travel, u, self.f[i], *state, self.helpers[i], *travelled, x1, given])
-            branch = [float(self._restitution(i)), broken]
+            force.append([y, *travel, u, self.f[i], *state, *travelled, x1, given])
+            branch = [float(self._restitution(i)), *within[s.phase]]
             numbers = [*self.law.values(), *self.target.values()]
             force_p.append([*p.point, *p.normal, *branch, *numbers])
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
@@ -129,12 +141,12 @@ class Collision:
         }
         if t.coordinates.legs:
             out["coasting"] = coasting, coasting_p
-        if p.target.breaks:
+        if p.target.events:
             out["join"] = self._join(), [np.zeros(0)] * (t.ny + 1)
         return out
 
     def _join(self) -> list[list[Affine]]:
-        """Slots of the block ``join``: ways to the break and on to the end of compression, as one."""
+        """Slots of the block ``join``: ways in the first two phases of three as one."""
         first, second = self.end[:2]
         times = self.T[0][0], self.T[1][0]
         ways = self.d[first], self.d[second], self.joined[0]
@@ -158,14 +170,14 @@ class Collision:
         """Variables that the rows of each stage determine, leg by leg; and step by step those that rows of
         elements do.
 
-        An element's travel comes first, by linear rows; last come the ways as one, if a target breaks.
+        An element's travel comes first, by linear rows; last come the ways as one, if there are three phases.
         """
         stages, last = range(len(self.stages)), self.end[-1]
         legs = [
             [leg for g in (self.coast_legs, self.coast_rates, self.legs) for leg in by_leg(g.index(i))]
             for i in stages
         ]
-        groups = (self.u, self.w, self.f, self.state, self.helpers, self.xt, self.p)
+        groups = (self.u, self.w, self.f, self.state, self.xt, self.p)
         steps = []
         for members in sorted({s.members for s in self.stages}):
             # the last force is given
@@ -185,17 +197,18 @@ class Collision:
             self._dynamics_rows(i, place, first)
         start, size = at["force"]
         part, where = self.t.parts("force"), self.suffix.lstrip(", ")
-        for term, component, k, name, measure in (
-            ("end of compression", "approach speed", self.end[-2], "rate", Measure("m/s", 1.0, "left")),
-            ("separation", "force", self.end[-1], "separation", Measure("N", FORCE_SCALE, "left")),
-        ):
-            self.t.equal(term, where, [component], start + k * size + part[name], measure)
-        if self.t.problem.target.breaks:
-            output = start + self.end[0] * size + part["breaking"]
-            self.t.equal("break", where, ["target"], output, percent("off"))
+        target, order = self.t.problem.target, percent("off")
+        if target.events:  # first, as they determine variables of their own
             names = [*self.t.coordinates.labels, "target"]
             outputs = at["join"][0] + np.arange(self.t.ny + 1)
             self.t.equal("travel in compression", where, names, outputs, along(names, "off"))
+        ends = [(name, "target", k, "event", order) for k, name in enumerate(target.events)]
+        if target.turns:
+            still = Measure("m/s", 1.0, "left")
+            ends.append(("end of compression", "approach speed", len(ends), "rate", still))
+        ends.append(("separation", "force", len(ends), "separation", Measure("N", FORCE_SCALE, "left")))
+        for term, component, k, name, measure in ends:
+            self.t.equal(term, where, [component], start + self.end[k] * size + part[name], measure)
 
     def _place(self, s: Stage) -> Place:
         time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
@@ -258,10 +271,9 @@ class Collision:
         t.equal("target's motion", place, states, first + part["target"], of_size)
         t.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         t.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
-        t.equal("target's law", place, target.helpers, first + part["helpers"], of_size)
         if i in self.end:
             return
-        if t.law_switches and target.switching:
+        if t.law_switches and target.events:
             back = self._restitution(i)
             t.rows.add(
                 term="approach speed",
@@ -272,14 +284,15 @@ class Collision:
                 upper=0.0 if back else np.inf,
                 measure=Measure("m/s", 1.0, "the other way"),
             )
-        if target.breaks and self.stages[i].phase == 0:
+        k, still = self.stages[i].phase, [0.0] * target.n_states
+        if target.lasting(still, 0.0, k):
             t.rows.add(
-                term="break",
+                term=target.events[min(k, len(target.events) - 1)],
                 place=place,
                 components=["target"],
-                outputs=first + part["breaking"],
-                upper=0,
-                measure=percent("too early"),
+                outputs=first + part["lasting"],
+                lower=0,
+                measure=percent("out of turn"),
             )
 
     def link(self, start: tuple[Affine, Affine, Affine]) -> list[list[Affine]]:
@@ -319,11 +332,10 @@ class Collision:
         self.u.write(x, found.speed[:, None] * rates)
         self.d.write(x, d)
         self.state.write(x, found.state)
-        self.helpers.write(x, found.helpers)
         self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
         self.p.write(x, found.impulse[:, None])
-        if p.target.breaks:
+        if p.target.events:
             share = times[:2, None] / before[2]
             self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
             self.joined_x.write(x, (share * self.xt.read(x)[self.end[:2]]).sum(axis=0))

@@ -12,13 +12,14 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.nail import CREEP, Nail
+from impactopt.contact.nail import Nail
 from impactopt.contact.targets import FreeMass, Target
 from impactopt.coordinates import StanceCoordinates
 from impactopt.nlp.layout import Array
 
 LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
-FASTER, TRIES = 1.3, 12  # the blow is made harder until a board breaks
+AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as long
+FASTER, TRIES = 1.3, 12  # the blow is made harder until a board breaks, or a nail moves
 # a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
 # robot's; and the shortest blow [s] that it stands for
 PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
@@ -29,7 +30,7 @@ class Blow:
     """A contact at k collocation points. ``durations`` [s] of its phases; the others at the points:
 
     speed (k,) of the point mass over that at contact, way (k,) [s]: its integral in the phase so far; force
-    (k,) [N]; impulse (k,) [N s]; state (k, n), helpers (k, h), travel (k,) [m] of the target in the phase.
+    (k,) [N]; impulse (k,) [N s]; state (k, n), travel (k,) [m] of the target in the phase.
     """
 
     durations: Array
@@ -38,7 +39,6 @@ class Blow:
     force: Array
     impulse: Array
     state: Array
-    helpers: Array
     travel: Array
 
 
@@ -62,17 +62,17 @@ def effective_mass(
 def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:
     """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
 
-    A target that breaks is met as fast as it takes to break it.
+    A target with events is met as fast as it takes for all of them to happen.
     """
     ends: Array | None = None
-    for _ in range(TRIES if target.breaks else 1):
+    for _ in range(TRIES if target.events else 1):
         time, rows = _histories(law, target, mass, speed)
         ends = _phases(time, rows, target)
         if ends is not None:
             break
         speed *= FASTER
     if ends is None:  # somewhere, where the solver has to mend it
-        ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.breaks else [0.0, 0.5, 1.0])
+        ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.events else [0.0, 0.5, 1.0])
     at = ends[phase] + place * np.diff(ends)[phase]
 
     def sample(values: Array) -> Array:
@@ -83,13 +83,6 @@ def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Arra
 
     x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
     state = sample(rows[3:-1]) if target.n_states else np.zeros((len(at), 0))
-    helpers = np.zeros((len(at), len(target.helpers)))
-    if isinstance(target, Nail):  # in the smooth law's words
-        resistance = target.resistance + target.hardening * (target.depth + state[:, 1])
-        unused = np.maximum(1 - np.interp(at, time, force) / resistance, CREEP)
-        moves = state[:, 0] > np.sqrt(CREEP)
-        state[:, 0] = np.where(moves, state[:, 0], CREEP / unused)
-        helpers[:, 0] = CREEP / state[:, 0]
     if isinstance(target, FreeMass) and ends[-1] > SOFT:
         return push(target.mass, phase, place)
     return Blow(
@@ -99,7 +92,6 @@ def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Arra
         force=np.interp(at, time, force),
         impulse=mass * (v[0] - np.interp(at, time, v)),
         state=state,
-        helpers=helpers,
         travel=since(travel),
     )
 
@@ -123,7 +115,6 @@ def push(mass: float, phase: Array, place: Array) -> Blow:
         force=force,
         impulse=force * elapsed,
         state=PUSHED * fraction[:, None],
-        helpers=np.zeros((len(phase), 0)),
         travel=PUSHED * ramp,
     )
 
@@ -151,11 +142,18 @@ def _histories(law: ContactLaw, target: Target, mass: float, speed: float) -> tu
 
 
 def _phases(time: Array, rows: Array, target: Target) -> Array | None:
-    """Start and ends of the phases [s]; None if the target should break in compression, and did not."""
+    """Start and ends of the phases [s]; None if the target's events have not happened in their order."""
     deepest = int(np.argmax(rows[0] - rows[2]))
     ends = [0.0, time[deepest], time[-1]]
-    if target.breaks:
-        after = [k for k in range(deepest) if float(target.breaking(rows[3:-1, k])) >= 0]
+    if isinstance(target, Nail):
+        moves = np.flatnonzero(rows[3] > 0)
+        if not moves.size:
+            return None
+        ends = [0.0, max(time[moves[0] - 1], AT_ONCE), time[moves[-1]], time[-1]]
+    elif target.events:
+        after = [
+            k for k in range(deepest) if float(target.event(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
+        ]
         if not after:
             return None
         ends.insert(1, time[after[0]])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.contact.targets import Target
 from impactopt.motion import Radau
 from impactopt.problem import ImpactProblem
 
@@ -17,7 +19,7 @@ Array = NDArray[np.float64]
 class Stage:
     """One collocation point of the collision."""
 
-    phase: int  # the last one is restitution
+    phase: int
     phase_name: str
     place: float  # s in the phase
     weights: Array  # (stages,) of this element's stages in u', d u/ds
@@ -32,24 +34,15 @@ class Stage:
         return f"{self.phase_name}, {100 * self.place:.0f} %"
 
 
-def contact_phases(breaks: bool) -> tuple[str, ...]:
-    """Names of the pieces of a contact in each of which all is smooth; ``breaks``: the target does."""
-    return ("compression", *(("compression after the break",) if breaks else ()), "restitution")
-
-
 def collision_mesh(
-    elements: tuple[tuple[float, ...], tuple[float, ...]], radau: Radau, *, breaks: bool = False
+    elements: Sequence[tuple[float, ...]], radau: Radau, names: tuple[str, ...] = Target.phases
 ) -> list[Stage]:
-    """Stages of the contact's phases; ``elements``: lengths of those of compression and of restitution, as
-    fractions of a phase.
-    """
-    names = contact_phases(breaks)
+    """Stages of the contact's phases; ``elements``: their lengths, as fractions of a phase."""
     inverse = np.linalg.inv(radau.a)
     stages: list[Stage] = []
     for phase, name in enumerate(names):
-        lengths = elements[int(name == "restitution")]
         s = 0.0
-        for e, h in enumerate(lengths):
+        for e, h in enumerate(elements[phase]):
             first = len(stages)
             members = tuple(range(first, first + len(radau.c)))
             for i, c in enumerate(radau.c):
@@ -71,12 +64,17 @@ def collision_mesh(
 
 
 def contact_mesh(problem: ImpactProblem) -> list[Stage]:
-    """Stages of the contact of a problem; elements are halved if its target sticks, slips or breaks."""
-    target, elements = problem.target, problem.collision_elements
-    if target.switching:
-        first, second = (tuple(h / 2 for h in lengths for _ in range(2)) for lengths in elements)
-        elements = first, second
-    return collision_mesh(elements, Radau.of_stages(problem.collision_stages), breaks=target.breaks)
+    """Stages of the contact of a problem; elements are halved if its target has events.
+
+    Where an event may come at once, the phase before it is one element.
+    """
+    target, (first, last) = problem.target, problem.collision_elements
+    if target.events:
+        first, last = (tuple(h / 2 for h in lengths for _ in range(2)) for lengths in (first, last))
+    before = [first] * (len(target.phases) - 1)
+    if target.at_once:
+        before[0] = (1.0,)
+    return collision_mesh([*before, last], Radau.of_stages(problem.collision_stages), target.phases)
 
 
 def with_middles(breaks: Array) -> Array:

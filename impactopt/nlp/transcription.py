@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from impactopt.codegen import cached, model_hash
 from impactopt.coordinates import StanceCoordinates
@@ -21,34 +20,20 @@ from impactopt.extra_terms import TorqueRate
 from impactopt.motion import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.at_contact import ContactProgram
+from impactopt.nlp.clearance import add_clearance
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.lanes import in_lanes
 from impactopt.nlp.layout import Affine, Array, Group, add, stack
 from impactopt.nlp.mesh import with_middles
 from impactopt.nlp.objective import Prices, motion_prices
-from impactopt.nlp.rows import (
-    Index,
-    Measure,
-    Place,
-    Rank,
-    along,
-    by_leg,
-    degrees,
-    millimetres,
-    percent,
-    rates,
-)
+from impactopt.nlp.rows import Index, Measure, Place, Rank, along, by_leg, degrees, percent, rates
 from impactopt.nlp.structured import derivative_functions
 from impactopt.objectives import Effort
 from impactopt.plan import Plan
 from impactopt.problem import ImpactProblem
 from impactopt.statics import static_wrenches
 from impactopt.support import support_polygon
-
-# the striking point stays this far behind the target [m], and less only at this speed [m/s] towards it: what
-# hovers at the plane would touch it between the nodes
-CLEARANCE, HASTE = 0.02, 0.04
 
 
 def block_functions(
@@ -99,7 +84,7 @@ class Transcription(ContactProgram):
         self._variables()
         self._swing_and_follow()
         self._contact_rows()
-        self._clearance()
+        add_clearance(self)
         self._collision_rows()
         self._after()
         self._finish(problem.terms, problem.objectives)
@@ -271,31 +256,6 @@ class Transcription(ContactProgram):
                     upper=0,
                     measure=fast,
                 )
-
-    def _clearance(self) -> None:
-        """The hand does not touch the target before contact."""
-        p = self.problem
-        nodes = self.swing_nodes[:-1]
-        instances = [[self.at(self.swing_control, self.swing_breaks, s)[0]] for s in nodes]
-        at = self.add_block("approach", instances, p.normal)
-        plane, ahead = float(p.normal @ p.point), float(np.mean(p.swing.duration))
-        nearest = min(CLEARANCE, self._start_gap())
-        for i, s in enumerate(nodes):
-            self.rows.add(
-                term="no touch before contact",
-                place=self.swing_place(s),
-                components=[p.striker],
-                outputs=np.array([at + i]),
-                upper=plane - min(nearest, HASTE * (1 - s) * ahead),
-                measure=millimetres("too near"),
-            )
-
-    def _start_gap(self) -> float:
-        """How far [m] behind the target's plane the striking point starts: it may stay as near as that."""
-        p, c = self.problem, self.coordinates
-        pin.framesForwardKinematics(c.model, c.data, p.start_posture)
-        at = c.data.oMf[c.model.getFrameId(f"striker:{p.striker}")].translation
-        return max(float(p.normal @ (p.point - at)), 0.0)
 
     def _after(self) -> None:
         """What comes after contact: the follow-through starts there, and the robot keeps its balance."""

@@ -319,6 +319,14 @@ def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -
     assert errors["implicit", 1e-7] < 1e-4 and [r["default"] for r in rows if "default" in r].count(True) == 1
 
 
+def test_the_humanoids_of_scaling_strike_with_their_hand() -> None:
+    scenes = scaling.humanoid_scenes(scaling.HUMANOIDS, quiet)
+    assert [scene.name for scene in scenes] == list(scaling.HUMANOIDS)
+    for scene in scenes:
+        assert len(scene.case.robot.soles) == 2 and scene.case.striker == "right_hand"
+    assert scaling.humanoid_scenes(("no such robot",), quiet) == []
+
+
 def test_a_hand_that_goes_away_is_frozen_and_no_more() -> None:
     for one in (scaling.tip_scene("chain", 4), scaling.tip_scene("tree", 8)):
         model = one.model(SDC)

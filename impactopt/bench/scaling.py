@@ -27,10 +27,10 @@ from impactopt.collision import SDC
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
 from impactopt.plotting.scaling import scaling_picture
-from impactopt.presets import robot_names
 
 CHAINS = (2, 4, 8, 16, 24, 32, 48, 64, 100)
 TREES = (8, 16, 32, 48, 64, 80, 100)  # of four limbs
+HUMANOIDS = ("standin", "talos", "g1")
 QUICK_CHAINS, QUICK_TREES = (2, 8, 16, 24), (8, 16, 32)
 STEPS = (5e-4, 2.5e-4, 1e-4, 5e-5, 1e-5)  # [s] of Taylor's steps and the paper's
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9)  # of the steps that find their own length
@@ -77,7 +77,7 @@ def run(
     *,
     chains: Sequence[int] | None = None,
     trees: Sequence[int] | None = None,
-    humanoids: Sequence[str] | None = None,
+    humanoids: Sequence[str] = HUMANOIDS,
     scene: Scene | None = None,
     steps: Sequence[float] = STEPS,
     tolerances: Sequence[float] = TOLERANCES,
@@ -88,13 +88,12 @@ def run(
 ) -> Report:
     """Rows over "dof", "step" and "batch", and the exponents of cost in the number of joints.
 
-    humanoids : presets; None: all that are installed.  scene : of steps and batches.
+    humanoids : presets; those that are not installed are left out.  scene : of steps and batches.
     workers : processes that compile.
     quick : no more than 32 joints, the stand-in only, and a few steps.
     """
     chains = chains or (QUICK_CHAINS if quick else CHAINS)
     trees = trees or (QUICK_TREES if quick else TREES)
-    humanoids = robot_names() if humanoids is None else humanoids
     if quick:
         humanoids, steps, tolerances = humanoids[:1], steps[1:3], tolerances[:2]
     scene = scene or Scene.of("standin")

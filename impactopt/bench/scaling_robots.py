@@ -42,7 +42,7 @@ def tip_scene(kind: str, n: int) -> Scene:
 
 
 def humanoid_scenes(names: Sequence[str], say: Say) -> list[Scene]:
-    """Presets that half-sit and strike with the right hand; one whose files are not installed is left out,
+    """Robots that half-sit and strike with the right hand; one whose files are not installed is left out,
     and named."""
     scenes = []
     for name in names:

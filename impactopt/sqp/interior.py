@@ -187,7 +187,8 @@ class InteriorRun(Run):
         met = elastic is None or elastic.largest() <= self.options.violation_tolerance
         if met and self._sigma:
             return Status.SOLVED
-        return self._change_aim(met=met)
+        near = bool(self._sigma) and self.point.max_violation <= _NEAR  # the price was too low, it may be
+        return self._change_aim(met=met or near)
 
     def _restored(self) -> bool:
         """Whether the violation, which alone counts, is so small that hard rows get further with it."""

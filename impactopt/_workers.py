@@ -31,6 +31,7 @@ _Shared = TypeVar("_Shared")
 _Input = TypeVar("_Input")
 _Output = TypeVar("_Output")
 
+AWAKE = 1.0  # [s]: the longest that Ctrl-C is overlooked for which comes between two looks and the wait
 STARTS = 3  # that may fail one after another, if it was a signal that ended them
 _LINUX = sys.platform.startswith("linux")
 _PR_SET_PDEATHSIG = 1  # of its prctl
@@ -116,7 +117,7 @@ def each_on_workers(
             while waiting is not None and len(crew) < workers:
                 crew.append(_Worker(context, function, shared, waiting))
                 waiting = task()
-            pipes: Any = wait([worker.pipe for worker in crew])
+            pipes: Any = wait([worker.pipe for worker in crew], timeout=AWAKE)
             for worker in [w for w in crew if w.pipe in pipes]:
                 try:
                     index, result = worker.pipe.recv()

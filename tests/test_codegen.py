@@ -155,7 +155,7 @@ def test_long_functions_are_compiled_without_optimization(
     y = ca.MX.sym("y", 3)
     outer = ca.Function("outer", [y], [inner(y)])
     functions = cached("mixed", (), lambda: [outer, ca.Function("brief", [x], [2 * x])])
-    assert compilations == ["-O0", "-O1"]
+    assert sorted(compilations) == ["-O0", "-O1"]  # two at a time
     np.testing.assert_allclose(functions["outer"](X), outer(X), rtol=1e-14)
 
 

@@ -259,13 +259,17 @@ def test_one_worker_is_this_process() -> None:
 def run_script(folder: Path, text: str) -> subprocess.Popen[str]:
     script = folder / "script.py"
     script.write_text(textwrap.dedent(text), encoding="utf-8")
-    return subprocess.Popen(
-        [sys.executable, str(script)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    try:
+        return subprocess.Popen(
+            [sys.executable, str(script)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_script_without_a_guard_is_told_of_it(tmp_path: Path) -> None:

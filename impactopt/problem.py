@@ -77,7 +77,7 @@ class ImpactProblem:
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
     contact_duration : bounds [s] of each of compression (until a nail stands) and restitution; what a break
-        or a start makes two of may each be shorter (`Target.shares`).
+        or a start makes two of may each be shorter.
     collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
         sum to 1; those of compression before and after a break or a start. They are halved for a nail and a
         board.

@@ -18,8 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from impactopt.program import (
-    Callback,
-    NonlinearProgram,
     Status,
     Vector,
     complementarity,
@@ -31,9 +29,8 @@ from impactopt.sqp.condense import Determined
 from impactopt.sqp.elastic import Elastic
 from impactopt.sqp.linesearch import Filter, Progress
 from impactopt.sqp.newton import borrow, give_back
-from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point
-from impactopt.sqp.run import Run
+from impactopt.sqp.run import Run, Task
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
@@ -71,22 +68,15 @@ class InteriorRun(Run):
     Rows are those that `Condenser` leaves; g - s = 0 for an inequality row with its slack s.
     """
 
-    def __init__(
-        self,
-        program: NonlinearProgram,
-        options: SQPOptions,
-        callback: Callback | None,
-        x: Vector,
-        y: Vector,
-        z: Vector,
-    ):
-        super().__init__(program, options, callback, x, y, z)
-        self._determined: Sequence[Determined] = getattr(program, "determined", ())
-        self._sequence: Vector | None = getattr(program, "sequence", None)
+    def __init__(self, task: Task):
+        super().__init__(task)
+        options = self.options
+        self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
+        self._sequence: Vector | None = getattr(task.program, "sequence", None)
         self._sigma, self._price = 1.0, options.price  # of the objective; of elastic rows
         self._changes = 0
         self._began = 0.0  # violation where only that began to count
-        self._warm = bool(np.any(y) or np.any(z))
+        self._warm = bool(np.any(self.y) or np.any(self.z))
         self._mu = options.barrier_warm if self._warm else options.barrier
 
     # ------------------------------------------------------------------ start
@@ -164,13 +154,10 @@ class InteriorRun(Run):
             error = self._error(0.0, residual)
             if self.report.iteration(self.point, self._kkt, note):
                 return Status.INTERRUPTED
-            if error <= self.options.kkt_tolerance:
+            if error <= self.options.kkt_tolerance or self._restored():
                 verdict = self._verdict()
                 if verdict is not None:
                     return verdict
-                continue
-            if self._restored():
-                self._change_aim(met=True)
                 continue
             if self._out_of_time():
                 return Status.TIME_LIMIT
@@ -182,13 +169,15 @@ class InteriorRun(Run):
         return Status.ITERATION_LIMIT
 
     def _verdict(self) -> Status | None:
-        """At a solution: the end, unless rows are violated, or only the violation counted."""
+        """At a solution, or where rows are restored: the end, unless rows are violated, or only the violation
+        counted.
+        """
         elastic = self._elastic
         met = elastic is None or elastic.largest() <= self.options.violation_tolerance
         if met and self._sigma:
             return Status.SOLVED
-        near = bool(self._sigma) and self.point.max_violation <= _NEAR  # the price was too low, it may be
-        return self._change_aim(met=met or near)
+        near = _NEAR if self._sigma else _RESTORED  # the price may only have been too low
+        return self._change_aim(met=met or self.point.max_violation <= near)
 
     def _restored(self) -> bool:
         """Whether the violation, which alone counts, is so small that hard rows get further with it."""

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 from impactopt.program import Callback, NonlinearProgram, Status, Vector
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import TimedProgram
 from impactopt.sqp.report import Report
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Task:
+    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds."""
+
+    program: NonlinearProgram
+    options: SQPOptions
+    callback: Callback | None
+    x: Vector
+    y: Vector
+    z: Vector
 
 
 class Run(ABC):
@@ -18,19 +31,11 @@ class Run(ABC):
     point : the last iterate. y (m,), z (n,) : multipliers of its rows and bounds.
     """
 
-    def __init__(
-        self,
-        program: NonlinearProgram,
-        options: SQPOptions,
-        callback: Callback | None,
-        x: Vector,
-        y: Vector,
-        z: Vector,
-    ):
-        self.report = Report(program, options.violation_tolerance, callback)
-        self.program, self.options = TimedProgram(program), options
-        self.point = self.program.unknown(x)
-        self.y, self.z = y, z
+    def __init__(self, task: Task):
+        self.report = Report(task.program, task.options.violation_tolerance, task.callback)
+        self.program, self.options = TimedProgram(task.program), task.options
+        self.point = self.program.unknown(task.x)
+        self.y, self.z = task.y, task.z
 
     @abstractmethod
     def iterate(self) -> Status:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from impactopt.program import (
-    Callback,
-    NonlinearProgram,
     Status,
     Vector,
     complementarity,
@@ -19,10 +17,9 @@ from impactopt.program import (
 )
 from impactopt.sqp.hessian import QuadraticModel, make_hessian
 from impactopt.sqp.merit import Filter, Merit
-from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.point import Point
 from impactopt.sqp.qp import make_qp_solver
-from impactopt.sqp.run import Run
+from impactopt.sqp.run import Run, Task
 from impactopt.sqp.subproblem import Step, Subproblem
 from impactopt.sqp.trust_region import TrustRegion
 
@@ -32,19 +29,12 @@ _ROUNDING = 1e-13  # changes of the merit function below this, relatively, are n
 class Sl1QPRun(Run):
     """One solve. Between iterations: the point, its multipliers, the trust region, the merit function."""
 
-    def __init__(
-        self,
-        program: NonlinearProgram,
-        options: SQPOptions,
-        callback: Callback | None,
-        x: Vector,
-        y: Vector,
-        z: Vector,
-    ):
-        super().__init__(program, options, callback, x, y, z)
+    def __init__(self, task: Task):
+        super().__init__(task)
+        options = self.options
         self.hessian = make_hessian(self.program, options)
         self.subproblem = Subproblem(self.program, make_qp_solver(options.qp_solver))
-        self.subproblem.start_from(y, z)
+        self.subproblem.start_from(self.y, self.z)
         self.merit = Merit(price=options.price, price_max=options.price_max)
         self.filter = Filter()
         self.region = TrustRegion(options.radius, options.radius_max, options.levenberg, options.levenberg)

@@ -10,6 +10,7 @@ from impactopt.errors import check_array
 from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, check_program
 from impactopt.sqp.interior import InteriorRun
 from impactopt.sqp.options import SQPOptions
+from impactopt.sqp.run import Task
 from impactopt.sqp.sl1qp import Sl1QPRun
 
 
@@ -49,8 +50,9 @@ def solve_sqp(
     )
     x0 = np.clip(x0, program.x_lower, program.x_upper)
     options = options or SQPOptions()
+    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z)
     interior = options.qp_solver == "interior"
-    run = (InteriorRun if interior else Sl1QPRun)(program, options, callback, x0, y, z)
+    run = (InteriorRun if interior else Sl1QPRun)(task)
     # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
     with threadpool_limits(limits=1 if interior else None, user_api="blas"):
         try:

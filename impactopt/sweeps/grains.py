@@ -9,7 +9,8 @@ from impactopt.output import Record, plain, record_of, record_of_strike, summary
 from impactopt.planner import solve
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file import ProblemFile, problem_file_from_data
-from impactopt.strike import optimize_strike
+from impactopt.solution import Solution
+from impactopt.strike import StrikeSolution, optimize_strike
 from impactopt.sweeps.alarm import Alarm
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.units import Columns, Unit, Work
@@ -43,16 +44,19 @@ def _plan(work: Work, unit: Unit, alarm: Alarm) -> Rows:
         "callback": alarm.iteration,
         **_arguments(file, work),
     }
-    from_file: Any = {"problem": file.text, "problem_path": file.path}
+    solution: Solution | StrikeSolution
     if work.grain == "strike":
-        strike = optimize_strike(problem, **options)
-        kept = record_of_strike(strike, **from_file) if work.trajectories else None
-        summary = summary_of(strike) if kept is None else kept.summary
+        solution = optimize_strike(problem, **options)
     else:
         solution = solve(problem, start=work.start, **options)
-        kept = record_of(solution, **from_file) if work.trajectories else None
-        summary = summary_of(solution) if kept is None else kept.summary
-    return _row(summary, problem), {} if kept is None else {unit.first: kept}
+    if not work.trajectories:
+        return _row(summary_of(solution), problem), {}
+    from_file: Any = {"problem": file.text, "problem_path": file.path}
+    if isinstance(solution, StrikeSolution):
+        record = record_of_strike(solution, **from_file)
+    else:
+        record = record_of(solution, **from_file)
+    return _row(record.summary, problem), {unit.first: record}
 
 
 def _collide(work: Work, unit: Unit, alarm: Alarm) -> Rows:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise, zip_longest
 
 import casadi as ca
 
@@ -18,7 +19,8 @@ __all__ = ["LANES", "in_lanes"]
 LANES = 8  # of any CPU: where its vectors are narrower, the compiler takes several
 # a compiler takes more than linear time for a long function: it gets parts of so many operations
 _PART = 500
-_LEVEL = "-O1"
+# what runs one after the other stands one after the other
+_LEVEL = "-O1 -fno-toplevel-reorder"
 
 _OF_VECTORS = {
     ca.OP_ASSIGN: "{0}",
@@ -87,6 +89,11 @@ static void out_of_lanes(const vec *rows, int count, double *columns) {{
     for (int i = 0; i < LANES; i++)
       for (int k = 0; k < count; k++) columns[i * count + k] = rows[k][i];
 }}
+/* Code that runs once a call, megabytes of it, has left the caches by the next call: it is asked for a part
+   ahead, or the CPU would wait for every line of it. */
+static inline void fetch(const void *from, const void *to) {{
+  for (const char *line = from; line < (const char *)to; line += 64) __builtin_prefetch(line, 0, 2);
+}}
 #pragma GCC optimize ("no-tree-dse", "no-dse", "no-tree-fre", "no-tree-forwprop")
 """
 
@@ -116,7 +123,10 @@ def _code(function: ca.Function, kinds: set[int]) -> str:
         after.append(f"out_of_lanes(v + OUT_{i}, {function.nnz_out(i)}, res[{i}]);")
         at += function.nnz_out(i)
     parts = _parts(list(_operations(function)))
-    body = [*before, *(f"part_{k}(v);" for k in range(len(parts))), *after]
+    called = [f"part_{k}" for k in range(len(parts))]
+    ahead = [f"fetch({part}, {end});" for part, end in pairwise(called[1:])]
+    calls = [f"{fetch}\n  {part}(v);" for part, fetch in zip_longest(called, ahead, fillvalue="")]
+    body = [*before, *calls, *after]
     each = [f"IN_EACH_LANE(op_{kind}, {formula})" for kind, formula in _IN_EACH_LANE.items() if kind in kinds]
     return "\n".join([_HEAD, *each, *places, *parts, _interface(function, body, at)])
 

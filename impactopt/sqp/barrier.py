@@ -105,6 +105,13 @@ class Bounded:
             longest(high, np.where(self._has_upper, -step, 0.0), keep),
         )
 
+    def short_of_bounds(self, values: Vector, keep: float) -> Vector:
+        """New values, each moved to where it takes no more than a part `keep` of its distance to a bound."""
+        low, high = self._distances()
+        least = np.where(self._has_lower, self.values - keep * low, -np.inf)
+        most = np.where(self._has_upper, self.values + keep * high, np.inf)
+        return np.clip(values, least, most)
+
     def dual_step(self, step: Vector, mu: float, keep: float) -> tuple[Vector, Vector, float]:
         """Both multipliers' steps for a step of the values, eq. 12, and the longest part of them, eq. 15b."""
         low, high = self._distances()

@@ -13,7 +13,8 @@ Where no step is progress any more the rows become elastic: they may be violated
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,10 @@ _FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
 _CLOSE, _POWER = 30.0, 1.3
 _CLOSE_ELASTIC, _POWER_ELASTIC = 10.0, 1.5
 _PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing decides does not wander
+# a step is bent where it gets so many times as far, a slack giving so much of its distance to a bound, and
+# where no row is off, or will be, by more than this
+_LONGER, _SHORT, _BENT = 1.2, 0.9, 1.0
+_CRAWL, _PATIENCE = 1e-2, 20  # so many steps shorter than this, one after the other, are no progress either
 _COMPLEMENTARY = 1e-2  # of the tolerance: multiplier x distance to the bound at a solution
 _LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
@@ -74,7 +79,7 @@ class InteriorRun(Run):
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
         self._sequence: Vector | None = getattr(task.program, "sequence", None)
         self._sigma, self._price = 1.0, options.price  # of the objective; of elastic rows
-        self._changes = 0
+        self._changes = self._crawled = 0
         self._began = 0.0  # violation where only that began to count
         self._warm = bool(np.any(self.y) or np.any(self.z))
         self._mu = options.barrier_warm if self._warm else options.barrier
@@ -226,31 +231,55 @@ class InteriorRun(Run):
         at = self._start_of(step, residual)
         if self._filter is None:
             self._filter = Filter.around(at.theta)
-        length, trials, corrections = longest, 0, 0
+        found = self._bent(step, at, longest) or self._searched(step, at, longest, residual)
+        crawls = found is None or found.length < _CRAWL
+        self._crawled = self._crawled + 1 if crawls else 0
+        if found is None or self._crawled > _PATIENCE:
+            self._crawled = 0
+            return self._give_way(residual)
+        step, trial, length, note = found
+        self._filter.remember(at, length, trial.phi)
+        self._move(step, trial, length)
+        words = [f"barrier {self._mu:.0e}, step {length:.2g}", *note]
+        if self._newton.shift:
+            words.append(f"shift {self._newton.shift:.0e}")
+        if self._elastic is not None:
+            words.append(f"rows elastic at {self._elastic.price:g}")
+        return ", ".join(words)
+
+    def _bent(self, step: _Step, at: Progress, longest: float) -> _Found | None:
+        """The step as far as the bounds of variables let it, where it is slacks that stop it: each of them
+        stops by itself short of its own bound, and what its row is then off by is the next step's to mend.
+
+        Else one slack of thousands stops all others. Only while no row is far off: it is worth nothing where
+        rows are not about as linear as the step takes them to be.
+        """
+        length = self._x.longest(step.free, self._keep)
+        if self._elastic is not None or length <= _LONGER * longest or self.point.max_violation > _BENT:
+            return None
+        slack = self._s.short_of_bounds(self._s.values + length * step.slack, _SHORT)
+        trial = self._tried(self.point.x + length * step.d, slack)
+        fine = trial.point.finite and trial.point.max_violation <= _BENT
+        if not fine or not self._accepts(at, length, trial):
+            return None
+        return _Found(step, trial, length, ["bent"])
+
+    def _searched(self, step: _Step, at: Progress, longest: float, residual: Vector) -> _Found | None:
+        """Along the step, backwards from its longest part; None: no part of it is progress."""
+        assert self._filter is not None
+        length, trials = longest, 0
         while True:
             trials += 1
             trial = self._trial(step, length)
             if self._accepts(at, length, trial):
-                break
+                return _Found(step, trial, length, [])
             if trials == 1 and trial.theta >= at.theta and self.options.second_order_correction:
-                found, corrections = self._corrected(at, residual, trial, longest)
+                found = self._corrected(at, residual, trial, longest)
                 if found is not None:
-                    step, trial = found
-                    length = longest
-                    break
+                    return found
             length *= 0.5
             if length < self._filter.shortest(at):
-                return self._give_way(residual)
-        self._filter.remember(at, length, trial.phi)
-        self._move(step, trial, length)
-        words = [f"barrier {self._mu:.0e}, step {length:.2g}"]
-        if self._newton.shift:
-            words.append(f"shift {self._newton.shift:.0e}")
-        if corrections:
-            words.append(f"{corrections} corrections")
-        if self._elastic is not None:
-            words.append(f"rows elastic at {self._elastic.price:g}")
-        return ", ".join(words)
+                return None
 
     def _move(self, step: _Step, trial: _Trial, length: float) -> None:
         x, s, mu, keep = self._x, self._s, self._mu, self._keep
@@ -353,27 +382,28 @@ class InteriorRun(Run):
         return float(np.abs(residual[c.eliminated]).sum() + np.abs(rows).sum())
 
     def _trial(self, step: _Step, length: float) -> _Trial:
-        x = self.point.x + length * step.d
-        point, slack, mu = self.program.point(x), self._s.values + length * step.slack, self._mu
+        trial = self._tried(self.point.x + length * step.d, self._s.values + length * step.slack)
+        if self._elastic is None or not trial.point.finite:
+            return trial
+        p, n = self._elastic.moved(length)
+        theta = self._theta(self._residual(trial.point, trial.slack), p - n)
+        return replace(trial, theta=theta, phi=trial.phi + self._elastic.cost(p, n, self._mu))
+
+    def _tried(self, x: Vector, slack: Vector) -> _Trial:
+        """A point to try, but for what elastic rows add."""
+        point = self.program.point(x)
         if not point.finite:
             return _Trial(point, slack, np.inf, np.inf)
-        phi = self._phi(point, slack)
-        excess = None
-        if self._elastic is not None:
-            p, n = self._elastic.moved(length)
-            phi, excess = phi + self._elastic.cost(p, n, mu), p - n
-        return _Trial(point, slack, self._theta(self._residual(point, slack), excess), phi)
+        return _Trial(point, slack, self._theta(self._residual(point, slack)), self._phi(point, slack))
 
     def _accepts(self, at: Progress, length: float, trial: _Trial) -> bool:
         assert self._filter is not None
         return self._filter.accepts(at, length, trial.theta, trial.phi) and trial.point.differentiable
 
-    def _corrected(
-        self, at: Progress, residual: Vector, trial: _Trial, longest: float
-    ) -> tuple[tuple[_Step, _Trial] | None, int]:
+    def _corrected(self, at: Progress, residual: Vector, trial: _Trial, longest: float) -> _Found | None:
         """Second-order corrections: the step again, with what it left of the rows (section 2.4)."""
         if self._elastic is not None:
-            return None, 0
+            return None
         left, theta = residual, trial.theta
         for k in range(_CORRECTIONS):
             if not trial.point.finite:
@@ -382,11 +412,11 @@ class InteriorRun(Run):
             step = self._solve(left)
             trial = self._trial(step, self._longest(step))
             if self._accepts(at, longest, trial):
-                return (step, trial), k + 1
+                return _Found(step, trial, longest, [f"{k + 1} corrections"])
             if trial.theta > _WORSE * theta:
                 break
             theta = trial.theta
-        return None, 0
+        return None
 
     def _give_way(self, residual: Vector) -> str | Status:
         """What to do where no step is progress: let rows be violated at a price, or end."""
@@ -460,3 +490,12 @@ class _Trial:
     slack: Vector
     theta: float
     phi: float
+
+
+class _Found(NamedTuple):
+    """A step that is progress, the point that a part of it leads to, and what to note about it."""
+
+    step: _Step
+    trial: _Trial
+    length: float
+    note: list[str]

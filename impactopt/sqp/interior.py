@@ -45,7 +45,7 @@ _PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing
 # where no row is off, or will be, by more than this
 _LONGER, _SHORT, _BENT = 1.2, 0.9, 1.0
 _CRAWL, _PATIENCE = 1e-2, 20  # so many steps shorter than this, one after the other, are no progress either
-_COMPLEMENTARY = 1e-2  # of the tolerance: multiplier x distance to the bound at a solution
+_LEFT = 0.1  # times mu: what a step may leave of the equations for it
 _LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
 # violation from which on elastic rows are made hard again where they do not get further, or this part of what
@@ -339,7 +339,7 @@ class InteriorRun(Run):
         if self._elastic is not None:
             r[c.rows] = self._elastic.residual(r[c.rows])
         r[c.rows] += self._offsets
-        d, everything = self._newton.solve(q, r)
+        d, everything = self._newton.solve(q, r, _LEFT * self._mu)
         y = everything[c.rows]
         slack = (y[self._unequal] - self._s.slope(self._mu)) / self._stiffness
         if self._elastic is not None:
@@ -471,10 +471,12 @@ class InteriorRun(Run):
             off, left = max(off, self._elastic.off(self._y, mu)), self._elastic.residual(left)
         violation = max(float(np.abs(v).max(initial=0.0)) for v in (left, residual[c.eliminated]))
         off /= max(_LARGE, bounds / count) / _LARGE
-        return max(max(self._dual, slack) / scale, violation, off if mu else off / _COMPLEMENTARY)
+        if not mu:  # in units of the one tolerance that all is compared with
+            off *= self.options.kkt_tolerance / self.options.complementarity_tolerance
+        return max(max(self._dual, slack) / scale, violation, off)
 
     def _lower_barrier(self, residual: Vector) -> None:
-        least = _COMPLEMENTARY * self.options.kkt_tolerance / 11.0
+        least = self.options.complementarity_tolerance / 11.0
         hard = self._elastic is None
         close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
         while self._mu > least and self._error(self._mu, residual) <= close * self._mu:

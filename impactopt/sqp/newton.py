@@ -142,9 +142,11 @@ class NewtonSystem:
         self._kernels.add_products(self._products, c.J, self._weights[self._equal], values)
         return values
 
-    def solve(self, q: Vector, r: Vector) -> tuple[Vector, Vector]:
+    def solve(self, q: Vector, r: Vector, close: float = 0.0) -> tuple[Vector, Vector]:
         """The step (n,) and the new multipliers (m,) of all rows, for a gradient (n,) and the rows' residuals
         (m,): what they are off by, with weights.
+
+        close : what may be left of an equation.
         """
         c, w, equal = self.condenser, self._weights.copy(), self._equal
         w[equal] = 0.0
@@ -156,10 +158,10 @@ class NewtonSystem:
         hard[c.eliminated], hard[equal] = y[c.eliminated], y[equal]
         dual += self._pulled(hard)
         dual[c.free[self.held]] = 0.0
-        more_d, more_y, _, _ = self._respond(dual, left, w)
-        d, y = d + more_d, y + more_y
-        y += w * r
-        return d, y
+        if max(np.abs(dual).max(initial=0.0), np.abs(left).max(initial=0.0)) > close:
+            more_d, more_y, _, _ = self._respond(dual, left, w)
+            d, y = d + more_d, y + more_y
+        return d, y + w * r
 
     def _respond(self, g: Vector, r: Vector, w: Vector) -> tuple[Vector, Vector, Vector, Vector]:
         """Step for a gradient and the residuals of equalities; multipliers, of rows with weights w what the

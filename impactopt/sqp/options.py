@@ -21,6 +21,8 @@ class SQPOptions:
     hessian : "exact" (made convex) or "bfgs" (damped; dense, for some hundred variables at most).
     violation_tolerance : largest violation of a row or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
+    complementarity_tolerance : with "interior", the largest multiplier x distance to a bound there, in its
+        place. The objective is off by that times the number of bounds that hold, at most.
     acceptable_tolerance : the same, for the status ACCEPTABLE where no further step helps.
     max_iterations, time_limit [s] : limits; the best iterate is returned.
     radius, radius_max : of the trust region |d|_inf <= radius, at the start and at most.
@@ -43,6 +45,7 @@ class SQPOptions:
     hessian: str = "exact"
     violation_tolerance: float = 1e-6
     kkt_tolerance: float = 1e-6
+    complementarity_tolerance: float = 1e-6
     acceptable_tolerance: float = 1e-4
     max_iterations: int = 500
     time_limit: float | None = None

@@ -54,6 +54,7 @@ _NEAR, _LESS = 1e-2, 1e-2
 _RESTORED = 1e-3  # violation from which on they are where nothing else counted
 _CHANGES = 12  # of what is aimed at, at most
 _AGAIN = 1e-4  # the least barrier after such a change
+_RESTARTS = 2  # where nothing is progress any more
 
 
 @dataclass
@@ -145,15 +146,32 @@ class InteriorRun(Run):
         if self._start_is_solution():
             self.report.iteration(self.point, self._kkt, "start")
             return Status.SOLVED
-        self._begin()
-        try:
-            return self._iterate()
-        finally:
-            give_back(self._newton)
+        note, restarts = "start", 0
+        while True:
+            self._begin()
+            try:
+                status = self._iterate(note)
+            finally:
+                give_back(self._newton)
+            if status is not Status.FAILED or restarts == _RESTARTS or not self._back_to_best():
+                return status
+            note, restarts = "again from the best iterate", restarts + 1
 
-    def _iterate(self) -> Status:
-        note = "start"
-        for _ in range(self.options.max_iterations + 1):
+    def _back_to_best(self) -> bool:
+        """Whether there is another point to begin at anew: the best so far, with multipliers and a barrier
+        of its own, as what failed may be the way there.
+        """
+        x = self.report.best.x
+        if x is None or np.array_equal(x, self.point.x):
+            return False
+        self.point = self.program.point(x)
+        self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
+        self._warm, self._mu = False, self.options.barrier
+        self._sigma, self._changes = 1.0, 0
+        return self.point.differentiable
+
+    def _iterate(self, note: str) -> Status:
+        while self.report.iterations <= self.options.max_iterations:
             residual = self._residual(self.point, self._s.values)
             self._take_multipliers()
             error = self._error(0.0, residual)

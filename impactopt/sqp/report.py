@@ -26,6 +26,7 @@ class Report:
     Attributes
     ----------
     seconds_qp : spent in QPs; the run adds to it.
+    best : the best iterate.
     """
 
     def __init__(self, program: NonlinearProgram, tolerance: float, callback: Callback | None):
@@ -33,8 +34,13 @@ class Report:
         self._program, self._tolerance, self._callback = program, tolerance, callback
         self._began = time.perf_counter()
         self._history: list[IterationRecord] = []
-        self._best = BestIterate(program, tolerance)
+        self.best = BestIterate(program, tolerance)
         self._last: Point | None = None
+
+    @property
+    def iterations(self) -> int:
+        """Number of points recorded."""
+        return len(self._history)
 
     def elapsed(self) -> float:
         """Seconds since the start."""
@@ -42,7 +48,7 @@ class Report:
 
     def iteration(self, point: Point, kkt: float, note: str) -> bool:
         """Record an iteration and tell the caller; True if the caller wants to stop."""
-        self._best.consider(point.x, point.objective, point.g)
+        self.best.consider(point.x, point.objective, point.g)
         step = 0.0 if self._last is None else float(np.max(np.abs(point.x - self._last.x), initial=0.0))
         self._last = point
         record = IterationRecord(
@@ -61,8 +67,8 @@ class Report:
         self, status: Status, program: TimedProgram, point: Point, y: Vector, z: Vector
     ) -> SolverResult:
         """The result with that status: at the point if it is a solution, else at the best iterate."""
-        if not status.usable and self._best.x is not None:
-            point = program.point(self._best.x)
+        if not status.usable and self.best.x is not None:
+            point = program.point(self.best.x)
         message = explain(self._program, status, point.x, point.g, tolerance=self._tolerance)
         if status is Status.FAILED:
             message += _why(point)

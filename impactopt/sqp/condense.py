@@ -48,17 +48,21 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     do not determine it by their pattern, it stays free. equal (m,): which rows are equalities.
     """
     touches = jacobian.tocsc()
-    taken = ~equal
+    start, touching = touches.indptr, touches.indices
+    taken, touched = ~equal, np.zeros(equal.size, dtype=bool)
     found: dict[tuple[tuple[int, ...], int], list[tuple[Index, Index]]] = {}
     for rank, variables in determined:
-        part = touches[:, variables]
-        rows = np.unique(part.indices)
+        columns = [touching[start[v] : start[v + 1]] for v in variables]
+        rows = np.unique(np.concatenate([np.zeros(0, np.intp), *columns]))
         rows = rows[~taken[rows]][: variables.size]
         if rows.size < variables.size or not variables.size:
             continue
-        system = sp.csr_matrix(part.tocsr()[rows])
-        system.data[:] = 1.0
-        if (maximum_bipartite_matching(system, perm_type="column") < 0).any():
+        system = np.zeros((rows.size, rows.size), dtype=bool)
+        for k, column in enumerate(columns):
+            touched[column] = True
+            system[k] = touched[rows]
+            touched[column] = False
+        if not _determines(system.tobytes(), rows.size):
             continue
         taken[rows] = True
         found.setdefault((rank, variables.size), []).append((rows, variables))
@@ -66,6 +70,13 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
         Elimination(np.array([r for r, _ in found[key]]), np.array([v for _, v in found[key]]))
         for key in sorted(found)
     ]
+
+
+@functools.cache
+def _determines(pattern: bytes, size: int) -> bool:
+    """Whether a square system with this pattern can be regular: most systems have that of another."""
+    system = sp.csr_matrix(np.frombuffer(pattern, dtype=bool).reshape(size, size))
+    return bool((maximum_bipartite_matching(system) >= 0).all())
 
 
 class _Touched(NamedTuple):
@@ -248,23 +259,30 @@ class Condenser:
 def _fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> list[list[_Touched]]:
     """Mark what becomes nonzero on the way, and find what each system touches."""
     row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
+    others = np.zeros(touches.shape[1], dtype=bool)
     out = []
     for q_all, e_all in eliminations:
         row_left[q_all.ravel()] = False
         column_left[e_all.ravel()] = False
+        others[e_all.ravel()] = True
         found, touched = [], np.zeros(touches.shape[0], dtype=np.intp)
         for q, e in zip(q_all, e_all, strict=True):
             t = np.flatnonzero(touches[:, e].any(axis=1) & row_left)
             c = np.flatnonzero(touches[q].any(axis=0) & column_left)
             coupled = couples[e].any(axis=0)
-            u = np.concatenate([c, np.setdiff1d(np.flatnonzero(coupled & column_left), c)])
-            if np.isin(np.setdiff1d(e_all, e), np.flatnonzero(coupled)).any():
+            others[e] = False
+            if (coupled & others).any():
                 raise ValueError("the Hessian couples variables of two systems of one elimination")
+            others[e] = True
+            more = coupled & column_left
+            more[c] = False
+            u = np.concatenate([c, np.flatnonzero(more)])
             touched[t] += 1
             touches[np.ix_(t, c)] = touches[np.ix_(t, e)] = True
             touches[np.ix_(q, e)] = couples[np.ix_(e, e)] = True
             couples[np.ix_(c, u)] = couples[np.ix_(u, c)] = True
             found.append(_Touched(q, e, t, c, u))
+        others[e_all.ravel()] = False
         if (touched > 1).any():
             raise ValueError(f"row {int(np.argmax(touched > 1))} touches two systems of one elimination")
         out.append(found)
@@ -276,16 +294,16 @@ def _by_pattern(jacobian: Matrix, rows: Index) -> list[tuple[Index, Index, Place
     numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
     by_rows = numbered.tocsr()
     by_rows.sort_indices()
-    found: dict[bytes, list[tuple[int, Places]]] = {}
+    start, columns, at = by_rows.indptr, by_rows.indices, by_rows.data.astype(np.int32)
+    found: dict[bytes, list[int]] = {}
     for i in rows:
-        part = slice(by_rows.indptr[i], by_rows.indptr[i + 1])
-        columns = by_rows.indices[part].astype(np.intp)
-        if columns.size:
-            found.setdefault(columns.tobytes(), []).append((i, by_rows.data[part].astype(np.int32)))
-    return [
-        (np.frombuffer(key, dtype=np.intp), np.array([i for i, _ in same]), np.array([at for _, at in same]))
-        for key, same in found.items()
-    ]
+        found.setdefault(columns[start[i] : start[i + 1]].tobytes(), []).append(i)
+    found.pop(b"", None)
+    out = []
+    for key, numbers in found.items():
+        own, same = np.frombuffer(key, dtype=columns.dtype).astype(np.intp), np.array(numbers)
+        out.append((own, same, at[start[same][:, None] + np.arange(own.size)]))
+    return out
 
 
 def _numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:

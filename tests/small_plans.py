@@ -80,7 +80,7 @@ def _functions(builders: dict[str, Callable[[], BlockExpression]]) -> dict[str, 
     out: dict[str, Any] = {}
     for name, build in builders.items():
         block = build()
-        out |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out)}
+        out |= {f.name(): f for f in derivative_functions(name, block.z, block.p, block.out, block.through)}
     return out
 
 

@@ -274,6 +274,21 @@ def test_derivative_functions_are_the_jacobian_and_the_lower_hessian(seed: int) 
     np.testing.assert_allclose(lower + np.tril(lower, -1).T, np.array(grad), atol=1e-8)
 
 
+@given(seeds)
+@settings(max_examples=10, deadline=None)
+def test_derivatives_through_inner_numbers_are_those_of_the_whole(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    z, p, s = ca.SX.sym("z", 5), ca.SX.sym("p", 2), ca.SX.sym("s", 2)
+    of_z = ca.vertcat(z[0] + z[1] * z[2] * p[0], ca.sin(z[3]) / z[1])
+    out = ca.vertcat(s[0] ** 2 * s[1] + z[4] * s[0], ca.exp(s[1]) * z[0] + p[1], z[2] * z[4], 0.0)
+    split = derivative_functions("f", z, p, out, (s, of_z))
+    whole = derivative_functions("f", z, p, ca.substitute(out, s, of_z))
+    numbers = 0.5 + rng.random(5), rng.standard_normal(2), rng.standard_normal(4)
+    for one, other in zip(split, whole, strict=True):
+        inputs = numbers[: one.n_in()]
+        np.testing.assert_allclose(one(*inputs).full(), other(*inputs).full(), rtol=1e-12, atol=1e-12)
+
+
 def test_pattern_is_in_casadis_order() -> None:
     matrix = ca.DM([[1, 0, 2], [0, 0, 3], [4, 0, 5]])
     rows, columns = pattern(ca.sparsify(matrix).sparsity())

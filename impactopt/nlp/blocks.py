@@ -24,18 +24,32 @@ DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
 
 @dataclass(frozen=True)
 class BlockExpression:
-    """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``."""
+    """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``.
+
+    through : numbers that ``out`` is written with, and what they are of (z, p).
+    """
 
     z: Any
     p: Any
     out: Any
     sizes: dict[str, int]
+    through: tuple[Any, Any] | None = None
 
 
-def make_block(z: list[Any], p: list[Any], out: dict[str, Any]) -> BlockExpression:
-    """A block from parts of z and of p, and the named slices of its output."""
+def make_block(
+    z: list[Any], p: list[Any], out: dict[str, Any], through: list[tuple[Any, Any]] | None = None
+) -> BlockExpression:
+    """A block from parts of z and of p, and the named slices of its output.
+
+    through : numbers that it is written with, in place of an expression of z and p each.
+    """
+    inner = None if through is None else tuple(ca.vertcat(*parts) for parts in zip(*through, strict=True))
     return BlockExpression(
-        ca.vertcat(*z), ca.vertcat(*p), ca.vertcat(*out.values()), {k: int(v.numel()) for k, v in out.items()}
+        ca.vertcat(*z),
+        ca.vertcat(*p),
+        ca.vertcat(*out.values()),
+        {k: int(v.numel()) for k, v in out.items()},
+        inner,
     )
 
 
@@ -173,8 +187,8 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
     weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
     t = after * T1 + T * s
-    y = y0 + T1 * d1 + T * d
-    v, a = c.motion(y, legs, u, u1 / T)
+    y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
+    v, a = c.motion(y, legs, u, ydd)
     rb = c.rb
     q = c.configuration(y, legs)
     rnea = ca.Function("rnea", [rb.q, rb.v, rb.a], [rb.rnea(rb.v, rb.a)])
@@ -191,7 +205,8 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
         "torque": servo,
     }
     z = [y0, u0, ref_legs, ref_rates, ff, d1, T1, d, T, u, u1, legs, f, w]
-    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out)
+    through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
+    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through)
 
 
 def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -> BlockExpression:
@@ -215,7 +230,8 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -
     within, shortest = ca.SX.sym("within", len(phases)), ca.SX.sym("shortest", min(len(phases), 1))
     of_law = ca.SX.sym("law", len(law.parameters))
     of_target = ca.SX.sym("target", len(target.parameters))
-    q, vel, _ = c.upper_motion(y0 + T1 * d1 + T * d, u, ca.SX.zeros(ny))
+    y, gone = ca.SX.sym("y", ny), ca.SX.sym("gone")
+    q, vel, _ = c.upper_motion(y, u, ca.SX.zeros(ny))
     place, twist, _ = striker_kinematics(c, striker)(q, vel, ca.SX.zeros(c.rb.nv))
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
@@ -232,7 +248,7 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -
             [[target.event(state, f, T - shortest, k, numbers)] for k in range(len(target.events))]
         )
         lasting = of_phase([target.lasting(state, f, k, numbers) for k in phases])
-    penetration = ca.dot(normal, place - point) - (T1 * x1 + T * x)
+    penetration = ca.dot(normal, place - point) - gone
     rate = ca.dot(normal, twist) - speed
     compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
     out = {
@@ -248,7 +264,8 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -
         "lasting": lasting,
     }
     z = [y0, d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
-    return make_block(z, [point, normal, restituting, within, shortest, of_law, of_target], out)
+    through = [(y, y0 + T1 * d1 + T * d), (gone, T1 * x1 + T * x)]
+    return make_block(z, [point, normal, restituting, within, shortest, of_law, of_target], out, through)
 
 
 def typical_state(target: Target) -> tuple[float, ...]:

@@ -267,16 +267,36 @@ def _sums(slot: Index, entries: list[Index], factors: list[Array], shape: tuple[
     return sp.csr_array((np.concatenate([np.zeros(0), *factors]), where), shape=shape)
 
 
-def derivative_functions(name: str, z: Any, p: Any, out: Any) -> list[Any]:
+def derivative_functions(
+    name: str, z: Any, p: Any, out: Any, through: tuple[Any, Any] | None = None
+) -> list[Any]:
     """A block's three functions of (z, p).
 
     ``name`` (z, p) -> out, ``name_jac`` (z, p) -> d out/dz,
     ``name_hess`` (z, p, lam) -> lower triangle of d2(lam.out)/dz2.
+
+    through : numbers s, and what they are of (z, p), where ``out`` is written with them: it is then
+        differentiated by them and by z apart, and both put together by the chain rule. That saves operations
+        where many of z have an effect through few numbers only.
     """
-    lam = ca.SX.sym("lam", out.numel())
-    out = ca.densify(out)
-    jac = ca.jacobian(out, z)
-    hess = ca.tril(ca.jacobian(ca.gradient(ca.dot(lam, out), z), z))
+    s, of_z = (ca.SX(0, 1), ca.SX(0, 1)) if through is None else through
+    lam, along, n = ca.SX.sym("lam", out.numel()), ca.SX.sym("along", s.numel()), z.numel()
+    out, both = ca.densify(out), ca.vertcat(z, s)
+    whole = ca.jacobian(out, both)
+    slopes = ca.gradient(ca.dot(lam, out), both)
+    curvature = ca.jacobian(slopes, both)
+    inner = ca.jacobian(of_z, z)
+    bends = ca.jacobian(ca.gradient(ca.dot(along, of_z), z), z)
+    crossed = ca.mtimes(inner.T, curvature[n:, :n])
+    jac = whole[:, :n] + ca.mtimes(whole[:, n:], inner)
+    hess = (
+        curvature[:n, :n]
+        + crossed
+        + crossed.T
+        + ca.mtimes(ca.mtimes(inner.T, curvature[n:, n:]), inner)
+        + ca.substitute(bends, along, slopes[n:])
+    )
+    out, jac, hess = ca.substitute([out, jac, ca.tril(hess)], [s], [of_z])
     opts = {"cse": True}
     return [
         ca.Function(name, [z, p], [out], opts),

@@ -62,7 +62,7 @@ def block_functions(
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
             b = block.build()
-            return [in_lanes(function) for function in derivative_functions(name, b.z, b.p, b.out)]
+            return [in_lanes(function) for function in derivative_functions(name, b.z, b.p, b.out, b.through)]
 
         out |= cached(f"{robot.name}-{name}", (name, *recipe, *block.key), functions, report=report)
     return out

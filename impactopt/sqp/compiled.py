@@ -93,7 +93,7 @@ class CompiledKernels(Kernels):
         for a in stages:
             k, nt, nc = a.tc.shape
             r, nu = a.q.shape[1], a.u.shape[1]
-            work = np.zeros(max(nt * nc, r * nu + nc * nu, r + max(nt, nc, nu)) + 1)
+            work = np.zeros(max(nt * nc, r * (nu + nc) + max(r, nc) * nu, r + max(nt, nc, nu)) + 1)
             arrays = [getattr(a, name) for name in _OF_STAGES]
             made.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)]))
             keep.append(work)

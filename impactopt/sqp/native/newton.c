@@ -72,43 +72,133 @@ EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, 
     }
 }
 
+/* Products of a few rows: a call of BLAS would take longer than they do. */
+#define FEW 8
+
+/* rows (r, n) of a matrix that lies by columns */
+static void turn(const double *columns, int r, int n, double *rows) {
+    for (int i = 0; i < n; ++i)
+        for (int p = 0; p < r; ++p) rows[p * n + i] = columns[i * r + p];
+}
+
+static void add(double *restrict to, double factor, const double *restrict from, int n) {
+    for (int i = 0; i < n; ++i) to[i] += factor * from[i];
+}
+
+/* rows (r, n) become those of B^-1 times them, for the factors of B as getrf leaves them */
+static void solve_few(const double *lu, const int32_t *pivots, int r, int n, double *rows) {
+    for (int p = 0; p < r; ++p) {
+        double *one_row = rows + p * n, *other = rows + (pivots[p] - 1) * n;
+        if (one_row != other)
+            for (int i = 0; i < n; ++i) {
+                double held = one_row[i];
+                one_row[i] = other[i], other[i] = held;
+            }
+    }
+    for (int p = 0; p < r; ++p)
+        for (int q = 0; q < p; ++q) add(rows + p * n, -lu[q * r + p], rows + q * n, n);
+    for (int p = r - 1; p >= 0; --p) {
+        for (int q = p + 1; q < r; ++q) add(rows + p * n, -lu[q * r + p], rows + q * n, n);
+        double over = 1.0 / lu[p * r + p];
+        for (int i = 0; i < n; ++i) rows[p * n + i] *= over;
+    }
+}
+
 static int eliminate(stage *a, double *J, int64_t none) {
     int r = a->r, nc = a->nc, nt = a->nt, info;
+    double *rows = a->work, *sums = a->work + r * nc;
     for (int64_t k = 0; k < a->k; ++k) {
         double *lu = a->lu + k * r * r, *X = a->X + k * nc * r, *T = a->T + k * nt * r;
         int32_t *pivots = a->pivots + k * r;
+        const int32_t *to = a->tc + k * nt * nc;
         take(J, a->qe + k * r * r, r * r, lu);
         take(J, a->qc + k * nc * r, nc * r, X);
         take(J, a->te + k * nt * r, nt * r, T);
         getrf(&r, &r, lu, &r, pivots, &info);
         if (info) return info;
-        if (nc) getrs("N", &r, &nc, lu, &r, pivots, X, &r, &info);
-        if (!nt || !nc) continue;
-        gemm("T", "N", &nc, &nt, &r, &one, X, &r, T, &r, &zero, a->work, &nc);
-        const int32_t *to = a->tc + k * nt * nc;
-        for (int64_t i = 0; i < nt * nc; ++i) J[to[i]] -= a->work[i];
+        if (!nc) continue;
+        if (r > FEW) {
+            getrs("N", &r, &nc, lu, &r, pivots, X, &r, &info);
+            if (nt) gemm("T", "N", &nc, &nt, &r, &one, X, &r, T, &r, &zero, a->work, &nc);
+            for (int64_t i = 0; i < nt * nc; ++i) J[to[i]] -= a->work[i];
+        } else {
+            turn(X, r, nc, rows);
+            solve_few(lu, pivots, r, nc, rows);
+            turn(rows, nc, r, X);
+            for (int t = 0; t < nt; ++t) {
+                memset(sums, 0, sizeof(double) * nc);
+                for (int p = 0; p < r; ++p) add(sums, T[t * r + p], rows + p * nc, nc);
+                for (int i = 0; i < nc; ++i) J[*to++] -= sums[i];
+            }
+        }
         J[none] = 0.0;
     }
     return 0;
 }
 
+/* W += C + C' for the variables that rows touch, C for the others, C = X' G */
+static void spread(const stage *a, int64_t k, double *X, double *G, double *C, double *W) {
+    int r = a->r, nc = a->nc, nu = a->nu;
+    const int32_t *to = a->hcc + k * nc * (nc + 1) / 2;
+    gemm("T", "N", &nu, &nc, &r, &one, G, &r, X, &r, &zero, C, &nu);
+    for (int i = 0; i < nc; ++i)
+        for (int j = 0; j <= i; ++j) W[*to++] += C[i * nu + j] + C[j * nu + i];
+    to = a->hcv + k * nc * (nu - nc);
+    for (int i = 0; i < nc; ++i)
+        for (int j = nc; j < nu; ++j) W[*to++] += C[i * nu + j];
+}
+
+/* the same for rows (r, nc) and (r, nu) of X and G, of which there are few */
+static inline __attribute__((always_inline)) void spread_rows(const stage *a, int64_t k, int r, const double *restrict X,
+                                                              const double *restrict G, double *restrict sums,
+                                                              double *restrict W) {
+    int nc = a->nc, nu = a->nu, nv = nu - nc;
+    const int32_t *within = a->hcc + k * nc * (nc + 1) / 2, *beyond = a->hcv + k * nc * nv;
+    for (int i = 0; i < nc; ++i) {
+        double x[FEW], g[FEW];
+        for (int p = 0; p < r; ++p) x[p] = X[p * nc + i], g[p] = G[p * nu + i];
+        for (int j = 0; j <= i; ++j) {
+            double sum = 0.0;
+            for (int p = 0; p < r; ++p) sum += x[p] * G[p * nu + j] + g[p] * X[p * nc + j];
+            sums[j] = sum;
+        }
+        for (int j = 0; j <= i; ++j) W[*within++] += sums[j];
+        for (int j = 0; j < nv; ++j) {
+            double sum = 0.0;
+            for (int p = 0; p < r; ++p) sum += x[p] * G[p * nu + nc + j];
+            sums[j] = sum;
+        }
+        for (int j = 0; j < nv; ++j) W[*beyond++] += sums[j];
+    }
+}
+
+static void spread_few(const stage *a, int64_t k, const double *X, const double *G, double *sums, double *W) {
+    if (a->r == 6) /* a leg, a wrench: loops of a length that the compiler knows */
+        spread_rows(a, k, 6, X, G, sums, W);
+    else
+        spread_rows(a, k, a->r, X, G, sums, W);
+}
+
 static void reduce(stage *a, double *W, int64_t none) {
     int r = a->r, nc = a->nc, nu = a->nu;
-    double *G = a->work, *C = G + r * nu;
+    double *G = a->work, *more = G + r * nu, *sums = more + r * nc;
     for (int64_t k = 0; k < a->k; ++k) {
         double *X = a->X + k * nc * r, *H = a->H + k * r * r, *own = a->G + k * nu * r;
         take(W, a->hee + k * r * r, r * r, H);
         take(W, a->heu + k * nu * r, nu * r, own);
-        for (int64_t i = 0; i < nu * r; ++i) G[i] = -own[i];
         if (!nc) continue;
-        gemm("N", "N", &r, &nc, &r, &half, H, &r, X, &r, &one, G, &r);
-        gemm("T", "N", &nu, &nc, &r, &one, G, &r, X, &r, &zero, C, &nu);
-        const int32_t *to = a->hcc + k * nc * (nc + 1) / 2;
-        for (int i = 0; i < nc; ++i)
-            for (int j = 0; j <= i; ++j) W[*to++] += C[i * nu + j] + C[j * nu + i];
-        to = a->hcv + k * nc * (nu - nc);
-        for (int i = 0; i < nc; ++i)
-            for (int j = nc; j < nu; ++j) W[*to++] += C[i * nu + j];
+        if (r > FEW) {
+            for (int64_t i = 0; i < nu * r; ++i) G[i] = -own[i];
+            gemm("N", "N", &r, &nc, &r, &half, H, &r, X, &r, &one, G, &r);
+            spread(a, k, X, G, more, W);
+        } else {
+            turn(X, r, nc, more);
+            turn(own, r, nu, G);
+            for (int i = 0; i < r * nu; ++i) G[i] = -G[i];
+            for (int p = 0; p < r; ++p)
+                for (int q = 0; q < r; ++q) add(G + p * nu, 0.5 * H[q * r + p], more + q * nc, nc);
+            spread_few(a, k, more, G, sums, W);
+        }
         W[none] = 0.0;
     }
 }

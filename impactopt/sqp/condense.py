@@ -10,7 +10,7 @@ treated together. What is left is a Newton system in the free variables (Nocedal
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,13 +147,14 @@ class Condenser:
         groups = _by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations))
         couples = np.eye(n, dtype=bool)
         couples[H.row, H.col] = True
-        for columns, _, _ in groups:
-            couples[np.ix_(columns, columns)] = True
+        for columns, _ in _alike(groups):
+            couples[columns[:, :, None], columns[:, None, :]] = True
         systems = _fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
         p, c = np.nonzero(touches)
         rows, none = _numbered(p, c, touches.shape)
-        i, j = np.nonzero(np.tril(couples))
+        i, j = np.nonzero(couples)
+        i, j = i[i >= j], j[i >= j]
         pairs, nothing = _numbered(i, j, couples.shape)
         pairs[j, i] = pairs[i, j]
         self.J, self.W = np.zeros(none + 1), np.zeros(nothing + 1)
@@ -163,7 +164,9 @@ class Condenser:
         self._diagonal = np.diagonal(pairs).copy()
         at = np.flatnonzero(H.row == H.col)
         self._curved = at, H.row[at]
-        self._products = [_products(pairs, *group) for group in groups]
+        self._products = [
+            made for columns, same in _alike(groups) for made in _products(pairs, columns, same)
+        ]
         self._stages = [_stage(found, rows, none, pairs, nothing) for found in systems]
         self._left = number[self.rows[self.equal]]
         self.pattern = couples[np.ix_(self.free, self.free)]
@@ -289,7 +292,10 @@ def _fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> li
     return out
 
 
-def _by_pattern(jacobian: Matrix, rows: Index) -> list[tuple[Index, Index, Places]]:
+_Rows = tuple[Index, Index, Places]
+
+
+def _by_pattern(jacobian: Matrix, rows: Index) -> list[_Rows]:
     """Columns, rows that touch just them, and where their values (rows, columns) stand in the data, csc."""
     numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
     by_rows = numbered.tocsr()
@@ -316,9 +322,21 @@ def _numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
 _lower = functools.cache(np.tril_indices)
 
 
-def _products(pairs: Places, columns: Index, rows: Index, values: Places) -> Products:
-    i, j = _lower(columns.size)
-    return Products(rows=rows.astype(np.int32), values=values, to=pairs[columns[i], columns[j]])
+def _alike(groups: Sequence[_Rows]) -> Iterator[tuple[Index, list[_Rows]]]:
+    """Groups with as many columns as each other, and all their columns (group, column)."""
+    sizes: dict[int, list[_Rows]] = {}
+    for group in groups:
+        sizes.setdefault(group[0].size, []).append(group)
+    for same in sizes.values():
+        yield np.array([columns for columns, _, _ in same]), same
+
+
+def _products(pairs: Places, columns: Index, groups: list[_Rows]) -> list[Products]:
+    i, j = _lower(columns.shape[1])
+    return [
+        Products(rows=rows.astype(np.int32), values=values, to=to)
+        for (_, rows, values), to in zip(groups, pairs[columns[:, i], columns[:, j]], strict=True)
+    ]
 
 
 def _stage(systems: list[_Touched], rows: Places, none: int, pairs: Places, nothing: int) -> Stage:

@@ -30,32 +30,31 @@ class Bounded:
         multipliers (k,) : positive at the upper bound, negative at the lower; each gets mu / distance at
         least.
         """
-        self._lower, self._upper = lower, upper
-        self._has_lower, self._has_upper = np.isfinite(lower), np.isfinite(upper)
-        self.values = self._inside(values, push)
-        low, high = self._distances()
-        self.below = np.where(self._has_lower, np.maximum(-multipliers, mu / low), 0.0)
-        self.above = np.where(self._has_upper, np.maximum(multipliers, mu / high), 0.0)
+        has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
+        # 1 where there is a bound, else 0; and the bound, else 0
+        self._below, self._above = has_lower.astype(float), has_upper.astype(float)
+        self._low, self._high = np.where(has_lower, lower, 0.0), np.where(has_upper, upper, 0.0)
+        self._take(self._inside(values, push))
+        self.below = self._below * np.maximum(-multipliers, mu / self._to_lower)
+        self.above = self._above * np.maximum(multipliers, mu / self._to_upper)
+
+    def _take(self, values: Vector) -> None:
+        self.values = values
+        self._to_lower, self._to_upper = self._distances(values)
 
     def _inside(self, values: Vector, push: float) -> Vector:
-        lower, upper = self._lower, self._upper
-        room = np.where(self._has_lower & self._has_upper, push * (upper - lower), np.inf)
-        low = np.where(self._has_lower, lower, 0.0)
-        high = np.where(self._has_upper, upper, 0.0)
-        least = np.where(
-            self._has_lower, low + np.minimum(push * np.maximum(1.0, np.abs(low)), room), -np.inf
-        )
-        most = np.where(
-            self._has_upper, high - np.minimum(push * np.maximum(1.0, np.abs(high)), room), np.inf
-        )
-        return np.clip(values, least, most)
+        has_lower, has_upper, low, high = self._below > 0, self._above > 0, self._low, self._high
+        room = np.where(has_lower & has_upper, push * (high - low), np.inf)
+        least = low + np.minimum(push * np.maximum(1.0, np.abs(low)), room)
+        most = high - np.minimum(push * np.maximum(1.0, np.abs(high)), room)
+        return np.clip(values, np.where(has_lower, least, -np.inf), np.where(has_upper, most, np.inf))
 
-    def _distances(self, values: Vector | None = None) -> tuple[Vector, Vector]:
+    def _distances(self, values: Vector) -> tuple[Vector, Vector]:
         """To both bounds; 1 where there is none."""
-        v = self.values if values is None else values
-        low = np.where(self._has_lower, v - np.where(self._has_lower, self._lower, 0.0), 1.0)
-        high = np.where(self._has_upper, np.where(self._has_upper, self._upper, 0.0) - v, 1.0)
-        return low, high
+        return (
+            self._below * (values - self._low) + (1.0 - self._below),
+            self._above * (self._high - values) + (1.0 - self._above),
+        )
 
     @property
     def multiplier(self) -> Vector:
@@ -65,7 +64,7 @@ class Bounded:
     @property
     def bounds(self) -> int:
         """Number of finite bounds."""
-        return int(self._has_lower.sum() + self._has_upper.sum())
+        return int(self._below.sum() + self._above.sum())
 
     def total(self) -> float:
         """Sum of the multipliers."""
@@ -80,55 +79,43 @@ class Bounded:
 
     def slope(self, mu: float) -> Vector:
         """Gradient of mu times the barrier."""
-        low, high = self._distances()
-        return np.where(self._has_upper, mu / high, 0.0) - np.where(self._has_lower, mu / low, 0.0)
+        out: Vector = mu * (self._above / self._to_upper - self._below / self._to_lower)
+        return out
 
     def stiffness(self) -> Vector:
         """What the multipliers add to the Hessian's diagonal (eq. 13)."""
-        low, high = self._distances()
-        return self.below / low + self.above / high
+        return self.below / self._to_lower + self.above / self._to_upper
 
     def off(self, mu: float) -> float:
         """Largest |multiplier x distance - mu|."""
-        low, high = self._distances()
-        gaps = (
-            np.where(self._has_lower, self.below * low - mu, 0.0),
-            np.where(self._has_upper, self.above * high - mu, 0.0),
-        )
+        gaps = self.below * self._to_lower - mu * self._below, self.above * self._to_upper - mu * self._above
         return max(float(np.abs(g).max(initial=0.0)) for g in gaps)
 
     def longest(self, step: Vector, keep: float) -> float:
         """The longest part <= 1 of a step that leaves 1 - keep of every distance (eq. 15a)."""
-        low, high = self._distances()
         return min(
-            longest(low, np.where(self._has_lower, step, 0.0), keep),
-            longest(high, np.where(self._has_upper, -step, 0.0), keep),
+            longest(self._to_lower, self._below * step, keep),
+            longest(self._to_upper, -self._above * step, keep),
         )
 
     def short_of_bounds(self, values: Vector, keep: float) -> Vector:
         """New values, each moved to where it takes no more than a part `keep` of its distance to a bound."""
-        low, high = self._distances()
-        least = np.where(self._has_lower, self.values - keep * low, -np.inf)
-        most = np.where(self._has_upper, self.values + keep * high, np.inf)
+        least = np.where(self._below > 0, self.values - keep * self._to_lower, -np.inf)
+        most = np.where(self._above > 0, self.values + keep * self._to_upper, np.inf)
         return np.clip(values, least, most)
 
     def dual_step(self, step: Vector, mu: float, keep: float) -> tuple[Vector, Vector, float]:
         """Both multipliers' steps for a step of the values, eq. 12, and the longest part of them, eq. 15b."""
-        low, high = self._distances()
-        below = np.where(self._has_lower, mu / low - self.below - self.below / low * step, 0.0)
-        above = np.where(self._has_upper, mu / high - self.above + self.above / high * step, 0.0)
+        below = (mu * self._below - self.below * step) / self._to_lower - self.below
+        above = (mu * self._above + self.above * step) / self._to_upper - self.above
         return below, above, min(longest(self.below, below, keep), longest(self.above, above, keep))
 
     def move(self, values: Vector, below: Vector, above: Vector, mu: float) -> None:
         """Take new values, and multipliers kept near mu / distance."""
-        self.values = values
-        low, high = self._distances()
-        self.below = np.where(
-            self._has_lower, np.clip(below, mu / low / _SAFEGUARD, mu / low * _SAFEGUARD), 0.0
-        )
-        self.above = np.where(
-            self._has_upper, np.clip(above, mu / high / _SAFEGUARD, mu / high * _SAFEGUARD), 0.0
-        )
+        self._take(values)
+        low, high = mu / self._to_lower, mu / self._to_upper
+        self.below = self._below * np.clip(below, low / _SAFEGUARD, low * _SAFEGUARD)
+        self.above = self._above * np.clip(above, high / _SAFEGUARD, high * _SAFEGUARD)
 
 
 def longest(room: Vector, step: Vector, keep: float) -> float:

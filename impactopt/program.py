@@ -241,9 +241,14 @@ def stationarity(gradient: Vector, jacobian: Matrix, multipliers: Vector, bound_
     The scale is IPOPT's (Waechter and Biegler 2006, eq. 6): large multipliers would else make the tolerance
     unreachable.
     """
+    residual = gradient + jacobian.T @ multipliers + bound_multipliers
+    return scaled_residual(residual, multipliers, bound_multipliers)
+
+
+def scaled_residual(residual: Vector, multipliers: Vector, bound_multipliers: Vector) -> float:
+    """`stationarity` of what is left of grad f + J' y + z."""
     total = multipliers.size + bound_multipliers.size
     mean = (np.abs(multipliers).sum() + np.abs(bound_multipliers).sum()) / max(total, 1)
-    residual = gradient + jacobian.T @ multipliers + bound_multipliers
     return float(np.max(np.abs(residual), initial=0.0) / (max(100.0, mean) / 100.0))
 
 

@@ -23,6 +23,7 @@ from impactopt.program import (
     Vector,
     complementarity,
     is_stationary_violation,
+    scaled_residual,
     stationarity,
 )
 from impactopt.sqp.barrier import Bounded
@@ -473,7 +474,7 @@ class InteriorRun(Run):
         self.z[held] -= dual[held]
         dual[held] = 0.0
         self._dual = float(np.abs(dual).max(initial=0.0))
-        self._kkt = stationarity(point.gradient, point.jacobian, self.y, self.z)
+        self._kkt = scaled_residual(dual + (1.0 - self._sigma) * point.gradient, self.y, self.z)
 
     def _error(self, mu: float, residual: Vector) -> float:
         """The scaled error of the barrier problem (eq. 5)."""

@@ -49,7 +49,10 @@ def algebra(request):
 
 # systems of any few rows, of six, and of so many that C leaves them to BLAS
 @given(
-    seed=st.integers(0, 10**6), own=st.sampled_from([2, 6, 8, 9]), hard=st.booleans(), indefinite=st.booleans()
+    seed=st.integers(0, 10**6),
+    own=st.sampled_from([2, 6, 8, 9]),
+    hard=st.booleans(),
+    indefinite=st.booleans(),
 )
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinite):

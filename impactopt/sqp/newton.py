@@ -16,6 +16,7 @@ from impactopt.sqp.kernels import Index, Kernels, Products
 
 _KEPT = 3  # structures
 _PENALTY = 1e9  # times the curvature along it: weight of an equality that is left; it changes no step
+_RANK = 1e-15  # singular values below this part of the largest are none
 _HELD = 1e15  # on the diagonal of variables that must not move
 _FIRST, _LEAST, _MOST = 1e-4, 1e-20, 1e20  # shifts of the diagonal (Waechter and Biegler 2006, section 3.1)
 _SMALL = 1e-5  # none is tried before a shift that would be smaller
@@ -103,9 +104,7 @@ class NewtonSystem:
             if self.shift > _MOST:
                 return False
         self._last = self.shift or self._last
-        if hard and self._equal.size:
-            self._spread = self._matrix.solve(self._A.T)
-            self._schur = self._A @ self._spread
+        self._spread: Vector | None = None
         return True
 
     def _penalty(self) -> Vector:
@@ -172,12 +171,13 @@ class NewtonSystem:
         by_free, off = c.forward(g, r)
         by_free += self._A.T @ (own * off)
         by_free[self.held] = 0.0
-        free = -self._matrix.solve(by_free)
         extra = np.zeros(equal.size)
         if self._hard and equal.size:
-            found = np.linalg.lstsq(self._schur, self._A @ free + off, rcond=None)[0]
-            extra = np.asarray(found, dtype=np.float64)
-            free -= self._spread @ extra
+            free, spread = self._solved(by_free)
+            extra = self._schur @ (self._A @ free + off)
+            free -= spread @ extra
+        else:
+            free = -self._matrix.solve(by_free)
         free[self.held] = 0.0
         d = c.expand(free)
         rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
@@ -186,6 +186,17 @@ class NewtonSystem:
         y[equal] = own * (self._A @ free + off) + extra
         y[c.eliminated] = c.multipliers(dual, y[equal])
         return d, y, rows, dual
+
+    def _solved(self, by_free: Vector) -> tuple[Vector, Vector]:
+        """- K^-1 by_free (f,) and K^-1 A' (f, l); the two at once where the second is not known yet, with the
+        inverse of its Schur complement, which rows that depend on each other leave without one of full rank.
+        """
+        if self._spread is not None:
+            return -self._matrix.solve(by_free), self._spread
+        both = self._matrix.solve(np.column_stack([by_free, self._A.T]))
+        self._spread = both[:, 1:]
+        self._schur = np.linalg.pinv(self._A @ self._spread, rcond=_RANK)
+        return -both[:, 0], self._spread
 
     def _pulled(self, y: Vector) -> Vector:
         """Gradient of all rows with multipliers (m,)."""

@@ -279,13 +279,29 @@ def derivative_functions(
         differentiated by them and by z apart, and both put together by the chain rule. That saves operations
         where many of z have an effect through few numbers only.
     """
-    s, of_z = (ca.SX(0, 1), ca.SX(0, 1)) if through is None else through
-    lam, along, n = ca.SX.sym("lam", out.numel()), ca.SX.sym("along", s.numel()), z.numel()
-    out, both = ca.densify(out), ca.vertcat(z, s)
+    lam = ca.SX.sym("lam", out.numel())
+    out = ca.densify(out)
+    if through is None:
+        jac = ca.jacobian(out, z)
+        hess = ca.jacobian(ca.gradient(ca.dot(lam, out), z), z)
+    else:
+        out, jac, hess = _through(z, out, lam, *through)
+    hess = ca.tril(hess)
+    opts = {"cse": True}
+    return [
+        ca.Function(name, [z, p], [out], opts),
+        ca.Function(f"{name}_jac", [z, p], [jac], opts),
+        ca.Function(f"{name}_hess", [z, p, lam], [hess], opts),
+    ]
+
+
+def _through(z: Any, out: Any, lam: Any, s: Any, of_z: Any) -> list[Any]:
+    """Value, Jacobian and Hessian of lam.out by z, where s in ``out`` stands for ``of_z``."""
+    n, both = z.numel(), ca.vertcat(z, s)
     whole = ca.jacobian(out, both)
     slopes = ca.gradient(ca.dot(lam, out), both)
     curvature = ca.jacobian(slopes, both)
-    inner = ca.jacobian(of_z, z)
+    inner, along = ca.jacobian(of_z, z), ca.SX.sym("along", s.numel())
     bends = ca.jacobian(ca.gradient(ca.dot(along, of_z), z), z)
     crossed = ca.mtimes(inner.T, curvature[n:, :n])
     jac = whole[:, :n] + ca.mtimes(whole[:, n:], inner)
@@ -296,10 +312,5 @@ def derivative_functions(
         + ca.mtimes(ca.mtimes(inner.T, curvature[n:, n:]), inner)
         + ca.substitute(bends, along, slopes[n:])
     )
-    out, jac, hess = ca.substitute([out, jac, ca.tril(hess)], [s], [of_z])
-    opts = {"cse": True}
-    return [
-        ca.Function(name, [z, p], [out], opts),
-        ca.Function(f"{name}_jac", [z, p], [jac], opts),
-        ca.Function(f"{name}_hess", [z, p, lam], [hess], opts),
-    ]
+    found: list[Any] = ca.substitute([out, jac, hess], [s], [of_z])
+    return found

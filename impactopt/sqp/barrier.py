@@ -30,20 +30,20 @@ class Bounded:
         multipliers (k,) : positive at the upper bound, negative at the lower; each gets mu / distance at
         least.
         """
-        has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
         # 1 where there is a bound, else 0; and the bound, else 0
-        self._below, self._above = has_lower.astype(float), has_upper.astype(float)
-        self._low, self._high = np.where(has_lower, lower, 0.0), np.where(has_upper, upper, 0.0)
+        self._has_lower, self._has_upper = np.isfinite(lower).astype(float), np.isfinite(upper).astype(float)
+        self._lower = np.where(self._has_lower > 0, lower, 0.0)
+        self._upper = np.where(self._has_upper > 0, upper, 0.0)
         self._take(self._inside(values, push))
-        self.below = self._below * np.maximum(-multipliers, mu / self._to_lower)
-        self.above = self._above * np.maximum(multipliers, mu / self._to_upper)
+        self.below = self._has_lower * np.maximum(-multipliers, mu / self._to_lower)
+        self.above = self._has_upper * np.maximum(multipliers, mu / self._to_upper)
 
     def _take(self, values: Vector) -> None:
         self.values = values
         self._to_lower, self._to_upper = self._distances(values)
 
     def _inside(self, values: Vector, push: float) -> Vector:
-        has_lower, has_upper, low, high = self._below > 0, self._above > 0, self._low, self._high
+        has_lower, has_upper, low, high = self._has_lower > 0, self._has_upper > 0, self._lower, self._upper
         room = np.where(has_lower & has_upper, push * (high - low), np.inf)
         least = low + np.minimum(push * np.maximum(1.0, np.abs(low)), room)
         most = high - np.minimum(push * np.maximum(1.0, np.abs(high)), room)
@@ -52,8 +52,8 @@ class Bounded:
     def _distances(self, values: Vector) -> tuple[Vector, Vector]:
         """To both bounds; 1 where there is none."""
         return (
-            self._below * (values - self._low) + (1.0 - self._below),
-            self._above * (self._high - values) + (1.0 - self._above),
+            self._has_lower * (values - self._lower) + (1.0 - self._has_lower),
+            self._has_upper * (self._upper - values) + (1.0 - self._has_upper),
         )
 
     @property
@@ -64,7 +64,7 @@ class Bounded:
     @property
     def bounds(self) -> int:
         """Number of finite bounds."""
-        return int(self._below.sum() + self._above.sum())
+        return int(self._has_lower.sum() + self._has_upper.sum())
 
     def total(self) -> float:
         """Sum of the multipliers."""
@@ -79,7 +79,7 @@ class Bounded:
 
     def slope(self, mu: float) -> Vector:
         """Gradient of mu times the barrier."""
-        out: Vector = mu * (self._above / self._to_upper - self._below / self._to_lower)
+        out: Vector = mu * (self._has_upper / self._to_upper - self._has_lower / self._to_lower)
         return out
 
     def stiffness(self) -> Vector:
@@ -88,34 +88,37 @@ class Bounded:
 
     def off(self, mu: float) -> float:
         """Largest |multiplier x distance - mu|."""
-        gaps = self.below * self._to_lower - mu * self._below, self.above * self._to_upper - mu * self._above
+        gaps = (
+            self.below * self._to_lower - mu * self._has_lower,
+            self.above * self._to_upper - mu * self._has_upper,
+        )
         return max(float(np.abs(g).max(initial=0.0)) for g in gaps)
 
     def longest(self, step: Vector, keep: float) -> float:
         """The longest part <= 1 of a step that leaves 1 - keep of every distance (eq. 15a)."""
         return min(
-            longest(self._to_lower, self._below * step, keep),
-            longest(self._to_upper, -self._above * step, keep),
+            longest(self._to_lower, self._has_lower * step, keep),
+            longest(self._to_upper, -self._has_upper * step, keep),
         )
 
     def short_of_bounds(self, values: Vector, keep: float) -> Vector:
         """New values, each moved to where it takes no more than a part `keep` of its distance to a bound."""
-        least = np.where(self._below > 0, self.values - keep * self._to_lower, -np.inf)
-        most = np.where(self._above > 0, self.values + keep * self._to_upper, np.inf)
+        least = np.where(self._has_lower > 0, self.values - keep * self._to_lower, -np.inf)
+        most = np.where(self._has_upper > 0, self.values + keep * self._to_upper, np.inf)
         return np.clip(values, least, most)
 
     def dual_step(self, step: Vector, mu: float, keep: float) -> tuple[Vector, Vector, float]:
         """Both multipliers' steps for a step of the values, eq. 12, and the longest part of them, eq. 15b."""
-        below = (mu * self._below - self.below * step) / self._to_lower - self.below
-        above = (mu * self._above + self.above * step) / self._to_upper - self.above
+        below = (mu * self._has_lower - self.below * step) / self._to_lower - self.below
+        above = (mu * self._has_upper + self.above * step) / self._to_upper - self.above
         return below, above, min(longest(self.below, below, keep), longest(self.above, above, keep))
 
     def move(self, values: Vector, below: Vector, above: Vector, mu: float) -> None:
         """Take new values, and multipliers kept near mu / distance."""
         self._take(values)
         low, high = mu / self._to_lower, mu / self._to_upper
-        self.below = self._below * np.clip(below, low / _SAFEGUARD, low * _SAFEGUARD)
-        self.above = self._above * np.clip(above, high / _SAFEGUARD, high * _SAFEGUARD)
+        self.below = self._has_lower * np.clip(below, low / _SAFEGUARD, low * _SAFEGUARD)
+        self.above = self._has_upper * np.clip(above, high / _SAFEGUARD, high * _SAFEGUARD)
 
 
 def longest(room: Vector, step: Vector, keep: float) -> float:

@@ -10,7 +10,7 @@ treated together. What is left is a Newton system in the free variables (Nocedal
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,7 +72,7 @@ def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determ
     ]
 
 
-@functools.cache
+@functools.lru_cache(maxsize=256)
 def _determines(pattern: bytes, size: int) -> bool:
     """Whether a square system with this pattern can be regular: most systems have that of another."""
     system = sp.csr_matrix(np.frombuffer(pattern, dtype=bool).reshape(size, size))
@@ -144,10 +144,10 @@ class Condenser:
         own_rows, own_columns = number[J.row[mine]], J.col[mine]
         touches = np.zeros((self._equations.size, n), dtype=bool)
         touches[own_rows, own_columns] = True
-        groups = _by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations))
+        groups = _alike(_by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations)))
         couples = np.eye(n, dtype=bool)
         couples[H.row, H.col] = True
-        for columns, _ in _alike(groups):
+        for columns, _ in groups:
             couples[columns[:, :, None], columns[:, None, :]] = True
         systems = _fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
@@ -164,9 +164,7 @@ class Condenser:
         self._diagonal = np.diagonal(pairs).copy()
         at = np.flatnonzero(H.row == H.col)
         self._curved = at, H.row[at]
-        self._products = [
-            made for columns, same in _alike(groups) for made in _products(pairs, columns, same)
-        ]
+        self._products = [made for columns, same in groups for made in _products(pairs, columns, same)]
         self._stages = [_stage(found, rows, none, pairs, nothing) for found in systems]
         self._left = number[self.rows[self.equal]]
         self.pattern = couples[np.ix_(self.free, self.free)]
@@ -327,13 +325,12 @@ def _numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
 _lower = functools.cache(np.tril_indices)
 
 
-def _alike(groups: Sequence[_Rows]) -> Iterator[tuple[Index, list[_Rows]]]:
-    """Groups with as many columns as each other, and all their columns (group, column)."""
+def _alike(groups: Sequence[_Rows]) -> list[tuple[Index, list[_Rows]]]:
+    """All columns (group, column) of those groups that have as many as each other, and these groups."""
     sizes: dict[int, list[_Rows]] = {}
     for group in groups:
         sizes.setdefault(group[0].size, []).append(group)
-    for same in sizes.values():
-        yield np.array([columns for columns, _, _ in same]), same
+    return [(np.array([columns for columns, _, _ in same]), same) for same in sizes.values()]
 
 
 def _products(pairs: Places, columns: Index, groups: list[_Rows]) -> list[Products]:

@@ -13,7 +13,7 @@ Where no step is progress any more the rows become elastic: they may be violated
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -77,16 +77,20 @@ class InteriorRun(Run):
 
     def __init__(self, task: Task):
         super().__init__(task)
-        options = self.options
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
         self._sequence: Vector | None = getattr(task.program, "sequence", None)
-        self._sigma, self._price = 1.0, options.price  # of the objective; of elastic rows
-        self._changes = self._crawled = 0
+        self._price = self.options.price  # of elastic rows
+        self._crawled = 0
         self._began = 0.0  # violation where only that began to count
-        self._warm = bool(np.any(self.y) or np.any(self.z))
-        self._mu = options.barrier_warm if self._warm else options.barrier
+        self._aim()
 
     # ------------------------------------------------------------------ start
+    def _aim(self) -> None:
+        """At the objective, from the multipliers given."""
+        self._sigma, self._changes = 1.0, 0  # weight of the objective
+        self._warm = bool(np.any(self.y) or np.any(self.z))
+        self._mu = self.options.barrier_warm if self._warm else self.options.barrier
+
     def _begin(self) -> None:
         p, y, z, point = self.program, self.y, self.z, self.point
         x = point.x
@@ -167,8 +171,7 @@ class InteriorRun(Run):
             return False
         self.point = self.program.point(x)
         self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
-        self._warm, self._mu = False, self.options.barrier
-        self._sigma, self._changes = 1.0, 0
+        self._aim()
         return self.point.differentiable
 
     def _iterate(self, note: str) -> Status:
@@ -218,7 +221,8 @@ class InteriorRun(Run):
             self._warm
             and self._kkt <= options.kkt_tolerance
             and point.max_violation <= options.violation_tolerance
-            and complementarity(self.program, point.x, point.g, self.y, self.z) <= options.kkt_tolerance
+            and complementarity(self.program, point.x, point.g, self.y, self.z)
+            <= options.complementarity_tolerance
         )
 
     def _change_aim(self, *, met: bool) -> Status | None:
@@ -273,11 +277,13 @@ class InteriorRun(Run):
         Else one slack of thousands stops all others. Only while no row is far off: it is worth nothing where
         rows are not about as linear as the step takes them to be.
         """
+        if self._elastic is not None or self.point.max_violation > _BENT:
+            return None
         length = self._x.longest(step.free, self._keep)
-        if self._elastic is not None or length <= _LONGER * longest or self.point.max_violation > _BENT:
+        if length <= _LONGER * longest:
             return None
         slack = self._s.short_of_bounds(self._s.values + length * step.slack, _SHORT)
-        trial = self._tried(self.point.x + length * step.d, slack)
+        trial = self._trial(step, length, slack)
         fine = trial.point.finite and trial.point.max_violation <= _BENT
         if not fine or not self._accepts(at, length, trial):
             return None
@@ -400,20 +406,18 @@ class InteriorRun(Run):
             rows = self._elastic.residual(rows) if excess is None else rows - excess
         return float(np.abs(residual[c.eliminated]).sum() + np.abs(rows).sum())
 
-    def _trial(self, step: _Step, length: float) -> _Trial:
-        trial = self._tried(self.point.x + length * step.d, self._s.values + length * step.slack)
-        if self._elastic is None or not trial.point.finite:
-            return trial
-        p, n = self._elastic.moved(length)
-        theta = self._theta(self._residual(trial.point, trial.slack), p - n)
-        return replace(trial, theta=theta, phi=trial.phi + self._elastic.cost(p, n, self._mu))
-
-    def _tried(self, x: Vector, slack: Vector) -> _Trial:
-        """A point to try, but for what elastic rows add."""
-        point = self.program.point(x)
+    def _trial(self, step: _Step, length: float, slack: Vector | None = None) -> _Trial:
+        """The point after a part of a step; slack: those there, if not the step's."""
+        point, mu = self.program.point(self.point.x + length * step.d), self._mu
+        slack = self._s.values + length * step.slack if slack is None else slack
         if not point.finite:
             return _Trial(point, slack, np.inf, np.inf)
-        return _Trial(point, slack, self._theta(self._residual(point, slack)), self._phi(point, slack))
+        phi = self._phi(point, slack)
+        excess = None
+        if self._elastic is not None:
+            p, n = self._elastic.moved(length)
+            phi, excess = phi + self._elastic.cost(p, n, mu), p - n
+        return _Trial(point, slack, self._theta(self._residual(point, slack), excess), phi)
 
     def _accepts(self, at: Progress, length: float, trial: _Trial) -> bool:
         assert self._filter is not None

@@ -104,7 +104,10 @@ class NewtonSystem:
             if self.shift > _MOST:
                 return False
         self._last = self.shift or self._last
-        self._spread: Vector | None = None
+        if hard and self._equal.size:
+            self._spread = self._matrix.solve(self._A.T)
+            # of the Schur complement: pseudo, as rows may depend on each other
+            self._inverse = np.linalg.pinv(self._A @ self._spread, rcond=_RANK)
         return True
 
     def _penalty(self) -> Vector:
@@ -171,13 +174,11 @@ class NewtonSystem:
         by_free, off = c.forward(g, r)
         by_free += self._A.T @ (own * off)
         by_free[self.held] = 0.0
+        free = -self._matrix.solve(by_free)
         extra = np.zeros(equal.size)
         if self._hard and equal.size:
-            free, spread = self._solved(by_free)
-            extra = self._schur @ (self._A @ free + off)
-            free -= spread @ extra
-        else:
-            free = -self._matrix.solve(by_free)
+            extra = self._inverse @ (self._A @ free + off)
+            free -= self._spread @ extra
         free[self.held] = 0.0
         d = c.expand(free)
         rows = np.concatenate([self._jacobian @ d, d[c.bounded]])
@@ -186,17 +187,6 @@ class NewtonSystem:
         y[equal] = own * (self._A @ free + off) + extra
         y[c.eliminated] = c.multipliers(dual, y[equal])
         return d, y, rows, dual
-
-    def _solved(self, by_free: Vector) -> tuple[Vector, Vector]:
-        """- K^-1 by_free (f,) and K^-1 A' (f, l); the two at once where the second is not known yet, with the
-        inverse of its Schur complement, which rows that depend on each other leave without one of full rank.
-        """
-        if self._spread is not None:
-            return -self._matrix.solve(by_free), self._spread
-        both = self._matrix.solve(np.column_stack([by_free, self._A.T]))
-        self._spread = both[:, 1:]
-        self._schur = np.linalg.pinv(self._A @ self._spread, rcond=_RANK)
-        return -both[:, 0], self._spread
 
     def _pulled(self, y: Vector) -> Vector:
         """Gradient of all rows with multipliers (m,)."""

@@ -35,8 +35,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     gc.collect()
 
 
-def compiled(*functions: Any) -> dict[str, Any]:
-    return cached("lanes", (), lambda: [in_lanes(f) for f in functions])
+def compiled(*functions: Any, count: int = LANES) -> dict[str, Any]:
+    return cached("lanes", (count,), lambda: [in_lanes(f, count) for f in functions])
 
 
 def every_operation() -> Any:
@@ -60,24 +60,25 @@ def every_operation() -> Any:
 
 
 @needs_compiler
-@pytest.mark.parametrize("part", [3, 10_000])
+@pytest.mark.parametrize(("part", "count"), [(3, 8), (10_000, 8), (3, 4), (3, 2)])
 def test_every_operation_gives_in_lanes_what_it_gives_alone(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, part: int
+    cache: Path, monkeypatch: pytest.MonkeyPatch, part: int, count: int
 ) -> None:
     monkeypatch.setattr(lanes, "_PART", part)
     functions = derivative_functions("all", *every_operation())
-    found, rng = compiled(*functions), np.random.default_rng(0)
+    found, rng = compiled(*functions, count=count), np.random.default_rng(0)
     for plain in functions:
         function = found[plain.name()]
-        mapped = plain.map(LANES)
+        mapped = plain.map(count)
         assert isinstance(in_lanes(plain), NativeCode)
         assert (function.name_in(), function.name_out()) == (plain.name_in(), plain.name_out())
         for i in range(plain.n_in()):
             assert function.sparsity_in(i) == mapped.sparsity_in(i)
         assert function.sparsity_out(0) == mapped.sparsity_out(0)
         for _ in range(5):
-            arguments = [rng.standard_normal((plain.size1_in(i), LANES)) for i in range(plain.n_in())]
-            arguments[1][0, :4] = arguments[0][0, :4]  # p equals a in four lanes, and does not in the others
+            arguments = [rng.standard_normal((plain.size1_in(i), count)) for i in range(plain.n_in())]
+            half = slice(count // 2)
+            arguments[1][0, half] = arguments[0][0, half]  # p equals a in half of the lanes
             arguments[0][2, ::2] = arguments[0][3, ::2]
             expected = np.array(mapped(*arguments).nonzeros())
             assert np.isfinite(expected).all()

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.batched import pattern
+from impactopt.nlp.batched import Block, pattern
 from impactopt.nlp.layout import Affine, Layout, select, stack
 from impactopt.nlp.rows import Rows
-from impactopt.nlp.structured import Block, StructuredProgram, derivative_functions
+from impactopt.nlp.structured import StructuredProgram, derivative_functions
 from impactopt.program import NonlinearProgram, Status
 
 Array = NDArray[np.float64]

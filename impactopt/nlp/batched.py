@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from impactopt.nlp.layout import Array
+from impactopt.nlp.layout import Affine, Array, stack
 from impactopt.nlp.rows import Index
 
 # of functions that take one instance a call: those in lanes are done before a thread has started
@@ -28,13 +31,23 @@ class BatchedFunction:
         # instances beyond `count` fill the last call up: they are the last one, again
         self.inputs = [np.zeros((calls * columns, function.size1_in(i))) for i in range(function.n_in())]
         self.inputs[1][...] = parameters[np.minimum(np.arange(calls * columns), count - 1)]
-        self._output = np.zeros((calls * columns, function.nnz_out(0) // columns))
-        self.count, self.output = count, self._output[:count]
+        self.count, self._shape = count, (calls * columns, function.nnz_out(0) // columns)
         for i, a in enumerate(self.inputs):
             if a.size:
                 self._buffer.set_arg(i, a.data)
-        if self._output.size:
-            self._buffer.set_res(0, self._output.data)
+        self.write_to(np.zeros(self.size))
+
+    @property
+    def size(self) -> int:
+        """Numbers that a call writes: those of the instances, and behind them what fills the last call up."""
+        return self._shape[0] * self._shape[1]
+
+    def write_to(self, numbers: Array) -> None:
+        """From now on calls write to these (size,)."""
+        self._all = numbers.reshape(self._shape)
+        self.output = self._all[: self.count]
+        if numbers.size:
+            self._buffer.set_res(0, self._all.data)
 
     def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
         """Rows are instances: z (count, n_z) -> (count, nnz of the output).
@@ -60,3 +73,53 @@ def pattern(sparsity: Any) -> tuple[Index, Index]:
     start = np.array(sparsity.colind(), dtype=np.intp)
     columns = np.repeat(np.arange(sparsity.size2()), start[1:] - start[:-1])
     return np.array(sparsity.row(), dtype=np.intp), columns
+
+
+@dataclass
+class Block:
+    """``count`` instances of a compiled function  out = f(z), its Jacobian and the Hessian of lambda.out."""
+
+    name: str
+    value: BatchedFunction
+    jacobian: BatchedFunction
+    hessian: BatchedFunction
+    n_in: int
+    n_out: int
+    count: int
+    lift: Affine  # (count * n_in)
+    jac_pattern: tuple[Index, Index]
+    hess_pattern: tuple[Index, Index]
+
+    @classmethod
+    def make(
+        cls,
+        name: str,
+        functions: dict[str, Any],
+        instances: Sequence[Sequence[Affine]],
+        parameters: ArrayLike,
+    ) -> Block:
+        """``functions``: of one instance, or `in_lanes`; ``instances``: of each, the slots that make up z.
+
+        ``parameters``: (n_p,) for all or (count, n_p).
+        """
+        f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
+        n_in, n_out = f.size1_in(0), f.size1_out(0)
+        lifts = [stack(slots) for slots in instances]
+        for lift in lifts:
+            if lift.size != n_in:
+                raise ValueError(f"block {name} takes {n_in} inputs, was given {lift.size}")
+        count = len(lifts)
+        p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))
+        value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
+        return cls(
+            name=name,
+            value=value,
+            jacobian=jacobian,
+            hessian=hessian,
+            n_in=n_in,
+            n_out=n_out,
+            count=count,
+            lift=stack(lifts),
+            jac_pattern=jacobian.pattern,
+            hess_pattern=hessian.pattern,
+        )

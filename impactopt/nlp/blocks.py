@@ -17,6 +17,7 @@ import numpy as np
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
+from impactopt.nlp.lanes import LANES
 
 FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
 DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
@@ -26,7 +27,8 @@ DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
 class BlockExpression:
     """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``.
 
-    through : numbers that ``out`` is written with, and what they are of (z, p).
+    through : numbers that ``out`` is written with, and what they are of (z, p).  lanes : of `in_lanes`, about
+        as many as there are instances.
     """
 
     z: Any
@@ -34,10 +36,15 @@ class BlockExpression:
     out: Any
     sizes: dict[str, int]
     through: tuple[Any, Any] | None = None
+    lanes: int = LANES
 
 
 def make_block(
-    z: list[Any], p: list[Any], out: dict[str, Any], through: list[tuple[Any, Any]] | None = None
+    z: list[Any],
+    p: list[Any],
+    out: dict[str, Any],
+    through: list[tuple[Any, Any]] | None = None,
+    lanes: int = LANES,
 ) -> BlockExpression:
     """A block from parts of z and of p, and the named slices of its output.
 
@@ -50,6 +57,7 @@ def make_block(
         ca.vertcat(*out.values()),
         {k: int(v.numel()) for k, v in out.items()},
         inner,
+        lanes,
     )
 
 
@@ -93,7 +101,8 @@ def node(c: StanceCoordinates) -> BlockExpression:
     legs, w, T = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("T")
     limit, rate_limit = ca.SX.sym("limit", n), ca.SX.sym("rate_limit", c.nl)
     weight, lever, start = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("start", len(c.legs))
-    v, a = c.motion(y, legs, y1 / T, y2 / T**2)
+    u, udot = ca.SX.sym("u", ny), ca.SX.sym("udot", ny)
+    v, a = c.motion(y, legs, u, udot)
     rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
     tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(legs, w)
     out = {
@@ -103,7 +112,8 @@ def node(c: StanceCoordinates) -> BlockExpression:
         "leg_rate": _leg_part(c, v) / rate_limit,
         "extension": c.leg_determinants(legs) / start,
     }
-    return make_block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever, start], out)
+    through = [(u, y1 / T), (udot, y2 / T**2)]
+    return make_block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever, start], out, through)
 
 
 def _base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
@@ -126,7 +136,10 @@ def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
     q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
     point, twist, _ = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))
     return make_block(
-        [y, y1, T], [axes], {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)}
+        [y, y1, T],
+        [axes],
+        {"point": point, "velocity": ca.mtimes(ca.reshape(axes, 3, 3).T, twist)},
+        lanes=2,
     )
 
 
@@ -162,7 +175,7 @@ def coasting(c: StanceCoordinates) -> BlockExpression:
     T1, T, s, after = (ca.SX.sym(name) for name in ("T1", "T", "s", "after"))
     y = y0 + u0 * (after * T1 + T * s)
     out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
-    return make_block([y0, u0, T1, T, legs, rates], [s, after], out)
+    return make_block([y0, u0, T1, T, legs, rates], [s, after], out, lanes=4)
 
 
 def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
@@ -206,7 +219,7 @@ def collision(c: StanceCoordinates, striker: str) -> BlockExpression:
     }
     z = [y0, u0, ref_legs, ref_rates, ff, d1, T1, d, T, u, u1, legs, f, w]
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
-    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through)
+    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through, lanes=4)
 
 
 def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -> BlockExpression:
@@ -265,7 +278,8 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -
     }
     z = [y0, d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
     through = [(y, y0 + T1 * d1 + T * d), (gone, T1 * x1 + T * x)]
-    return make_block(z, [point, normal, restituting, within, shortest, of_law, of_target], out, through)
+    p = [point, normal, restituting, within, shortest, of_law, of_target]
+    return make_block(z, p, out, through, lanes=4)
 
 
 def typical_state(target: Target) -> tuple[float, ...]:
@@ -307,7 +321,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
         "blow": blow * inverse_mass + lost - (1 + e) * approach,
     }
     p = [normal, rigid, given, stiffness, damping, inverse_mass, limit, weight, lever]
-    return make_block([y, legs, u0, du, w, blow], p, out)
+    return make_block([y, legs, u0, du, w, blow], p, out, lanes=2)
 
 
 def two_mass_restitution(ratio: Any) -> Any:
@@ -357,16 +371,16 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     vertical speed; angular momentum.
     """
     y, y1, legs, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("T")
-    rb = c.rb
+    rb, u = c.rb, ca.SX.sym("u", c.ny)
     momentum = ca.Function("momentum", [rb.q, rb.v], [rb.com(), rb.centroidal_momentum(rb.v)])
-    com, h = momentum(c.configuration(y, legs), c.velocity(y, legs, y1 / T))
+    com, h = momentum(c.configuration(y, legs), c.velocity(y, legs, u))
     mass = sum(i.mass for i in c.model.inertias)
     velocity = h[:3] / mass
     capture = com[:2] + velocity[:2] * ca.sqrt(com[2] / 9.81)
     polygon = ca.SX.sym("polygon", 3 * edges)
     e = ca.reshape(polygon, 3, edges).T
     out = {"capture": ca.mtimes(e[:, :2], capture) - e[:, 2], "vertical": velocity[2], "angular": h[3:]}
-    return make_block([y, y1, legs, T], [polygon], out)
+    return make_block([y, y1, legs, T], [polygon], out, [(u, y1 / T)], lanes=2)
 
 
 def builders(

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 from impactopt.cone import contact_wrench_cone
 from impactopt.coordinates import StanceCoordinates
 from impactopt.nlp import blocks as symbolic
+from impactopt.nlp.batched import Block
 from impactopt.nlp.collision import DIRECTIONS
 from impactopt.nlp.layout import Affine, Array, Group, Layout
 from impactopt.nlp.rows import Index, Measure, Place, Rows, along, percent
-from impactopt.nlp.structured import Block, StructuredProgram
+from impactopt.nlp.structured import StructuredProgram
 from impactopt.problem import ImpactProblem
 from impactopt.terms import (
     Balance,

@@ -70,14 +70,14 @@ def peak(stages: int) -> BlockExpression:
     f = ca.SX.sym("f", stages)
     g = f / FORCE_SCALE
     # even powers: the sum below is never zero, whatever the signs on the way
-    return make_block([f], [], {"peak": ca.sum1(g**9) / (ca.sum1(g**8) + 1e-12)})
+    return make_block([f], [], {"peak": ca.sum1(g**9) / (ca.sum1(g**8) + 1e-12)}, lanes=2)
 
 
 def energy(target: Any) -> BlockExpression:
     """What the target holds or has used up.  z = its state;  p = its numbers;  out = energy [J]."""
     state, numbers = ca.SX.sym("state", target.n_states), ca.SX.sym("numbers", len(target.parameters))
     named = {name: numbers[i] for i, name in enumerate(target.parameters)}
-    return make_block([state], [numbers], {"energy": ca.SX(target.energy(state, named))})
+    return make_block([state], [numbers], {"energy": ca.SX(target.energy(state, named))}, lanes=2)
 
 
 def effort(n: int) -> BlockExpression:
@@ -208,7 +208,7 @@ def hit_region(c: StanceCoordinates, striker: str, disc: bool) -> BlockExpressio
     at = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
     way = ca.mtimes(ca.reshape(rows, 3, 3).T, at - point)
     side = (ca.sumsqr(way[1:]) - radius**2) / (2 * radius) if disc else way[1:]
-    return make_block([y], [point, rows, radius], {"depth": way[0], "side": side})
+    return make_block([y], [point, rows, radius], {"depth": way[0], "side": side}, lanes=2)
 
 
 TYPICAL = 1.0  # [m/s] of a strike
@@ -226,4 +226,4 @@ def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:
     speed = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
     along, *across = ca.vertsplit(ca.mtimes(ca.reshape(rows, 3, 3).T, speed))
     room = ((tangent * along) ** 2 - ca.sumsqr(ca.vertcat(*across))) / (2 * tangent * TYPICAL)
-    return make_block([y, y1, T], [rows, tangent], {"room": room})
+    return make_block([y, y1, T], [rows, tangent], {"room": room}, lanes=2)

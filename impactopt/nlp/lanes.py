@@ -1,4 +1,4 @@
-"""Functions of eight instances at once: C in which each number of one instance is a vector, a lane each.
+"""Functions of several instances at once: C in which each number of one instance is a vector, a lane each.
 
 CasADi's C takes the instances one after the other, a number at a time. The same operations in the same order
 on vectors need about as many of the CPU's instructions for eight instances as for one.
@@ -16,7 +16,9 @@ from impactopt.codegen import NativeCode
 
 __all__ = ["LANES", "in_lanes"]
 
-LANES = 8  # of any CPU: where its vectors are narrower, the compiler takes several
+# of any CPU: where its vectors are narrower, the compiler takes several. Fewer, a power of two, for functions
+# of few instances: lanes that are idle cost as much as the others, in memory between the caches above all
+LANES = 8
 # a compiler takes more than linear time for a long function: it gets parts of so many operations
 _PART = 500
 # what runs one after the other stands one after the other
@@ -68,49 +70,51 @@ _KNOWN = {*_OF_VECTORS, *_IN_EACH_LANE, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST}
 
 # The passes left out look for what CasADi has found before: without them it compiles in two thirds of the
 # time, and what it makes is as fast.
-_HEAD = f"""#include <math.h>
+_HEAD = """#include <math.h>
 #include <stdint.h>
-#define LANES {LANES}
 typedef double vec __attribute__((vector_size(8 * LANES)));
-#define ALL(number) ((vec){{0}} + (number))
+#define ALL(number) ((vec){0} + (number))
 #define IN_EACH_LANE(name, formula) \\
-  static vec name(vec a, vec b) {{ \\
+  static vec name(vec a, vec b) { \\
     vec c; \\
-    for (int i = 0; i < LANES; i++) {{ double x = a[i], y = b[i]; c[i] = formula; }} \\
+    for (int i = 0; i < LANES; i++) { double x = a[i], y = b[i]; c[i] = formula; } \\
     return c; \\
-  }}
+  }
 /* from a column an instance to a lane an instance, and back */
-static void into_lanes(const double *columns, int rows, vec *out) {{
+static void into_lanes(const double *columns, int rows, vec *out) {
   for (int k = 0; k < rows; k++)
     for (int i = 0; i < LANES; i++) out[k][i] = columns ? columns[i * rows + k] : 0;
-}}
-static void out_of_lanes(const vec *rows, int count, double *columns) {{
+}
+static void out_of_lanes(const vec *rows, int count, double *columns) {
   if (columns)
     for (int i = 0; i < LANES; i++)
       for (int k = 0; k < count; k++) columns[i * count + k] = rows[k][i];
-}}
+}
 /* Code that runs once a call, megabytes of it, has left the caches by the next call: it is asked for a part
    ahead, or the CPU would wait for every line of it. */
-static inline void fetch(const void *from, const void *to) {{
+static inline void fetch(const void *from, const void *to) {
   for (const char *line = from; line < (const char *)to; line += 64) __builtin_prefetch(line, 0, 2);
-}}
+}
 #pragma GCC optimize ("no-tree-dse", "no-dse", "no-tree-fre", "no-tree-forwprop")
 """
 
 
-def in_lanes(function: ca.Function) -> NativeCode | ca.Function:
-    """The function of `LANES` instances, called as ``function.map(LANES)``: an instance a column.
+def in_lanes(function: ca.Function, lanes: int = LANES) -> NativeCode | ca.Function:
+    """The function of so many instances, called as ``function.map(lanes)``: an instance a column.
 
+    lanes : a power of two.
     function : of SX. One with an operation that is not known here stays as it is, and takes the place of the
         other where there is no compiler: how many instances a function takes is read off its columns.
     """
     kinds = {function.instruction_id(k) for k in range(function.n_instructions())}
     if not kinds <= _KNOWN:
         return function
-    return NativeCode(name=function.name(), code=_code(function, kinds), graph=lambda: function, level=_LEVEL)
+    return NativeCode(
+        name=function.name(), code=_code(function, kinds, lanes), graph=lambda: function, level=_LEVEL
+    )
 
 
-def _code(function: ca.Function, kinds: set[int]) -> str:
+def _code(function: ca.Function, kinds: set[int], lanes: int) -> str:
     """One array of vectors: the registers that CasADi numbers, the inputs, the outputs."""
     at = int(function.sz_w())
     places, before, after = [], [], []
@@ -128,7 +132,8 @@ def _code(function: ca.Function, kinds: set[int]) -> str:
     calls = [f"{fetch}\n  {part}(v);" for part, fetch in zip_longest(called, ahead, fillvalue="")]
     body = [*before, *calls, *after]
     each = [f"IN_EACH_LANE(op_{kind}, {formula})" for kind, formula in _IN_EACH_LANE.items() if kind in kinds]
-    return "\n".join([_HEAD, *each, *places, *parts, _interface(function, body, at)])
+    head = f"#define LANES {lanes}\n{_HEAD}"
+    return "\n".join([head, *each, *places, *parts, _interface(function, body, at, lanes)])
 
 
 Operation = tuple[str, list[int], list[int]]  # in C, with register 5 as a5; the registers read; and written
@@ -186,11 +191,11 @@ def _parts(operations: list[Operation]) -> list[str]:
     return parts[::-1]
 
 
-def _interface(function: ca.Function, body: list[str], vectors: int) -> str:
+def _interface(function: ca.Function, body: list[str], vectors: int, lanes: int) -> str:
     """What CasADi writes around a function of as many instances as there are lanes, around this body."""
     names = function.name_in(), function.name_out()
-    inputs = [ca.SX.sym("x", ca.repmat(function.sparsity_in(i), 1, LANES)) for i in range(function.n_in())]
-    shapes = [ca.repmat(function.sparsity_out(i), 1, LANES) for i in range(function.n_out())]
+    inputs = [ca.SX.sym("x", ca.repmat(function.sparsity_in(i), 1, lanes)) for i in range(function.n_in())]
+    shapes = [ca.repmat(function.sparsity_out(i), 1, lanes) for i in range(function.n_out())]
     hollow = ca.Function(function.name(), inputs, [ca.SX(ca.DM(shape, 0.0)) for shape in shapes], *names)
     generator = ca.CodeGenerator("c", {"with_header": False})
     generator.add(hollow)
@@ -199,4 +204,4 @@ def _interface(function: ca.Function, body: list[str], vectors: int) -> str:
     end = code.index("\n}\n", start)
     aligned = "vec *v = (vec *)(((uintptr_t)w + sizeof(vec) - 1) / sizeof(vec) * sizeof(vec));"
     code = code[:start] + "\n  ".join(["", aligned, *body, "return 0;"]) + code[end:]
-    return re.sub(r"(\*sz_w = )\d+", rf"\g<1>{LANES * (vectors + 1)}", code)
+    return re.sub(r"(\*sz_w = )\d+", rf"\g<1>{lanes * (vectors + 1)}", code)

@@ -62,7 +62,8 @@ def block_functions(
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
             b = block.build()
-            return [in_lanes(function) for function in derivative_functions(name, b.z, b.p, b.out, b.through)]
+            found = derivative_functions(name, b.z, b.p, b.out, b.through)
+            return [in_lanes(function, b.lanes) for function in found]
 
         out |= cached(f"{robot.name}-{name}", (name, *recipe, *block.key), functions, report=report)
     return out

@@ -165,7 +165,7 @@ class Condenser:
         at = np.flatnonzero(H.row == H.col)
         self._curved = at, H.row[at]
         self._products = [made for columns, same in groups for made in _products(pairs, columns, same)]
-        self._stages = [_stage(found, rows, none, pairs, nothing) for found in systems]
+        self._stages = [_stage(same, rows, pairs) for found in systems for same in _shapes(found)]
         self._left = number[self.rows[self.equal]]
         self.pattern = couples[np.ix_(self.free, self.free)]
         of_left = touches[np.ix_(self._left, self.free)]
@@ -341,28 +341,27 @@ def _products(pairs: Places, columns: Index, groups: list[_Rows]) -> list[Produc
     ]
 
 
-def _stage(systems: list[_Touched], rows: Places, none: int, pairs: Places, nothing: int) -> Stage:
-    """rows, pairs : places of the entries of equalities and W, as of `_numbered`."""
-    (m, n), k, r = rows.shape, len(systems), systems[0].q.size
-    nt, nc = max(s.t.size for s in systems), max(s.c.size for s in systems)
-    nu = nc + max(s.u.size - s.c.size for s in systems)
+def _shapes(systems: list[_Touched]) -> list[list[_Touched]]:
+    """Systems of one elimination that touch as many variables and rows as each other."""
+    out: dict[tuple[int, int, int], list[_Touched]] = {}
+    for s in systems:
+        out.setdefault((s.c.size, s.u.size, s.t.size), []).append(s)
+    return list(out.values())
 
-    def places(*shape: int, fill: int) -> Places:
-        return np.full((k, *shape), fill, dtype=np.int32)
 
-    q, e, t, u = places(r, fill=m), places(r, fill=n), places(nt, fill=m), places(nu, fill=n)
-    qe, qc, te, tc = (places(*s, fill=none) for s in ((r, r), (nc, r), (nt, r), (nt, nc)))
-    hee, heu, hcc, hcv = (
-        places(*s, fill=nothing) for s in ((r, r), (nu, r), (nc * (nc + 1) // 2,), (nc, nu - nc))
-    )
-    for i, s in enumerate(systems):
-        c, own_t = slice(s.c.size), slice(s.t.size)
-        at = np.concatenate([np.arange(s.c.size), nc + np.arange(s.u.size - s.c.size)])
-        q[i], e[i], u[i, at], t[i, own_t] = s.q, s.e, s.u, s.t
-        qe[i], qc[i, c] = rows[np.ix_(s.q, s.e)].T, rows[np.ix_(s.q, s.c)].T
-        te[i, own_t], tc[i, own_t, c] = rows[np.ix_(s.t, s.e)], rows[np.ix_(s.t, s.c)]
-        hee[i], heu[i, at] = pairs[np.ix_(s.e, s.e)], pairs[np.ix_(s.u, s.e)]
-        lower = _lower(s.c.size)
-        hcc[i, : lower[0].size] = pairs[np.ix_(s.c, s.c)][lower]
-        hcv[i, c, : s.u.size - s.c.size] = pairs[np.ix_(s.c, s.u[s.c.size :])]
-    return Stage(q=q, e=e, t=t, u=u, qe=qe, qc=qc, te=te, tc=tc, hee=hee, heu=heu, hcc=hcc, hcv=hcv)
+def _stage(systems: list[_Touched], rows: Places, pairs: Places) -> Stage:
+    """Systems of one shape; rows, pairs : places of the entries of equalities and W, as of `_numbered`."""
+    q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
+    i, j = _lower(c.shape[1])
+    places = {
+        "qe": rows[q[:, None, :], e[:, :, None]],
+        "qc": rows[q[:, None, :], c[:, :, None]],
+        "te": rows[t[:, :, None], e[:, None, :]],
+        "tc": rows[t[:, :, None], c[:, None, :]],
+        "hee": pairs[e[:, :, None], e[:, None, :]],
+        "heu": pairs[u[:, :, None], e[:, None, :]],
+        "hcc": pairs[c[:, i], c[:, j]],
+        "hcv": pairs[c[:, :, None], u[:, None, c.shape[1] :]],
+    }
+    numbers = {"q": q, "e": e, "t": t, "u": u, **places}
+    return Stage(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})

@@ -14,7 +14,7 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from impactopt.codegen import compiled_library
 from impactopt.program import Vector
-from impactopt.sqp.kernels import Kernels, Panels, Places, Products, Stack, Stage
+from impactopt.sqp.kernels import Index, Kernels, Panels, Places, Products, Stack, Stage
 
 _ROUTINES = (
     (cython_blas, "dgemm"),
@@ -55,7 +55,7 @@ def _pointer(module: Any, name: str) -> int:
 
 
 _OF_STAGES = (
-    *("q", "e", "t", "u", "qe", "qc", "te", "tc", "hee", "heu", "hcc", "hcv"),
+    *("q", "e", "t", "u", "qe", "qc", "te", "tc", "hee", "heu"),
     *("lu", "pivots", "X", "T", "H", "G", "x0", "own"),
 )
 _OF_PANELS = ("size", "height", "first", "below", "row_at", "start", "at")
@@ -64,7 +64,7 @@ _OF_PANELS = ("size", "height", "first", "below", "row_at", "start", "at")
 class _Stage(ctypes.Structure):
     _fields_ = (
         *[(name, ctypes.c_int64) for name in ("k", "r", "nt", "nc", "nu")],
-        *[(name, ctypes.c_void_p) for name in (*_OF_STAGES, "work")],
+        *[(name, ctypes.c_void_p) for name in (*_OF_STAGES, "work", "hcc", "hcv")],
     )
 
 
@@ -93,10 +93,13 @@ class CompiledKernels(Kernels):
         for a in stages:
             k, nt, nc = a.tc.shape
             r, nu = a.q.shape[1], a.u.shape[1]
-            work = np.zeros(max(nt * nc, r * (nu + nc) + max(r, nc) * nu, r + max(nt, nc, nu)) + 1)
-            arrays = [getattr(a, name) for name in _OF_STAGES]
-            made.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in (*arrays, work)]))
-            keep.append(work)
+            spread = nc * max(nc + 1, nu)  # of products of variables that rows touch, and of others
+            work = np.zeros(max(nt * nc, r * (nu + nc) + max(r * nu, spread), r + max(nt, nc, nu)) + 1)
+            within = _runs(a.hcc.ravel(), np.arange(k)[:, None] * a.hcc.shape[1] + _rows_of_triangle(nc))
+            beyond = _runs(a.hcv.transpose(0, 2, 1).ravel(), np.arange(k * (nu - nc)) * nc)
+            arrays = [*[getattr(a, name) for name in _OF_STAGES], work, within, beyond]
+            made.append(_Stage(k, r, nt, nc, nu, *[x.ctypes.data for x in arrays]))
+            keep.append(arrays)
         return (_Stage * len(made))(*made), ctypes.c_int64(len(made)), keep
 
     @staticmethod
@@ -112,14 +115,19 @@ class CompiledKernels(Kernels):
     @staticmethod
     def _groups(products: Sequence[Products]) -> tuple[Any, ...]:
         empty = [np.zeros(0, np.int32)]
+        columns = [p.values.shape[1] for p in products]
+        before = np.cumsum([0, *[p.to.size for p in products]])
+        rows = [start + _rows_of_triangle(m) for start, m in zip(before, columns, strict=False)]
         parts = (
             np.array([p.rows.size for p in products], dtype=np.int32),
-            np.array([p.values.shape[1] for p in products], dtype=np.int32),
+            np.array(columns, dtype=np.int32),
             np.concatenate(empty + [p.rows for p in products]),
             np.concatenate(empty + [p.values.ravel() for p in products]),
-            np.concatenate(empty + [p.to for p in products]),
+            _runs(np.concatenate(empty + [p.to for p in products]), np.concatenate(empty + rows)),
         )
-        return parts, np.zeros(max([p.to.size for p in products], default=0) + 1)
+        return parts, np.zeros(
+            max([(p.rows.size + 1) * (p.values.shape[1] + 1) for p in products], default=1)
+        )
 
     # ------------------------------------------------------------------ the operations
     def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
@@ -153,6 +161,21 @@ class CompiledKernels(Kernels):
         shape = (ctypes.c_int64(x.shape[0]), ctypes.c_int64(x.shape[1]))
         self._c.newton_solve(self._of(p, self._panels)[0], _at(values), _at(x), *shape)
         return x
+
+
+def _runs(places: Places, first: Index) -> Places:
+    """Places in runs of neighbours (runs, 2): the first and how many; a run begins at each of ``first``."""
+    begins = np.append(True, places[1:] != places[:-1] + 1)[: places.size]
+    begins[first.ravel()] = True
+    at = np.flatnonzero(begins)
+    return np.column_stack([places[at], np.diff(np.append(at, places.size))]).astype(np.int32)
+
+
+@functools.cache
+def _rows_of_triangle(n: int) -> Index:
+    """Where the rows of a lower triangle begin."""
+    i = np.arange(n)
+    return i * (i + 1) // 2
 
 
 def _at(array: npt.NDArray[Any] | Places) -> ctypes.c_void_p:

@@ -32,13 +32,28 @@ EXPORT void newton_setup(void **f) {
     getrf = (getrf_t *)f[4], getrs = (getrs_t *)f[5], potrf = (potrf_t *)f[6];
 }
 
+/* `length` places, one after the other from `place` on */
+typedef struct {
+    int32_t place, length;
+} run;
+
+/* Add n numbers to W, run by run; the run after them. */
+static inline const run *scatter(const run *to, int n, const double *restrict numbers, double *restrict W) {
+    for (int j = 0; j < n; j += to++->length) {
+        double *places = W + to->place;
+        for (int l = 0; l < to->length; ++l) places[l] += numbers[j + l];
+    }
+    return to;
+}
+
 /* One stage: k systems of r rows, nt other rows, nc and nu variables touched. */
 typedef struct {
     int64_t k, r, nt, nc, nu;
-    int32_t *q, *e, *t, *u, *qe, *qc, *te, *tc, *hee, *heu, *hcc, *hcv;
+    int32_t *q, *e, *t, *u, *qe, *qc, *te, *tc, *hee, *heu;
     double *lu;
     int32_t *pivots;
     double *X, *T, *H, *G, *x0, *own, *work;
+    const run *hcc, *hcv; /* of all systems, row by row of the lower triangle, and variable by variable */
 } stage;
 
 static void take(const double *from, const int32_t *at, int64_t count, double *to) {
@@ -51,24 +66,44 @@ EXPORT void newton_copy(const double *values, const int32_t *source, double *to,
 }
 
 /* ---------------------------------------------------------------- matrices */
-/* Rows of groups, one after the other: g rows over p columns; W's places of the products of two. */
+/* sums (n) of four rows (m) or fewer, each times a factor */
+static inline void add_rows(double *restrict sums, int n, int count, const double *f, const double *v, int m) {
+    const double *v1 = v + m, *v2 = v1 + m, *v3 = v2 + m;
+    if (count == 1)
+        for (int j = 0; j < n; ++j) sums[j] += f[0] * v[j];
+    else if (count == 2)
+        for (int j = 0; j < n; ++j) sums[j] += f[0] * v[j] + f[1] * v1[j];
+    else if (count == 3)
+        for (int j = 0; j < n; ++j) sums[j] += f[0] * v[j] + f[1] * v1[j] + f[2] * v2[j];
+    else
+        for (int j = 0; j < n; ++j) sums[j] += f[0] * v[j] + f[1] * v1[j] + f[2] * v2[j] + f[3] * v3[j];
+}
+
+/* Rows of groups, one after the other: g rows over p columns; runs of W's places of the products of two, row
+   by row of their lower triangle. work: the rows of a group that have a weight, these weights, and the sums of
+   one row of products. */
 EXPORT void newton_products(int64_t groups, const int32_t *g, const int32_t *p, const int32_t *rows,
-                            const int32_t *values, const int32_t *to, const double *J, const double *weights,
+                            const int32_t *values, const run *to, const double *J, const double *weights,
                             double *W, double *work) {
     for (int64_t k = 0; k < groups; ++k) {
-        int m = p[k];
-        memset(work, 0, sizeof(double) * m * (m + 1) / 2);
+        int m = p[k], live = 0;
+        double *v = work, *weight = work + g[k] * m, *sums = weight + g[k];
         for (int row = 0; row < g[k]; ++row, values += m) {
-            double w = weights[*rows++], *out = work;
+            double w = weights[*rows++];
             if (w == 0.0) continue;
-            double v[m];
-            take(J, values, m, v);
-            for (int i = 0; i < m; ++i) {
-                double s = w * v[i];
-                for (int j = 0; j <= i; ++j) *out++ += s * v[j];
-            }
+            take(J, values, m, v + live * m);
+            weight[live++] = w;
         }
-        for (int i = 0; i < m * (m + 1) / 2; ++i) W[*to++] += work[i];
+        for (int i = 0; i < m; ++i) {
+            memset(sums, 0, sizeof(double) * (i + 1));
+            for (int row = 0; row < live; row += 4) {
+                int count = live - row < 4 ? live - row : 4;
+                double f[4];
+                for (int q = 0; q < count; ++q) f[q] = weight[row + q] * v[(row + q) * m + i];
+                add_rows(sums, i + 1, count, f, v + row * m, m);
+            }
+            to = scatter(to, i + 1, sums, W);
+        }
     }
 }
 
@@ -136,24 +171,31 @@ static int eliminate(stage *a, double *J, int64_t none) {
     return 0;
 }
 
+/* Where the runs of the next system begin. */
+typedef struct {
+    const run *cc, *cv;
+} targets;
+
 /* W += C + C' for the variables that rows touch, C for the others, C = X' G */
-static void spread(const stage *a, int64_t k, double *X, double *G, double *C, double *W) {
-    int r = a->r, nc = a->nc, nu = a->nu;
-    const int32_t *to = a->hcc + k * nc * (nc + 1) / 2;
-    gemm("T", "N", &nu, &nc, &r, &one, G, &r, X, &r, &zero, C, &nu);
-    for (int i = 0; i < nc; ++i)
-        for (int j = 0; j <= i; ++j) W[*to++] += C[i * nu + j] + C[j * nu + i];
-    to = a->hcv + k * nc * (nu - nc);
-    for (int i = 0; i < nc; ++i)
-        for (int j = nc; j < nu; ++j) W[*to++] += C[i * nu + j];
+static targets spread(const stage *a, targets to, double *X, double *G, double *C, double *W) {
+    int r = a->r, nc = a->nc, nv = a->nu - nc;
+    gemm("T", "N", &nc, &nc, &r, &one, G, &r, X, &r, &zero, C, &nc);
+    double *sums = C + nc * nc;
+    for (int i = 0; i < nc; ++i) {
+        for (int j = 0; j <= i; ++j) sums[j] = C[i * nc + j] + C[j * nc + i];
+        to.cc = scatter(to.cc, i + 1, sums, W);
+    }
+    if (!nv) return to;
+    gemm("T", "N", &nc, &nv, &r, &one, X, &r, G + nc * r, &r, &zero, C, &nc);
+    for (int v = 0; v < nv; ++v) to.cv = scatter(to.cv, nc, C + v * nc, W);
+    return to;
 }
 
 /* the same for rows (r, nc) and (r, nu) of X and G, of which there are few */
-static inline __attribute__((always_inline)) void spread_rows(const stage *a, int64_t k, int r, const double *restrict X,
-                                                              const double *restrict G, double *restrict sums,
-                                                              double *restrict W) {
-    int nc = a->nc, nu = a->nu, nv = nu - nc;
-    const int32_t *within = a->hcc + k * nc * (nc + 1) / 2, *beyond = a->hcv + k * nc * nv;
+static inline __attribute__((always_inline)) targets spread_rows(const stage *a, targets to, int r,
+                                                                 const double *restrict X, const double *restrict G,
+                                                                 double *restrict sums, double *restrict W) {
+    int nc = a->nc, nu = a->nu;
     for (int i = 0; i < nc; ++i) {
         double x[FEW], g[FEW];
         for (int p = 0; p < r; ++p) x[p] = X[p * nc + i], g[p] = G[p * nu + i];
@@ -162,26 +204,31 @@ static inline __attribute__((always_inline)) void spread_rows(const stage *a, in
             for (int p = 0; p < r; ++p) sum += x[p] * G[p * nu + j] + g[p] * X[p * nc + j];
             sums[j] = sum;
         }
-        for (int j = 0; j <= i; ++j) W[*within++] += sums[j];
-        for (int j = 0; j < nv; ++j) {
+        to.cc = scatter(to.cc, i + 1, sums, W);
+    }
+    for (int v = nc; v < nu; ++v) {
+        double g[FEW];
+        for (int p = 0; p < r; ++p) g[p] = G[p * nu + v];
+        for (int j = 0; j < nc; ++j) {
             double sum = 0.0;
-            for (int p = 0; p < r; ++p) sum += x[p] * G[p * nu + nc + j];
+            for (int p = 0; p < r; ++p) sum += g[p] * X[p * nc + j];
             sums[j] = sum;
         }
-        for (int j = 0; j < nv; ++j) W[*beyond++] += sums[j];
+        to.cv = scatter(to.cv, nc, sums, W);
     }
+    return to;
 }
 
-static void spread_few(const stage *a, int64_t k, const double *X, const double *G, double *sums, double *W) {
+static targets spread_few(const stage *a, targets to, const double *X, const double *G, double *sums, double *W) {
     if (a->r == 6) /* a leg, a wrench: loops of a length that the compiler knows */
-        spread_rows(a, k, 6, X, G, sums, W);
-    else
-        spread_rows(a, k, a->r, X, G, sums, W);
+        return spread_rows(a, to, 6, X, G, sums, W);
+    return spread_rows(a, to, a->r, X, G, sums, W);
 }
 
 static void reduce(stage *a, double *W, int64_t none) {
     int r = a->r, nc = a->nc, nu = a->nu;
     double *G = a->work, *more = G + r * nu, *sums = more + r * nc;
+    targets to = {a->hcc, a->hcv};
     for (int64_t k = 0; k < a->k; ++k) {
         double *X = a->X + k * nc * r, *H = a->H + k * r * r, *own = a->G + k * nu * r;
         take(W, a->hee + k * r * r, r * r, H);
@@ -190,14 +237,14 @@ static void reduce(stage *a, double *W, int64_t none) {
         if (r > FEW) {
             for (int64_t i = 0; i < nu * r; ++i) G[i] = -own[i];
             gemm("N", "N", &r, &nc, &r, &half, H, &r, X, &r, &one, G, &r);
-            spread(a, k, X, G, more, W);
+            to = spread(a, to, X, G, more, W);
         } else {
             turn(X, r, nc, more);
             turn(own, r, nu, G);
             for (int i = 0; i < r * nu; ++i) G[i] = -G[i];
             for (int p = 0; p < r; ++p)
                 for (int q = 0; q < r; ++q) add(G + p * nu, 0.5 * H[q * r + p], more + q * nc, nc);
-            spread_few(a, k, more, G, sums, W);
+            to = spread_few(a, to, more, G, sums, W);
         }
         W[none] = 0.0;
     }

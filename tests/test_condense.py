@@ -69,7 +69,7 @@ def test_the_condensed_step_is_the_whole_one(algebra, seed, own, hard, indefinit
     assert c.rows[c.equal].tolist() == [m - 5]
     gradient, residual = rng.normal(size=n), rng.normal(size=c.m)
     weights, diagonal = 0.1 + rng.random(c.rows.size), rng.random(c.free.size)
-    newton = NewtonSystem(c, np.zeros(0, dtype=int), None, algebra)
+    newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
     assert newton.factor(J, H, diagonal, lambda _: weights.copy(), hard=hard)
     step, y = newton.solve(gradient, residual)
     # the same, whole: equalities J_e d = -r_e, other rows y = w (J d + r), stationarity
@@ -97,7 +97,7 @@ def test_a_variable_that_is_held_does_not_move(algebra):
     equal, bounded = np.zeros(J.shape[0], dtype=bool), np.zeros(J.shape[1], dtype=bool)
     equal[eliminations[0].rows.ravel()] = True
     c = Condenser(J, H, eliminations, equal, bounded, algebra)
-    newton = NewtonSystem(c, np.array([1]), np.arange(J.shape[1], dtype=float), algebra)
+    newton = NewtonSystem(c, np.array([1]), algebra)
     assert newton.factor(J, H, np.zeros(c.free.size), lambda _: np.ones(c.rows.size), hard=True)
     step, _ = newton.solve(rng.normal(size=J.shape[1]), rng.normal(size=c.m))
     assert step[c.free[1]] == 0.0
@@ -143,7 +143,7 @@ def test_the_factor_in_blocks_against_dense_algebra(algebra, seed, n, wide):
     K += np.eye(n)
     pattern = K != 0.0
     i, j = np.nonzero(np.tril(pattern))
-    matrix = BlockCholesky(pattern, np.arange(n, dtype=float) if seed % 2 else None, algebra)
+    matrix = BlockCholesky(pattern, algebra)
 
     def values(dense):
         out = np.zeros(matrix.size)
@@ -169,7 +169,7 @@ def test_a_motions_own_rows_are_found_and_its_step_is_the_whole_one(algebra, bip
     c = Condenser(J, H, find_eliminations(J, equal, wanted), equal, np.zeros(p.n, dtype=bool), algebra)
     assert c.eliminated.size == sum(w.variables.size for w in wanted)
     assert c.equal.size < 60  # of the hundreds there are
-    newton = NewtonSystem(c, np.zeros(0, dtype=int), p.sequence, algebra)
+    newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
     weights = 10.0 ** rng.uniform(-6, 6, size=c.rows.size)
     assert newton.factor(J, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
     gradient, residual = p.gradient(x), 1e-3 * rng.normal(size=p.m)

@@ -233,7 +233,6 @@ class ContactProgram(Builder):
             quadratic=quadratic,
             linear=linear,
             determined=self._determined(),
-            sequence=self._sequence(),
         )
 
     # ------------------------------------------------------------------ structure
@@ -260,10 +259,6 @@ class ContactProgram(Builder):
     def _starts(self) -> list[Index]:
         """Variables that the state after contact determines."""
         return []
-
-    def _sequence(self) -> Array | None:
-        """Where along the motion each variable has its say (n,), if it is not all at once."""
-        return None
 
     def _prices(self) -> Prices:
         raise NotImplementedError

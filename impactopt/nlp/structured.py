@@ -34,14 +34,12 @@ class StructuredProgram:
         quadratic: sp.spmatrix | sp.sparray,
         linear: Array,
         determined: Sequence[tuple[Rank, Index]] = (),
-        sequence: Array | None = None,
     ) -> None:
         """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds.
 
         determined : variables that equality rows of their own determine, with their rank in eliminating them.
-        sequence (n,) : place of the variables along the motion; near ones share rows.
         """
-        self.determined, self.sequence = tuple(determined), sequence
+        self.determined = tuple(determined)
         self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)
         n = self.n = layout.n
         self.x_lower, self.x_upper = layout.lower, layout.upper

@@ -297,21 +297,6 @@ class Transcription(ContactProgram):
     def _starts(self) -> list[Index]:
         return [follow.determined() for follow in self.follows]
 
-    def _sequence(self) -> Array:
-        """0 at the start, 1 at contact, 2 at rest; a second follow-through comes before, rest first."""
-        out = np.ones(self.layout.n)
-        last = self.problem.swing.intervals + 2
-        placed = [(self.swing_c, (3 + np.arange(self.swing_c.count)) / last)]
-        placed += [(self.swing_legs, self.swing_nodes), (self.swing_w, self.swing_nodes)]
-        for f in self.follows:
-            since, sign = (1.0, 1.0) if f is self.follow else (0.0, -1.0)
-            at, nodes = since + sign * np.arange(f.c.count) / f.c.count, since + sign * self.follow_nodes
-            placed += [(f.c, at), (f.legs, nodes), (f.w, nodes)]
-        for group, at in placed:
-            for k, place in enumerate(at):
-                out[group.index(k)] = place
-        return out
-
     # ------------------------------------------------------------------ solution
     def spline(
         self, x: Array, control: Callable[[int], Affine], breaks: Array, duration: Group

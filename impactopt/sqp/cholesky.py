@@ -5,51 +5,42 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from impactopt.program import Vector
 from impactopt.sqp.kernels import Index, Kernels, Panels, Places
-
-_BLOCK = 32  # variables
+from impactopt.sqp.ordering import elimination_blocks
 
 
 class BlockCholesky:
     """L L' = K for matrices whose pattern does not change.
 
-    Variables come in blocks; of each block of columns the blocks of rows that become nonzero are kept as one
-    panel, so that the work is a few dense products a panel (Davis, Direct Methods for Sparse Linear Systems,
-    2006, chapter 4: a supernodal factorization whose supernodes have one size).
+    Variables come in blocks (`ordering`); of each block of columns the blocks of rows that become nonzero are
+    kept as one panel, so that the work is a few dense products a panel (Davis, Direct Methods for Sparse
+    Linear Systems, 2006, chapter 4: a supernodal factorization).
 
     Attributes
     ----------
     size : of the array of all panels' numbers.
     """
 
-    def __init__(self, pattern: Any, sequence: Vector | None, kernels: Kernels):
-        """pattern: which entries may be nonzero (n, n), symmetric; sequence (n,): variables near each other
-        in it touch each other, None: to be found.
-        """
+    def __init__(self, pattern: Any, kernels: Kernels):
+        """pattern: which entries may be nonzero (n, n), symmetric."""
         n, self._kernels = pattern.shape[0], kernels
-        if sequence is None:
-            order = reverse_cuthill_mckee(sp.csr_matrix(pattern), symmetric_mode=True).astype(np.intp)
-        else:
-            order = np.argsort(sequence, kind="stable")
-        self._n, self._order = n, order
+        blocks = elimination_blocks(pattern)
+        count, sizes = len(blocks), np.array([b.size for b in blocks], dtype=np.intp)
+        self._n, self._order = n, np.concatenate([np.zeros(0, np.intp), *blocks])
         self._place = np.empty(n, dtype=np.intp)
-        self._place[order] = np.arange(n)
-        starts = np.arange(0, n, _BLOCK)
-        start = np.append(starts, n)
-        count = starts.size
+        self._place[self._order] = np.arange(n)
+        self._block = np.repeat(np.arange(count), sizes)  # of each place
+        start = np.append(0, np.cumsum(sizes))
         i, j = np.nonzero(pattern)
         filled = np.zeros((count, count), dtype=bool)
-        filled[self._place[i] // _BLOCK, self._place[j] // _BLOCK] = True
+        filled[self._block[self._place[i]], self._block[self._place[j]]] = True
         below: list[Places] = []
         for k in range(count):
             rows = (np.flatnonzero(filled[k + 1 :, k]) + k + 1).astype(np.int32)
             filled[np.ix_(rows, rows)] = True
             below.append(rows)
-        sizes = np.diff(start)
         row_at = np.full((count, count), -1, dtype=np.int32)
         height, at = np.zeros(count, dtype=np.int32), np.zeros(count + 1, dtype=np.intp)
         for k, rows in enumerate(below):
@@ -66,9 +57,10 @@ class BlockCholesky:
     def places(self, i: Index, j: Index) -> Index:
         """Where the entries (i, j) of the lower triangle, or (j, i), stand."""
         low, high = np.maximum(self._place[i], self._place[j]), np.minimum(self._place[i], self._place[j])
-        row, column = low // _BLOCK, high // _BLOCK
+        row, column = self._block[low], self._block[high]
         p = self._panels
-        out: Index = p.at[column] + p.height[column] * (high % _BLOCK) + p.row_at[row, column] + low % _BLOCK
+        across, down = high - p.start[column], p.row_at[row, column] + low - p.start[row]
+        out: Index = p.at[column] + p.height[column] * across + down
         return out
 
     def factor(self, values: Vector) -> bool:

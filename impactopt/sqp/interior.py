@@ -78,7 +78,6 @@ class InteriorRun(Run):
     def __init__(self, task: Task):
         super().__init__(task)
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
-        self._sequence: Vector | None = getattr(task.program, "sequence", None)
         self._price = self.options.price  # of elastic rows
         self._crawled = 0
         self._began = 0.0  # violation where only that began to count
@@ -104,7 +103,6 @@ class InteriorRun(Run):
             equal=p.g_lower == p.g_upper,
             bounded=bounded,
             moves=moves,
-            sequence=self._sequence,
         )
         self._condenser = c = self._newton.condenser
         lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])

@@ -38,14 +38,11 @@ class NewtonSystem:
     shift : the last.
     """
 
-    def __init__(self, condenser: Condenser, held: Index, sequence: Vector | None, kernels: Kernels):
-        """held: numbers of the free variables that do not move; sequence (n,): variables near each other in
-        it touch each other, None: to be found.
-        """
+    def __init__(self, condenser: Condenser, held: Index, kernels: Kernels):
+        """held: numbers of the free variables that do not move."""
         self.condenser, self.held = condenser, held
         self._equal = condenser.rows[condenser.equal]  # numbers of the equalities left
-        order = None if sequence is None else sequence[condenser.free]
-        self._matrix = BlockCholesky(condenser.pattern, order, kernels)
+        self._matrix = BlockCholesky(condenser.pattern, kernels)
         self._from, i, j = condenser.at_free
         places = self._matrix.places
         self._to = places(i, j).astype(np.int32)
@@ -208,17 +205,16 @@ def borrow(
     equal: Mask,
     bounded: Mask,
     moves: Mask,
-    sequence: Vector | None,
 ) -> NewtonSystem:
-    """The system for these patterns, for one who gives it back: its structure takes as long as 30 iterations
+    """The system for these patterns, for one who gives it back: its structure takes as long as 10 iterations
     and serves all programs that differ in their numbers.
 
     determined : what rows determine; equal (m,): which rows are equalities; bounded, moves (n,): which
-    variables have a finite bound, and which are not fixed; sequence (n,): see `NewtonSystem`.
+    variables have a finite bound, and which are not fixed.
     """
     arrays = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
     arrays += [variables for _, variables in determined]
-    arrays += [equal, bounded, moves, np.zeros(0) if sequence is None else sequence]
+    arrays += [equal, bounded, moves]
     digest = hashlib.sha256(repr([rank for rank, _ in determined]).encode())
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}".encode())
@@ -230,7 +226,7 @@ def borrow(
         eliminations = find_eliminations(jacobian, equal, determined)
         condenser = Condenser(jacobian, hessian, eliminations, equal, bounded, algebra)
         held = np.flatnonzero(~moves[condenser.free])
-        system = NewtonSystem(condenser, held, sequence, algebra)
+        system = NewtonSystem(condenser, held, algebra)
     system.begin(key)
     return system
 

@@ -156,15 +156,22 @@ class Plan:
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
-        curve, start, nodes, wrench = self.swing, 0.0, self.swing_nodes, self.swing_wrench
+        curve, start = self.way(phase, missed=missed)
+        nodes, wrench = self.swing_nodes, self.swing_wrench
         if phase == 2:
-            nodes = self.follow_nodes
-            curve, wrench, start = self._last(missed)
+            nodes, wrench = self.follow_nodes, self._last(missed)[1]
         local = np.clip(ts - start, 0.0, curve.duration)
         y, yd, ydd = curve.sample(local)
         at = nodes * curve.duration
         w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
         return y, yd, ydd, w
+
+    def way(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float]:
+        """Spline and start [s] of the swing (phase 0) or the follow-through (2); ``missed``: of the brake."""
+        if phase == 0:
+            return self.swing, 0.0
+        curve, _, start = self._last(missed)
+        return curve, start
 
     def _last(self, missed: bool) -> tuple[CubicSpline, Array, float]:
         """Spline, wrenches and start [s] of the way to rest."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.between import NO_MORE, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.nlp.start import first_iterate, iterate_from_strike, strike_iterate
+from impactopt.nlp.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
 from impactopt.problem import ImpactProblem
@@ -20,6 +22,7 @@ from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, 
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
+_ROUNDS = 3  # of more nodes, at most
 
 
 def solve(
@@ -31,6 +34,7 @@ def solve(
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
+    between: bool = True,
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
 ) -> Solution:
@@ -43,6 +47,9 @@ def solve(
     starts : so many of them, the first one plain, the others with perturbed postures and other speeds, drawn
         by ``seed``; the best motion is kept, ``Solution.attempts`` tells of all.
     options : the solver's own.  time_limit [s] : of the solver, for all starts together.
+    between : whether a motion that leaves its limits between the nodes of its program gets more of them
+        there, and is solved once more from where it is: while it gives up half of a margin somewhere, at most
+        thrice. ``Solution.nodes`` tells where they are.
     report : told in words what is being built; callback : called with every iteration's record; returning
         True, or Ctrl-C, stops with the best iterate.
 
@@ -55,8 +62,9 @@ def solve(
     check_solver(solver)
     check_starts(starts, seed, given=not isinstance(start, str))
     given: str | Array | SolverResult
+    nodes = NO_MORE
     if isinstance(start, Solution):
-        given = start.result
+        given, nodes = start.result, start.nodes
     else:
         given = start if isinstance(start, str) else check_array("start", start, (None,))
     if isinstance(given, str) and given not in STARTS:
@@ -66,12 +74,47 @@ def solve(
         )
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report)
-    t = Transcription(problem, problem.coordinates, functions)
+    t = Transcription(problem, problem.coordinates, functions, nodes)
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began)
-    return Solution(plan=t.decode(fields["result"].x), **fields)
+    solution = Solution(plan=t.decode(fields["result"].x), nodes=nodes, **fields)
+    for _ in range(_ROUNDS if between else 0):
+        finer = _with_more_nodes(solution, t, budget)
+        if finer is None:
+            break
+        solution, t = finer
+    return solution
+
+
+def _with_more_nodes(
+    solution: Solution, t: Transcription, budget: Budget
+) -> tuple[Solution, Transcription] | None:
+    """The same motion with nodes where it leaves its limits between them, and its program; None where it does
+    not, or where they end in none that is usable.
+    """
+    if not solution.status.usable or budget.left == 0:
+        return None
+    nodes = nodes_to_add(solution.plan, t.nodes)
+    if nodes == t.nodes:
+        return None
+    began, old = time.perf_counter(), solution.result
+    finer = Transcription(t.problem, t.coordinates, t.functions, nodes)
+    x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
+    start = replace(old, x=x, multipliers=y, bound_multipliers=z)
+    name = f"{nodes.total} nodes more"
+    fields = solve_from(finer, [(name, lambda: start)], budget, began)
+    new = fields["result"]
+    if not new.status.usable:
+        return None
+    sums = ("iterations", "seconds", "seconds_functions", "seconds_qp")
+    fields["result"] = replace(new, **{key: getattr(old, key) + getattr(new, key) for key in sums})
+    for key in ("build_seconds", "solve_seconds"):
+        fields[key] += getattr(solution, key)
+    before = tuple(replace(attempt, kept=False) for attempt in solution.attempts)
+    fields["attempts"] = before + fields["attempts"]
+    return Solution(plan=finer.decode(new.x), nodes=nodes, **fields), finer
 
 
 def _starts(

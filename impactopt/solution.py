@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt import __version__
+from impactopt.between import NO_MORE, MoreNodes
 from impactopt.plan import Plan, Trajectory
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
@@ -69,10 +70,13 @@ class Solved:
 class Solution(Solved):
     """A solved (or stopped) impact problem.
 
-    plan : the motion; for a status that is not usable, that of the best iterate.  The rest: :class:`Solved`.
+    plan : the motion; for a status that is not usable, that of the best iterate.
+    nodes : what its program had beside the ends and middles of its splines' intervals, as
+        :func:`impactopt.solve` adds them.  The rest: :class:`Solved`.
     """
 
     plan: Plan
+    nodes: MoreNodes = NO_MORE
 
     @property
     def impulse(self) -> float:
@@ -147,6 +151,7 @@ class Solution(Solved):
             **blow_numbers(plan),
             "objectives": dict(self.objectives),
             "duration_s": plan.duration,
+            "nodes_added": self.nodes.total,
             **plan.margins(self.trajectory),
             "versions": versions(),
         }

@@ -33,6 +33,7 @@ LAYERS = (
         "_problem_checks",
         "problem",
         "plan",
+        "between",
     ),
     ("planned_strike",),
     ("nlp",),

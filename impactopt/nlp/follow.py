@@ -11,6 +11,7 @@ import numpy as np
 
 from impactopt.motion import CubicSpline
 from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.nlp.mesh import percentage
 from impactopt.nlp.rows import Index, Place
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ class FollowThrough:
         return np.concatenate([self.c.index(0), self.c.index(1)])
 
     def place_at(self, s: float) -> Place:
-        return Place(f"{self.place}, {100 * s:.0f} %", f"{self.place} at {{s}}", self.T[0] * s)
+        name = f"{self.place}, {percentage(s, self.t.nodes.follow)}"
+        return Place(name, f"{self.place} at {{s}}", self.T[0] * s)
 
     def nodes(self) -> tuple[list[list[Affine]], list[Place]]:
         """Slots of the block ``node`` and the places of its instances."""

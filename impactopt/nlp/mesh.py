@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +75,11 @@ def contact_mesh(problem: ImpactProblem) -> list[Stage]:
     if target.at_once:
         before[0] = (1.0,)
     return collision_mesh([*before, last], Radau.of_stages(problem.collision_stages), target.phases)
+
+
+def percentage(s: float, more: Collection[float]) -> str:
+    """What a place on [0, 1] is called; one of ``more`` with more digits, as others are near it."""
+    return f"{100 * s:.2f} %" if s in more else f"{100 * s:.0f} %"
 
 
 def with_middles(breaks: Array) -> Array:

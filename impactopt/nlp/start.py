@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,6 +116,41 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
         if mine is not None and mine.count == group.count:
             mine.write(out, group.read(x))
     return _finished(t, out)
+
+
+def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
+    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one.
+
+    What is at nodes is between those of the old nodes; multipliers are those of the same rows and variables.
+    """
+    places = {"swing": (old.swing_nodes, t.swing_nodes)}
+    places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
+    new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
+    for name, group in t.layout.groups.items():
+        known = old.layout.groups.get(name)
+        if known is None or not group.size:
+            continue
+        values, own = known.read(x), (z[known.index(k)] for k in range(known.count))
+        here = np.arange(group.count)
+        if known.count != group.count:
+            before, now = places[name.split()[0]]
+            here = np.flatnonzero(np.isin(now, before))
+            values = np.column_stack([np.interp(now, before, column) for column in values.T])
+        group.write(new, values)
+        for k, multipliers in zip(here, own, strict=True):
+            bounds[group.index(int(k))] = multipliers
+    of_rows = dict(zip(_keys(old), y, strict=True))
+    rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
+    return _finished(t, new), rows, bounds
+
+
+def _keys(t: Transcription) -> Iterator[tuple[str, str, str, int]]:
+    """What a row is, and how many of that name come before it."""
+    seen: dict[tuple[str, str, str], int] = {}
+    for row in t.program.origins:
+        name = row.term, row.place.name, row.component
+        seen[name] = seen.get(name, -1) + 1
+        yield *name, seen[name]
 
 
 def _write_hit(t: ContactProgram, x: Array, hit: Contact) -> None:

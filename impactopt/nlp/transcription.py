@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.between import NO_MORE, MoreNodes
 from impactopt.codegen import cached, model_hash
 from impactopt.coordinates import StanceCoordinates
 from impactopt.extra_terms import TorqueRate
@@ -25,7 +26,7 @@ from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.lanes import in_lanes
 from impactopt.nlp.layout import Affine, Array, Group, add, stack
-from impactopt.nlp.mesh import with_middles
+from impactopt.nlp.mesh import percentage, with_middles
 from impactopt.nlp.objective import Prices, motion_prices
 from impactopt.nlp.rows import Index, Measure, Place, Rank, along, by_leg, degrees, percent, rates
 from impactopt.nlp.structured import derivative_functions
@@ -70,17 +71,25 @@ def block_functions(
 
 
 class Transcription(ContactProgram):
-    """The program of one problem, with the groups that its solution is read from."""
+    """The program of one problem, with the groups that its solution is read from.
+
+    nodes : beside the ends and middles of the splines' intervals.
+    """
 
     def __init__(
-        self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
+        self,
+        problem: ImpactProblem,
+        coordinates: StanceCoordinates,
+        functions: dict[str, Any],
+        nodes: MoreNodes = NO_MORE,
     ) -> None:
         super().__init__(problem, coordinates, functions)
+        self.nodes = nodes
         self.swing_breaks = graded_breaks(problem.swing.intervals, problem.swing.grading, fine_end=True)
         self.follow_breaks = graded_breaks(problem.follow.intervals, problem.follow.grading, fine_end=False)
-        # nodes: ends and middles of the intervals; the swing's start is given
-        self.swing_nodes = with_middles(self.swing_breaks)[1:]
-        self.follow_nodes = with_middles(self.follow_breaks)
+        # the swing's start is given
+        self.swing_nodes = np.union1d(with_middles(self.swing_breaks)[1:], nodes.swing)
+        self.follow_nodes = np.union1d(with_middles(self.follow_breaks), nodes.follow)
         self.torques: list[Affine] = []  # over limit, at each node of the block "node", if `torques_lifted`
         self._variables()
         self._swing_and_follow()
@@ -132,7 +141,7 @@ class Transcription(ContactProgram):
         return y, yd, ydd
 
     def swing_place(self, s: float) -> Place:
-        return Place(f"swing, {100 * s:.0f} %", "swing at {s}", self.swing_T[0] * s)
+        return Place(f"swing, {percentage(s, self.nodes.swing)}", "swing at {s}", self.swing_T[0] * s)
 
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
         return [

@@ -1,0 +1,163 @@
+"""What a plan does between its program's nodes, and the nodes that are added there."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+from small_plans import Planned
+
+from impactopt import between, planner
+from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.motion import CubicSpline
+from impactopt.nlp.start import carried_over
+from impactopt.nlp.transcription import Transcription
+from impactopt.plan import Plan
+from impactopt.problem import Phase
+from impactopt.program import Status
+from impactopt.sqp import solve_sqp
+from impactopt.terms import ContactWrenchCone, TorqueLimit
+from impactopt.validation.result import distance_inside
+
+Array = NDArray[np.float64]
+
+
+def forces(plan: Plan, curve: CubicSpline, places: Array) -> list[tuple[Array, Array]]:
+    """q (nq) and tau (nv) of inverse dynamics without the ground, at places on [0, 1] of a spline."""
+    c, model, out = plan.coordinates, plan.problem.robot.model, []
+    legs = c.split(plan.problem.start_posture)[1]
+    for y, yd, ydd in zip(*curve.sample(places * curve.duration), strict=True):
+        legs = c.solve_legs(y, legs)
+        q, v, a = c.complete_motion(y, yd, ydd, legs)
+        out.append((q, pin.rnea(model, model.createData(), q, v, a).copy()))
+    return out
+
+
+def middles(nodes: Array) -> Array:
+    return (nodes[1:] + nodes[:-1]) / 2
+
+
+def with_term(plan: Plan, term: Any) -> Plan:
+    return dataclasses.replace(plan, problem=dataclasses.replace(plan.problem, terms=(term,)))
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.1, 1.0])
+def test_torques_between_nodes_by_inverse_dynamics(arm_plan: Planned, fraction: float) -> None:
+    plan = with_term(arm_plan.plan, TorqueLimit(fraction=fraction))
+    limit, expected = plan.problem.robot.torque_limit, []
+    for curve, nodes in ((plan.swing, plan.swing_nodes), (plan.follow, plan.follow_nodes)):
+        at = middles(nodes)
+        ratio = np.array([np.abs(tau / limit).max() for _, tau in forces(plan, curve, at)])
+        expected.append(tuple(at[ratio > 1.2 * fraction]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(between, "_SHARE", 0.0)
+        patch.setattr(between, "_TORQUE", 0.2 * fraction)
+        assert nodes_to_add(plan, NO_MORE) == MoreNodes(*expected)
+    assert bool(expected[0]) == (fraction < 1.0)
+    assert nodes_to_add(plan, NO_MORE) == NO_MORE  # half of the room up to all that there is
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.02, 0.08])
+def test_the_zmp_between_nodes_by_inverse_dynamics(biped_plan: Planned, margin: float) -> None:
+    plan = with_term(biped_plan.plan, ContactWrenchCone(margin=margin))
+    expected = []
+    for curve, nodes in ((plan.swing, plan.swing_nodes), (plan.follow, plan.follow_nodes)):
+        at, zmps = middles(nodes), []
+        for q, tau in forces(plan, curve, at):
+            place = pin.SE3(pin.Quaternion(q[3:7]).toRotationMatrix(), q[:3])
+            f = place.act(pin.Force(tau[:6]))  # about the world's origin
+            zmps.append([-f.angular[1] / f.linear[2], f.angular[0] / f.linear[2]])
+        inside = distance_inside(plan.polygon, np.array(zmps))
+        expected.append(set(at[inside < min(margin / 2, margin - 1e-3)]))
+    found = nodes_to_add(plan, NO_MORE)
+    assert expected[0] <= set(found.swing) and expected[1] <= set(found.follow)
+    if margin == 0.08:
+        assert expected[0] or expected[1]
+    known = MoreNodes(swing=(0.123,), follow=(0.456,))
+    assert nodes_to_add(plan, known).total == found.total + 2
+
+
+def finer(t: Transcription) -> Transcription:
+    nodes = MoreNodes(
+        swing=tuple(middles(t.swing_nodes)[[1, -1]]), follow=tuple(middles(t.follow_nodes)[[0]])
+    )
+    return Transcription(t.problem, t.coordinates, t.functions, nodes)
+
+
+def test_a_program_with_more_nodes_starts_where_the_old_one_ended(biped_plan: Planned) -> None:
+    old, result = biped_plan.transcription, biped_plan.result
+    new = finer(old)
+    assert len(new.swing_nodes) == len(old.swing_nodes) + 2
+    assert len(new.follow_nodes) == len(old.follow_nodes) + 1
+    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    plan = new.decode(x)
+    np.testing.assert_array_equal(plan.swing.control, biped_plan.plan.swing.control)
+    np.testing.assert_array_equal(plan.follow.control, biped_plan.plan.follow.control)
+    # old rows are as they were, with their multipliers; new ones are met about as well as legs in between
+    names = {str(row): i for i, row in enumerate(old.program.origins)}
+    assert len(names) == old.program.m
+    g, before = new.program.constraints(x), old.program.constraints(result.x)
+    for i, row in enumerate(new.program.origins):
+        k = names.pop(str(row), None)
+        if k is None:
+            assert y[i] == 0.0
+            assert "0." in str(row) or "." in row.place.name, row
+        else:
+            assert g[i] == pytest.approx(before[k], abs=1e-9) and y[i] == result.multipliers[k], row
+    assert not names
+    off = np.maximum(new.program.g_lower - g, g - new.program.g_upper).max()
+    assert off < 0.2
+    assert np.count_nonzero(z) == np.count_nonzero(result.bound_multipliers)
+
+
+def test_the_old_solution_is_a_warm_start(arm_plan: Planned) -> None:
+    old = arm_plan.transcription
+    first = solve_sqp(old.program, arm_plan.result.x)
+    new = finer(old)
+    x, y, z = carried_over(new, old, first.x, first.multipliers, first.bound_multipliers)
+    again = solve_sqp(new.program, x, multipliers=y, bound_multipliers=z)
+    assert again.status is Status.SOLVED
+    assert again.objective == pytest.approx(first.objective, rel=0.02)
+
+
+@pytest.fixture
+def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A problem whose torques are a little over their limit between the nodes, where nothing is given up."""
+    monkeypatch.setattr(planner, "block_functions", lambda *_: arm_transcription.functions)
+    monkeypatch.setattr(between, "_SHARE", 0.0)
+    monkeypatch.setattr(between, "_TORQUE", 1e-6)
+    return dataclasses.replace(
+        arm_transcription.problem,
+        swing=Phase(duration=0.4, intervals=6),
+        follow=Phase(duration=0.35, intervals=6),
+        terms=(TorqueLimit(fraction=0.15, collision=0.15),),
+    )
+
+
+def test_solve_adds_nodes_where_they_are_missing(coarse: Any) -> None:
+    plain, better = planner.solve(coarse, between=False), planner.solve(coarse)
+    assert plain.status is better.status is Status.SOLVED
+    assert plain.nodes == NO_MORE and better.nodes.total > 0
+    over = [
+        max(s.plan.margins()["torque_ratio"][phase] for phase in ("swing", "follow")) - 0.15
+        for s in (plain, better)
+    ]
+    assert over[0] > 1.5 * over[1]
+    assert better.impulse == pytest.approx(plain.impulse, rel=1e-3)
+    assert [a.kept for a in better.attempts] == [False] * (len(better.attempts) - 1) + [True]
+    assert better.attempts[0].iterations == plain.result.iterations < better.result.iterations
+    assert better.summary()["nodes_added"] == better.nodes.total
+    # a neighbour starts with the same nodes
+    moved = dataclasses.replace(coarse, point=np.asarray(coarse.point) - np.array([0.0, 0.0, 0.005]))
+    again = planner.solve(moved, start=better)
+    assert again.status is Status.SOLVED and set(again.nodes.swing) >= set(better.nodes.swing)
+
+
+def test_a_solution_that_keeps_its_limits_is_the_plain_one(coarse: Any) -> None:
+    fine = dataclasses.replace(coarse, terms=(TorqueLimit(fraction=0.5),))
+    solution = planner.solve(fine)
+    assert solution.nodes == NO_MORE and len(solution.attempts) == 1

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from impactopt.contact.nail import Nail
 from impactopt.errors import InputError, check_array
 from impactopt.planner import solve
@@ -110,7 +108,7 @@ def drive_nail(
         driven = float(solution.plan.collision.outcome["depth_m"])
         at += driven
         blows.append(Blow(solution=solution, depth=at))
-        x = np.array(solution.result.x)
+        x = solution
         if report is not None:
             report(
                 f"blow {len(blows)}: {1e3 * driven:.1f} mm with {solution.impulse:.2f} N s; "

@@ -81,7 +81,7 @@ def solve(
     fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began)
     solution = Solution(plan=t.decode(fields["result"].x), nodes=nodes, **fields)
     for _ in range(_ROUNDS if between else 0):
-        finer = _with_more_nodes(solution, t, budget)
+        finer = _with_more_nodes(solution, t, budget, report)
         if finer is None:
             break
         solution, t = finer
@@ -89,7 +89,7 @@ def solve(
 
 
 def _with_more_nodes(
-    solution: Solution, t: Transcription, budget: Budget
+    solution: Solution, t: Transcription, budget: Budget, report: Callable[[str], None] | None
 ) -> tuple[Solution, Transcription] | None:
     """The same motion with nodes where it leaves its limits between them, and its program; None where it does
     not, or where they end in none that is usable.
@@ -103,7 +103,9 @@ def _with_more_nodes(
     finer = Transcription(t.problem, t.coordinates, t.functions, nodes)
     x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
     start = replace(old, x=x, multipliers=y, bound_multipliers=z)
-    name = f"{nodes.total} nodes more"
+    name = f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"
+    if report is not None:
+        report(f"the plan leaves its limits between nodes: {name}, and on from there")
     fields = solve_from(finer, [(name, lambda: start)], budget, began)
     new = fields["result"]
     if not new.status.usable:

@@ -94,7 +94,7 @@ def test_each_blow_is_planned_where_the_one_before_left_the_nail(solver: Solver)
         np.testing.assert_allclose(
             asked.point, problem.point + (before - NAIL.depth) * problem.normal, atol=1e-15
         )
-        assert (start == "reach") if k == 1 else (start[0] == k - 1)
+        assert (start == "reach") if k == 1 else (start.result.x[0] == k - 1)
         assert options == {"time_limit": 9.0, "report": None}
     assert series.blows[-2].depth < 0.04 <= series.blows[-1].depth
 
@@ -122,7 +122,7 @@ def test_a_plan_that_leads_nowhere_is_not_where_the_next_one_starts(monkeypatch:
     made = Solver(fails_at=(2,))
     monkeypatch.setattr(blows, "solve", made)
     assert len(drive_nail(nailing(), depth=0.03).blows) == 3
-    assert [s if isinstance(s, str) else s[0] for _, s, _ in made.asked] == ["reach", 1, "reach", 3]
+    assert [s if isinstance(s, str) else s.result.x[0] for _, s, _ in made.asked] == ["reach", 1, "reach", 3]
 
 
 def test_a_nail_that_is_in_on_the_last_step_is_in(monkeypatch: pytest.MonkeyPatch) -> None:

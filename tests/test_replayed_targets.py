@@ -204,7 +204,11 @@ def test_a_nail_that_is_not_there_stays_as_it_was() -> None:
     ids=lambda x: type(x).__name__ if isinstance(x, Target) else "",
 )
 def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[str, Any]) -> None:
-    """An arm: impulse, force, duration, depth. MuJoCo's steps are of first order."""
+    """An arm: impulse, force, duration, depth.
+
+    MuJoCo's steps are of first order, and a contact that ends with hardly any force ends a little early: by
+    0.42, 0.32, 0.22 ms with steps of 100, 50, 25 us.
+    """
     law = KelvinVoigt(stiffness=5e4, damping=100.0)
     robot = arm(kp=300.0, kd=10.0)
     problem = dataclasses.replace(arm_problem(), robot=robot, law=law, target=target, **changes)
@@ -213,7 +217,7 @@ def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[
     assert result.status is Status.SOLVED, result.message
     plan = transcription.decode(result.x)
     motion = dataclasses.replace(plan.trajectory(), end=plan.contact_end + 0.01)  # the blow is what counts
-    for engine, step in (("pinocchio", 1e-4), ("mujoco", 5e-5)):
+    for engine, step in (("pinocchio", 1e-4), ("mujoco", 2.5e-5)):
         sim = simulate(problem, motion, engine=engine, step=step, settle=0.0)
         missed = law.damping * plan.hand_speed * step
         assert sim.impulse == pytest.approx(plan.impulse, rel=5e-3, abs=missed), engine

@@ -38,9 +38,11 @@ _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
 _FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
 # the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and
-# loosely. Where elastic rows have to show that no point meets them, as in the paper.
-_CLOSE, _POWER = 30.0, 1.3
+# loosely. From multipliers given it falls at once: the point is near, and there is no path to keep to. Where
+# elastic rows have to show that no point meets them, as in the paper.
+_CLOSE, _POWER, _CLOSE_WARM = 30.0, 1.3, 1e4
 _CLOSE_ELASTIC, _POWER_ELASTIC = 10.0, 1.5
+_FINE, _FINEST = 0.6, 0.3  # times the tolerance: a mu that is small enough, and the least
 _PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing decides does not wander
 # a step is bent where it gets so many times as far, a slack giving so much of its distance to a bound, and
 # where no row is off, or will be, by more than this
@@ -497,11 +499,12 @@ class InteriorRun(Run):
         return max(max(self._dual, slack) / scale, violation, off)
 
     def _lower_barrier(self, residual: Vector) -> None:
-        least = self.options.complementarity_tolerance / 11.0
-        hard = self._elastic is None
+        tolerance, hard = self.options.complementarity_tolerance, self._elastic is None
         close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
-        while self._mu > least and self._error(self._mu, residual) <= close * self._mu:
-            self._mu = max(least, min(_FASTER * self._mu, self._mu**power))
+        if hard and self._warm:
+            close = _CLOSE_WARM
+        while self._mu > _FINE * tolerance and self._error(self._mu, residual) <= close * self._mu:
+            self._mu = max(_FINEST * tolerance, min(_FASTER * self._mu, self._mu**power))
             self._filter = None
 
 

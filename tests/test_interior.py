@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_plans import changed, transcribed
 from textbook import CASES, INF, Textbook, assert_optimal
 
+from impactopt import load_problem
+from impactopt.nlp.start import first_iterate
 from impactopt.program import Status
 from impactopt.sqp import SQPOptions, interior, solve_sqp
 
@@ -88,3 +93,13 @@ def test_what_goes_on_failing_is_said_to_fail(monkeypatch):
     result = solve_sqp(case.build(), case.x0)
     assert result.status is Status.FAILED
     assert len(result.history) <= 3
+
+
+def test_elastic_rows_that_are_met_do_not_keep_it_from_an_end():
+    """Nails in woods of which the first two ended at the iteration limit, with rows elastic and met."""
+    problem = load_problem("arm_planar")
+    base = transcribed(problem)
+    for resistance in (568.1043576449156, 569.6147318929434, 789.978655):
+        t = changed(base, target=dataclasses.replace(problem.target, resistance=resistance))
+        result = solve_sqp(t.program, first_iterate(t))
+        assert result.status is Status.SOLVED and result.iterations < 200, resistance

@@ -81,7 +81,7 @@ class InteriorRun(Run):
         super().__init__(task)
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
         self._price = self.options.price  # of elastic rows
-        self._crawled = 0
+        self._crawled = self._met = 0  # iterations: of short steps, and of elastic rows that are met
         self._began = 0.0  # violation where only that began to count
         self._aim()
 
@@ -186,6 +186,9 @@ class InteriorRun(Run):
                 if verdict is not None:
                     return verdict
                 continue
+            if self._lingers():
+                self._change_aim(met=True)
+                continue
             if self._out_of_time():
                 return Status.TIME_LIMIT
             self._lower_barrier(residual)
@@ -212,6 +215,12 @@ class InteriorRun(Run):
         if elastic is None or self._sigma or elastic.price >= self.options.price_max:
             return False
         return self.point.max_violation <= _RESTORED
+
+    def _lingers(self) -> bool:
+        """Whether elastic rows have been met for long, and the rest is left to do: hard rows do it sooner."""
+        met = self._elastic is not None and self.point.max_violation <= self.options.violation_tolerance
+        self._met = self._met + 1 if met and self._sigma else 0
+        return self._met > _PATIENCE and self._price < self.options.price_max
 
     def _start_is_solution(self) -> bool:
         """Whether the start with the multipliers given meets all tolerances."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -96,7 +97,9 @@ def _with_more_nodes(
     """
     if not solution.status.usable or budget.left == 0:
         return None
-    nodes = nodes_to_add(solution.plan, t.nodes)
+    nodes = t.nodes
+    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+        nodes = nodes_to_add(solution.plan, t.nodes)
     if nodes == t.nodes:
         return None
     began, old = time.perf_counter(), solution.result

@@ -13,6 +13,7 @@ from small_plans import Planned
 
 from impactopt import between, planner
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.errors import InputError
 from impactopt.motion import CubicSpline
 from impactopt.nlp.start import carried_over
 from impactopt.nlp.transcription import Transcription
@@ -161,3 +162,11 @@ def test_a_solution_that_keeps_its_limits_is_the_plain_one(coarse: Any) -> None:
     fine = dataclasses.replace(coarse, terms=(TorqueLimit(fraction=0.5),))
     solution = planner.solve(fine)
     assert solution.nodes == NO_MORE and len(solution.attempts) == 1
+
+
+def test_a_plan_that_cannot_be_looked_at_is_not_lost(coarse: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreachable(*_: Any) -> MoreNodes:
+        raise InputError("a leg does not reach")
+
+    monkeypatch.setattr(planner, "nodes_to_add", unreachable)
+    assert planner.solve(coarse).status is Status.SOLVED

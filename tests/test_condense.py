@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from impactopt.nlp.start import first_iterate
 from impactopt.sqp.cholesky import BlockCholesky
 from impactopt.sqp.compiled import kernels
-from impactopt.sqp.condense import Condenser, Determined, Elimination, find_eliminations
+from impactopt.sqp.condense import Condenser, Determined, find_eliminations
 from impactopt.sqp.kernels import Kernels
 from impactopt.sqp.newton import NewtonSystem
+from impactopt.sqp.patterns import Elimination
 
 NONE = np.zeros(9, dtype=bool)
 

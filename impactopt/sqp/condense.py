@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,19 +19,20 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from impactopt.program import Matrix, Vector
-from impactopt.sqp.kernels import Index, Kernels, Places, Products, Stage
+from impactopt.sqp.kernels import Index, Kernels
+from impactopt.sqp.patterns import (
+    Elimination,
+    alike,
+    by_pattern,
+    entries,
+    fill,
+    numbered,
+    products,
+    shapes,
+    stage,
+)
 
 Mask = npt.NDArray[np.bool_]
-
-
-class Elimination(NamedTuple):
-    """Systems of one shape: equality rows (k, r), and the variables (k, r) that each system's rows determine.
-
-    No row may touch the variables of two systems of the same elimination.
-    """
-
-    rows: Index
-    variables: Index
 
 
 class Determined(NamedTuple):
@@ -77,20 +78,6 @@ def _determines(pattern: bytes, size: int) -> bool:
     """Whether a square system with this pattern can be regular: most systems have that of another."""
     system = sp.csr_matrix(np.frombuffer(pattern, dtype=bool).reshape(size, size))
     return bool((maximum_bipartite_matching(system) >= 0).all())
-
-
-class _Touched(NamedTuple):
-    """What one system touches.
-
-    q, e : its rows and variables; t : other equality rows that these variables touch; c : variables that its
-    rows touch; u : c, and behind them those that only the Hessian couples to e.
-    """
-
-    q: Index
-    e: Index
-    t: Index
-    c: Index
-    u: Index
 
 
 class Condenser:
@@ -144,18 +131,18 @@ class Condenser:
         own_rows, own_columns = number[J.row[mine]], J.col[mine]
         touches = np.zeros((self._equations.size, n), dtype=bool)
         touches[own_rows, own_columns] = True
-        groups = _alike(_by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations)))
+        groups = alike(by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations)))
         couples = np.eye(n, dtype=bool)
         couples[H.row, H.col] = True
         for columns, _ in groups:
             couples[columns[:, :, None], columns[:, None, :]] = True
-        systems = _fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
+        systems = fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
-        p, c = _entries(touches)
-        rows, none = _numbered(p, c, touches.shape)
-        i, j = _entries(couples)
+        p, c = entries(touches)
+        rows, none = numbered(p, c, touches.shape)
+        i, j = entries(couples)
         i, j = i[i >= j], j[i >= j]
-        pairs, nothing = _numbered(i, j, couples.shape)
+        pairs, nothing = numbered(i, j, couples.shape)
         pairs[j, i] = pairs[i, j]
         self.J, self.W = np.zeros(none + 1), np.zeros(nothing + 1)
         self._own_jacobian = mine.astype(np.int32), rows[own_rows, own_columns]
@@ -164,8 +151,8 @@ class Condenser:
         self._diagonal = np.diagonal(pairs).copy()
         at = np.flatnonzero(H.row == H.col)
         self._curved = at, H.row[at]
-        self._products = [made for columns, same in groups for made in _products(pairs, columns, same)]
-        self._stages = [_stage(same, rows, pairs) for found in systems for same in _shapes(found)]
+        self._products = [made for columns, same in groups for made in products(pairs, columns, same)]
+        self._stages = [stage(same, rows, pairs) for found in systems for same in shapes(found)]
         self._left = number[self.rows[self.equal]]
         self.pattern = couples[np.ix_(self.free, self.free)]
         of_left = touches[np.ix_(self._left, self.free)]
@@ -254,114 +241,3 @@ class Condenser:
         everything = np.zeros(self.m)
         everything[self._equations] = out[:-1]
         return everything[self.eliminated]
-
-
-# ---------------------------------------------------------------- patterns
-def _fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> list[list[_Touched]]:
-    """Mark what becomes nonzero on the way, and find what each system touches."""
-    row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
-    others = np.zeros(touches.shape[1], dtype=bool)
-    out = []
-    for q_all, e_all in eliminations:
-        row_left[q_all.ravel()] = False
-        column_left[e_all.ravel()] = False
-        others[e_all.ravel()] = True
-        found, touched = [], np.zeros(touches.shape[0], dtype=np.intp)
-        for q, e in zip(q_all, e_all, strict=True):
-            t = np.flatnonzero(touches[:, e].any(axis=1) & row_left)
-            c = np.flatnonzero(touches[q].any(axis=0) & column_left)
-            coupled = couples[e].any(axis=0)
-            others[e] = False
-            if (coupled & others).any():
-                raise ValueError("the Hessian couples variables of two systems of one elimination")
-            others[e] = True
-            more = coupled & column_left
-            more[c] = False
-            u = np.concatenate([c, np.flatnonzero(more)])
-            touched[t] += 1
-            touches[np.ix_(t, c)] = touches[np.ix_(t, e)] = True
-            touches[np.ix_(q, e)] = couples[np.ix_(e, e)] = True
-            couples[np.ix_(c, u)] = couples[np.ix_(u, c)] = True
-            found.append(_Touched(q, e, t, c, u))
-        others[e_all.ravel()] = False
-        if (touched > 1).any():
-            raise ValueError(f"row {int(np.argmax(touched > 1))} touches two systems of one elimination")
-        out.append(found)
-    return out
-
-
-_Rows = tuple[Index, Index, Places]
-
-
-def _by_pattern(jacobian: Matrix, rows: Index) -> list[_Rows]:
-    """Columns, rows that touch just them, and where their values (rows, columns) stand in the data, csc."""
-    numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
-    by_rows = numbered.tocsr()
-    by_rows.sort_indices()
-    start, columns, at = by_rows.indptr, by_rows.indices, by_rows.data.astype(np.int32)
-    found: dict[bytes, list[int]] = {}
-    for i in rows:
-        found.setdefault(columns[start[i] : start[i + 1]].tobytes(), []).append(i)
-    found.pop(b"", None)
-    out = []
-    for key, numbers in found.items():
-        own, same = np.frombuffer(key, dtype=columns.dtype).astype(np.intp), np.array(numbers)
-        out.append((own, same, at[start[same][:, None] + np.arange(own.size)]))
-    return out
-
-
-def _entries(matrix: Any) -> tuple[Index, Index]:
-    """np.nonzero, which takes twice as long for two dimensions as for one."""
-    return np.divmod(np.flatnonzero(matrix), matrix.shape[1])
-
-
-def _numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
-    """Places of the entries (i, j), counted from 0, in a matrix; the others have the number of all."""
-    out = np.full(shape, i.size, dtype=np.int32)
-    out[i, j] = np.arange(i.size)
-    return out, i.size
-
-
-_lower = functools.cache(np.tril_indices)
-
-
-def _alike(groups: Sequence[_Rows]) -> list[tuple[Index, list[_Rows]]]:
-    """All columns (group, column) of those groups that have as many as each other, and these groups."""
-    sizes: dict[int, list[_Rows]] = {}
-    for group in groups:
-        sizes.setdefault(group[0].size, []).append(group)
-    return [(np.array([columns for columns, _, _ in same]), same) for same in sizes.values()]
-
-
-def _products(pairs: Places, columns: Index, groups: list[_Rows]) -> list[Products]:
-    i, j = _lower(columns.shape[1])
-    return [
-        Products(rows=rows.astype(np.int32), values=values, to=to)
-        for (_, rows, values), to in zip(groups, pairs[columns[:, i], columns[:, j]], strict=True)
-    ]
-
-
-def _shapes(systems: list[_Touched]) -> list[list[_Touched]]:
-    """Systems of one elimination that touch as many variables and rows as each other."""
-    out: dict[tuple[int, int, int], list[_Touched]] = {}
-    for s in systems:
-        out.setdefault((s.c.size, s.u.size, s.t.size), []).append(s)
-    return list(out.values())
-
-
-def _stage(systems: list[_Touched], rows: Places, pairs: Places) -> Stage:
-    """Systems of one shape; rows, pairs : places of the entries of equalities and W, as of `_numbered`."""
-    q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
-    i, j = _lower(c.shape[1])
-    places = {
-        "qe": rows[q[:, None, :], e[:, :, None]],
-        "qc": rows[q[:, None, :], c[:, :, None]],
-        "te": rows[t[:, :, None], e[:, None, :]],
-        "tc": rows[t[:, :, None], c[:, None, :]],
-        "hee": pairs[e[:, :, None], e[:, None, :]],
-        "heu": pairs[u[:, :, None], e[:, None, :]],
-        "hcc": pairs[c[:, i], c[:, j]],
-        "hcv": pairs[c[:, :, None], u[:, None, c.shape[1] :]],
-    }
-    numbers = {"q": q, "e": e, "t": t, "u": u, **places}
-    return Stage(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})

@@ -113,13 +113,23 @@ def _with_more_nodes(
     new = fields["result"]
     if not new.status.usable:
         return None
-    sums = ("iterations", "seconds", "seconds_functions", "seconds_qp")
-    fields["result"] = replace(new, **{key: getattr(old, key) + getattr(new, key) for key in sums})
+    fields["result"] = _one_after_the_other(old, new)
     for key in ("build_seconds", "solve_seconds"):
         fields[key] += getattr(solution, key)
     before = tuple(replace(attempt, kept=False) for attempt in solution.attempts)
     fields["attempts"] = before + fields["attempts"]
     return Solution(plan=finer.decode(new.x), nodes=nodes, **fields), finer
+
+
+def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
+    """The new result, with the effort of both."""
+    sums = ("iterations", "seconds", "seconds_functions", "seconds_qp")
+    later = tuple(
+        replace(r, iteration=old.iterations + r.iteration, seconds=old.seconds + r.seconds)
+        for r in new.history
+    )
+    effort = {key: getattr(old, key) + getattr(new, key) for key in sums}
+    return replace(new, history=old.history + later, **effort)
 
 
 def _starts(

@@ -151,6 +151,8 @@ def test_solve_adds_nodes_where_they_are_missing(coarse: Any) -> None:
     assert better.impulse == pytest.approx(plain.impulse, rel=1e-3)
     assert [a.kept for a in better.attempts] == [False] * (len(better.attempts) - 1) + [True]
     assert better.attempts[0].iterations == plain.result.iterations < better.result.iterations
+    steps = [record.iteration for record in better.result.history]
+    assert steps == sorted(steps) and steps[-1] == better.result.iterations
     assert better.summary()["nodes_added"] == better.nodes.total
     # a neighbour starts with the same nodes
     moved = dataclasses.replace(coarse, point=np.asarray(coarse.point) - np.array([0.0, 0.0, 0.005]))

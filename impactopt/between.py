@@ -43,10 +43,10 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     the support polygon, of torques to all that the motors have.
     """
     start = plan.coordinates.split(plan.problem.start_posture)[1]
-    swing, legs = _middles_outside(plan, 0, plan.swing_nodes, start)
-    follow = _middles_outside(plan, 2, plan.follow_nodes, legs)[0]
+    swing, legs = _middles_outside(plan, 0, start)
+    follow = _middles_outside(plan, 2, legs)[0]
     if plan.brake is not None:
-        follow += _middles_outside(plan, 2, plan.follow_nodes, legs, missed=True)[0]
+        follow += _middles_outside(plan, 2, legs, missed=True)[0]
     return MoreNodes(
         tuple(sorted({*known.swing, *swing})),
         tuple(sorted({*known.follow, *follow})),
@@ -54,12 +54,12 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
 
 
 def _middles_outside(
-    plan: Plan, phase: int, nodes: Array, legs: Array, *, missed: bool = False
+    plan: Plan, phase: int, legs: Array, *, missed: bool = False
 ) -> tuple[list[float], Array]:
     """Middles between nodes at which the plan is out of its limits, and the legs at the last of them."""
     p, c = plan.problem, plan.coordinates
+    curve, begin, nodes, _ = plan.way(phase, missed=missed)
     places = (nodes[1:] + nodes[:-1]) / 2
-    curve, begin = plan.way(phase, missed=missed)
     y, yd, ydd, wrench = plan.independent(phase, begin + places * curve.duration, missed=missed)
     q, _, _, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)
     limit, cone = p.term(TorqueLimit).fraction, p.term(ContactWrenchCone)

@@ -14,6 +14,7 @@ A library that someone else could have written is never loaded: see `impactopt.p
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import hashlib
 import json
@@ -24,10 +25,12 @@ import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy.typing as npt
 
 from impactopt._compiler import CompileError, Compiler, find_compiler
 from impactopt._hashing import canonical, model_hash
@@ -41,7 +44,15 @@ from impactopt.private_files import (
     write_atomically,
 )
 
-__all__ = ["NativeCode", "cache_directory", "cached", "compiled_library", "library_path", "model_hash"]
+__all__ = [
+    "NativeCode",
+    "address",
+    "cache_directory",
+    "cached",
+    "library_path",
+    "model_hash",
+    "native_library",
+]
 
 Report = Callable[[str], None]
 
@@ -148,21 +159,28 @@ def cached(
         return _build_entry(directory, entry, name, build, compiler, tell)
 
 
-def compiled_library(name: str, code: str, *, level: str = _NATIVE_LEVEL) -> Path | None:
-    """The shared library of C code that is no CasADi function; None where no compiler can make it."""
+def native_library(package: str, name: str) -> Any:
+    """The library of ``native/NAME.c`` in a package, loaded; None where no compiler can make it."""
     compiler = find_compiler()
     if compiler is None:
         return None
+    code = files(f"{package}.native").joinpath(f"{name}.c").read_text(encoding="utf-8")
     directory = _directory()
     try:
         with (
             locked(directory / f"{_slug(name)}.lock", on_wait=lambda: None),
             tempfile.TemporaryDirectory(dir=directory, prefix="tmp-") as scratch,
         ):
-            return directory / _library(directory, Path(scratch), name, code, level, compiler)[0]
+            path = _library(directory, Path(scratch), name, code, _NATIVE_LEVEL, compiler)[0]
+            return ctypes.CDLL(str(directory / path))
     except (CompileError, OSError) as error:
         warnings.warn(f"{name}: {error}; its work is done in Python", NoCompilerWarning, stacklevel=3)
         return None
+
+
+def address(array: npt.NDArray[Any]) -> ctypes.c_void_p:
+    """Of an array's numbers, for C."""
+    return ctypes.c_void_p(array.ctypes.data)
 
 
 def library_path(name: str, recipe: tuple[Any, ...], function: str) -> Path | None:

@@ -156,34 +156,28 @@ class Plan:
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
-        curve, start = self.way(phase, missed=missed)
-        nodes, wrench = self.swing_nodes, self.swing_wrench
-        if phase == 2:
-            nodes, wrench = self.follow_nodes, self._last(missed)[1]
+        curve, start, nodes, wrench = self.way(phase, missed=missed)
         local = np.clip(ts - start, 0.0, curve.duration)
         y, yd, ydd = curve.sample(local)
         at = nodes * curve.duration
         w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
         return y, yd, ydd, w
 
-    def way(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float]:
-        """Spline and start [s] of the swing (phase 0) or the follow-through (2); ``missed``: of the brake."""
+    def way(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
+        """Spline, start [s], nodes and sole wrenches there of the swing (phase 0) or the follow-through (2);
+        ``missed``: of the brake.
+        """
         if phase == 0:
-            return self.swing, 0.0
-        curve, _, start = self._last(missed)
-        return curve, start
-
-    def _last(self, missed: bool) -> tuple[CubicSpline, Array, float]:
-        """Spline, wrenches and start [s] of the way to rest."""
+            return self.swing, 0.0, self.swing_nodes, self.swing_wrench
         if not missed:
-            return self.follow, self.follow_wrench, self.contact_end
+            return self.follow, self.contact_end, self.follow_nodes, self.follow_wrench
         after = self.problem.brake_after
         if self.brake is None or self.brake_wrench is None or after is None:
             raise InputError(
                 "this plan has no motion for a blow that meets nothing: solve the problem with a scenario "
                 "Scenario(name=..., missing=True, brake_after=0.025)"
             )
-        return self.brake, self.brake_wrench, self.contact_start + after
+        return self.brake, self.contact_start + after, self.follow_nodes, self.brake_wrench
 
     def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
@@ -196,7 +190,7 @@ class Plan:
         The instants of contact and of its end are there twice: the reference jumps from the coasting one to
         the predicted state.
         """
-        last, _, t1 = self._last(missed)
+        last, t1, _, _ = self.way(2, missed=missed)
         t0, rest = self.contact_start, t1 + last.duration
         end = rest + hold
         legs = self.coordinates.split(self.problem.start_posture)[1]

@@ -40,11 +40,10 @@ class JacobianMap:
             parts.append((start + first[owner], x * m + row[owner], length[owner], factor))
             z, out = z + b.count * b.n_in, out + b.count * b.n_out
         entry, place, length, factor = _joined(parts)
-        own = linear.tocoo()
-        at = own.coords[1].astype(np.intp) * m + own.coords[0]
+        at, values = _placed(linear)
         places = union(np.concatenate([place, at]), np.concatenate([length, np.ones_like(at)]))
         self._rows, self._starts = _csc(places, self._shape)
-        self._linear = np.bincount(np.searchsorted(places, at), own.data, places.size)
+        self._linear = np.bincount(np.searchsorted(places, at), values, places.size)
         shape = places.size, self._entries.size
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
@@ -82,15 +81,14 @@ class HessianMap:
             parts.append((start + first[owner], c[of_term] * n + r, length[owner], by))
             z += b.count * b.n_in
         entry, place, length, factor = _joined(parts)
-        own = quadratic.tocoo()
-        at = own.coords[1].astype(np.intp) * n + own.coords[0]
+        at, values = _placed(quadratic)
         one, other = (_pattern(p, self._shape) for p in (union(place, length), union(at)))
         whole = sp.csc_array(one + one.T + other)
         self._rows, self._starts = whole.indices, whole.indptr
         places = np.repeat(np.arange(n), np.diff(whole.indptr)) * n + whole.indices
         numbers = sp.csc_array((np.arange(places.size), whole.indices, whole.indptr), self._shape)
         self._across = numbers.T.tocsc().data.astype(np.int32)
-        self._half = np.bincount(np.searchsorted(places, at), 0.5 * own.data, places.size)
+        self._half = np.bincount(np.searchsorted(places, at), 0.5 * values, places.size)
         shape = places.size, self._entries.size
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
@@ -146,6 +144,13 @@ def _joined(parts: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
     """Entries, places, lengths and factors of all parts."""
     none = np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0)
     return tuple(np.concatenate(of) for of in zip(none, *parts, strict=True))
+
+
+def _placed(matrix: sp.sparray) -> tuple[Index, Array]:
+    """Places ``column * rows + row`` of a matrix's entries, and their values."""
+    entries = matrix.tocoo()
+    rows, columns = entries.coords
+    return columns.astype(np.intp) * matrix.shape[0] + rows, entries.data
 
 
 def _csc(places: Index, shape: tuple[int, int]) -> tuple[Index, Index]:

@@ -10,14 +10,13 @@ from __future__ import annotations
 import ctypes
 import functools
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from impactopt.codegen import compiled_library
+from impactopt.codegen import address, native_library
 from impactopt.nlp.layout import Array
 from impactopt.nlp.rows import Index
 
@@ -47,8 +46,8 @@ class Runs:
         if library is None:
             out += self._matrix @ entries
             return
-        runs = (_at(a) for a in (self.entry, self.place, self.length, self.factor))
-        library.runs_add(ctypes.c_int64(self.entry.size), *runs, _at(entries), _at(out))
+        runs = (address(a) for a in (self.entry, self.place, self.length, self.factor))
+        library.runs_add(ctypes.c_int64(self.entry.size), *runs, address(entries), address(out))
 
     @functools.cached_property
     def _matrix(self) -> sp.csr_array:
@@ -66,7 +65,7 @@ def with_transposed(values: Array, across: Places) -> Array:
     if library is None:
         return values + values[across]
     out = np.empty_like(values)
-    library.runs_add_transposed(ctypes.c_int64(values.size), _at(across), _at(values), _at(out))
+    library.runs_add_transposed(ctypes.c_int64(values.size), address(across), address(values), address(out))
     return out
 
 
@@ -89,10 +88,4 @@ def union(first: Index, length: Index | int = 1) -> Index:
 @functools.cache
 def _library() -> Any:
     """In C where there is a compiler; None: sparse products do it."""
-    source = files(f"{__package__}.native").joinpath("runs.c").read_text(encoding="utf-8")
-    path = compiled_library("runs", source)
-    return None if path is None else ctypes.CDLL(str(path))
-
-
-def _at(array: npt.NDArray[Any]) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
+    return native_library(__package__, "runs")

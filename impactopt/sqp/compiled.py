@@ -5,14 +5,12 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cython_blas, cython_lapack
 
-from impactopt.codegen import compiled_library
+from impactopt.codegen import address, native_library
 from impactopt.program import Vector
 from impactopt.sqp.kernels import Index, Kernels, Panels, Places, Products, Stack, Stage
 
@@ -35,11 +33,9 @@ def kernels() -> Kernels:
 
 @functools.cache
 def _library() -> Any:
-    source = files(f"{__package__}.native").joinpath("newton.c").read_text(encoding="utf-8")
-    path = compiled_library("newton", source)
-    if path is None:
+    library = native_library(__package__, "newton")
+    if library is None:
         return None
-    library = ctypes.CDLL(str(path))
     pointers = (ctypes.c_void_p * len(_ROUTINES))(*[_pointer(*routine) for routine in _ROUTINES])
     library.newton_setup(pointers)
     return library
@@ -131,35 +127,36 @@ class CompiledKernels(Kernels):
 
     # ------------------------------------------------------------------ the operations
     def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
-        self._c.newton_copy(_at(values), _at(source), _at(to), _at(places), ctypes.c_int64(source.size))
+        arrays = address(values), address(source), address(to), address(places)
+        self._c.newton_copy(*arrays, ctypes.c_int64(source.size))
 
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
         parts, work = self._of(products, self._groups)
         groups = ctypes.c_int64(len(products))
-        self._c.newton_products(groups, *map(_at, parts), _at(values), _at(weights), _at(W), _at(work))
+        self._c.newton_products(groups, *map(address, [*parts, values, weights, W, work]))
 
     def eliminate(self, stages: Sequence[Stage], J: Vector) -> None:
-        if self._c.newton_eliminate(*self._of(stages, self._all)[:2], _at(J), _last(J)):
+        if self._c.newton_eliminate(*self._of(stages, self._all)[:2], address(J)):
             raise np.linalg.LinAlgError("rows do not determine their variables")
 
     def reduce(self, stages: Sequence[Stage], W: Vector) -> None:
-        self._c.newton_reduce(*self._of(stages, self._all)[:2], _at(W), _last(W))
+        self._c.newton_reduce(*self._of(stages, self._all)[:2], address(W))
 
     def forward(self, stages: Sequence[Stage], g: Vector, off: Vector) -> None:
-        self._c.newton_forward(*self._of(stages, self._all)[:2], _at(g), _last(g), _at(off), _last(off))
+        self._c.newton_forward(*self._of(stages, self._all)[:2], address(g), address(off))
 
     def expand(self, stages: Sequence[Stage], d: Vector) -> None:
-        self._c.newton_expand(*self._of(stages, self._all)[:2], _at(d))
+        self._c.newton_expand(*self._of(stages, self._all)[:2], address(d))
 
     def multipliers(self, stages: Sequence[Stage], v: Vector, y: Vector) -> None:
-        self._c.newton_multipliers(*self._of(stages, self._all)[:2], _at(v), _last(v), _at(y))
+        self._c.newton_multipliers(*self._of(stages, self._all)[:2], address(v), address(y))
 
     def factor(self, p: Panels, values: Vector) -> bool:
-        return not self._c.newton_cholesky(self._of(p, self._panels)[0], _at(values))
+        return not self._c.newton_cholesky(self._of(p, self._panels)[0], address(values))
 
     def solve(self, p: Panels, values: Vector, x: Stack) -> Stack:
         shape = (ctypes.c_int64(x.shape[0]), ctypes.c_int64(x.shape[1]))
-        self._c.newton_solve(self._of(p, self._panels)[0], _at(values), _at(x), *shape)
+        self._c.newton_solve(self._of(p, self._panels)[0], address(values), address(x), *shape)
         return x
 
 
@@ -176,11 +173,3 @@ def _rows_of_triangle(n: int) -> Index:
     """Where the rows of a lower triangle begin."""
     i = np.arange(n)
     return i * (i + 1) // 2
-
-
-def _at(array: npt.NDArray[Any] | Places) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
-
-
-def _last(array: Vector) -> ctypes.c_int64:
-    return ctypes.c_int64(array.size - 1)

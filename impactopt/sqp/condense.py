@@ -219,25 +219,25 @@ class Condenser:
 
         gradient : (n,) of what belongs to W; residual (m,).
         """
-        g, off = np.append(gradient, 0.0), np.append(residual[self._equations], 0.0)
+        g, off = gradient.copy(), residual[self._equations]
         self._kernels.forward(self._stages, g, off)
         return g[self.free], off[self._left]
 
     def expand(self, step: Vector) -> Vector:
         """The step of all variables (n,) for one of the free ones (f,), after `forward`."""
-        d = np.zeros(self.n + 1)
+        d = np.zeros(self.n)
         d[self.free] = step
         self._kernels.expand(self._stages, d)
-        return d[:-1]
+        return d
 
     def multipliers(self, dual: Vector, y: Vector) -> Vector:
         """Multipliers of the eliminated rows.
 
         dual (n,) : gradient of the Lagrangian without the equalities; y (l,) : multipliers of those left.
         """
-        v, out = np.append(dual, 0.0), np.zeros(self._equations.size + 1)
+        v, out = dual.copy(), np.zeros(self._equations.size)
         out[self._left] = y
         self._kernels.multipliers(self._stages, v, out)
         everything = np.zeros(self.m)
-        everything[self._equations] = out[:-1]
+        everything[self._equations] = out
         return everything[self.eliminated]

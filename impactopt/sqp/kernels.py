@@ -23,7 +23,7 @@ Stack = npt.NDArray[np.float64]
 class Stage:
     """Systems (k) of one shape, r rows each: where their numbers stand, and what eliminating them found.
 
-    Places that are none point to one number behind the others, which is zero.
+    Places of what is not there point to one number behind the others, which is zero.
 
     Attributes
     ----------
@@ -213,9 +213,8 @@ class Kernels:
 
 
 def _add(to: Vector, where: Places, what: Stack) -> None:
-    """Add numbers; places may repeat, and the last one stays zero."""
+    """Add numbers; places may repeat."""
     np.add.at(to, where.ravel(), what.ravel())
-    to[-1] = 0.0
 
 
 def _split(p: Panels, values: Vector) -> list[Stack]:

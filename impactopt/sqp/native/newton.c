@@ -1,7 +1,7 @@
 /* The small dense algebra of condensed Newton systems; kernels.py says what each function is for.
 
    Matrices lie by columns, as BLAS and LAPACK want them: an array (k, a, b) of NumPy's is k matrices of b rows
-   and a columns. Places that are none point to one number behind the others, which is kept zero. */
+   and a columns. Places of what is not there point to one number behind the others, which is zero. */
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -139,7 +139,7 @@ static void solve_few(const double *lu, const int32_t *pivots, int r, int n, dou
     }
 }
 
-static int eliminate(stage *a, double *J, int64_t none) {
+static int eliminate(stage *a, double *J) {
     int r = a->r, nc = a->nc, nt = a->nt, info;
     double *rows = a->work, *sums = a->work + r * nc;
     for (int64_t k = 0; k < a->k; ++k) {
@@ -166,7 +166,6 @@ static int eliminate(stage *a, double *J, int64_t none) {
                 for (int i = 0; i < nc; ++i) J[*to++] -= sums[i];
             }
         }
-        J[none] = 0.0;
     }
     return 0;
 }
@@ -225,7 +224,7 @@ static targets spread_few(const stage *a, targets to, const double *X, const dou
     return spread_rows(a, to, a->r, X, G, sums, W);
 }
 
-static void reduce(stage *a, double *W, int64_t none) {
+static void reduce(stage *a, double *W) {
     int r = a->r, nc = a->nc, nu = a->nu;
     double *G = a->work, *more = G + r * nu, *sums = more + r * nc;
     targets to = {a->hcc, a->hcv};
@@ -246,7 +245,6 @@ static void reduce(stage *a, double *W, int64_t none) {
                 for (int q = 0; q < r; ++q) add(G + p * nu, 0.5 * H[q * r + p], more + q * nc, nc);
             to = spread_few(a, to, more, G, sums, W);
         }
-        W[none] = 0.0;
     }
 }
 
@@ -258,7 +256,7 @@ static void pull(int r, int n, double *M, double *v, double *to, const int32_t *
     for (int i = 0; i < n; ++i) to[at[i]] -= work[i];
 }
 
-static void forward(stage *a, double *g, int64_t n, double *off, int64_t m) {
+static void forward(stage *a, double *g, double *off) {
     int r = a->r, nc = a->nc, nt = a->nt, nu = a->nu, info;
     double *own = a->work, *work = own + r;
     for (int64_t k = 0; k < a->k; ++k) {
@@ -271,7 +269,6 @@ static void forward(stage *a, double *g, int64_t n, double *off, int64_t m) {
         gemv("N", &r, &r, &minus, a->H + k * r * r, &r, x0, &unit, &one, own, &unit);
         pull(r, nc, X, own, g, u, work);
         pull(r, nu, a->G + k * nu * r, x0, g, u, work);
-        g[n] = off[m] = 0.0;
     }
 }
 
@@ -286,13 +283,12 @@ static void expand(stage *a, double *d) {
     }
 }
 
-static void own_duals(stage *a, double *v, int64_t n) {
+static void own_duals(stage *a, double *v) {
     int r = a->r, nc = a->nc;
     double *own = a->own;
     for (int64_t k = 0; k < a->k; ++k, own += r) {
         take(v, a->e + k * r, r, own);
         pull(r, nc, a->X + k * nc * r, own, v, a->u + k * a->nu, a->work);
-        v[n] = 0.0;
     }
 }
 
@@ -309,26 +305,26 @@ static void duals(stage *a, double *y) {
 }
 
 /* ---------------------------------------------------------------- all stages, one after the other */
-EXPORT int newton_eliminate(stage *a, int64_t stages, double *J, int64_t none) {
+EXPORT int newton_eliminate(stage *a, int64_t stages, double *J) {
     int info = 0;
-    for (int64_t i = 0; i < stages && !info; ++i) info = eliminate(a + i, J, none);
+    for (int64_t i = 0; i < stages && !info; ++i) info = eliminate(a + i, J);
     return info;
 }
 
-EXPORT void newton_reduce(stage *a, int64_t stages, double *W, int64_t none) {
-    for (int64_t i = 0; i < stages; ++i) reduce(a + i, W, none);
+EXPORT void newton_reduce(stage *a, int64_t stages, double *W) {
+    for (int64_t i = 0; i < stages; ++i) reduce(a + i, W);
 }
 
-EXPORT void newton_forward(stage *a, int64_t stages, double *g, int64_t n, double *off, int64_t m) {
-    for (int64_t i = 0; i < stages; ++i) forward(a + i, g, n, off, m);
+EXPORT void newton_forward(stage *a, int64_t stages, double *g, double *off) {
+    for (int64_t i = 0; i < stages; ++i) forward(a + i, g, off);
 }
 
 EXPORT void newton_expand(stage *a, int64_t stages, double *d) {
     for (int64_t i = stages - 1; i >= 0; --i) expand(a + i, d);
 }
 
-EXPORT void newton_multipliers(stage *a, int64_t stages, double *v, int64_t n, double *y) {
-    for (int64_t i = 0; i < stages; ++i) own_duals(a + i, v, n);
+EXPORT void newton_multipliers(stage *a, int64_t stages, double *v, double *y) {
+    for (int64_t i = 0; i < stages; ++i) own_duals(a + i, v);
     for (int64_t i = stages - 1; i >= 0; --i) duals(a + i, y);
 }
 

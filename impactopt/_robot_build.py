@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
@@ -173,6 +174,31 @@ def add_tool(model: pin.Model, tool: Tool) -> None:
     body = pin.Inertia(tool.mass, tool.center, tool.inertia)
     model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
     add_striker(model, tool.striker)
+
+
+def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Pairs of names of links; InputError for what is no pair, or no link."""
+    for pair in pairs:
+        if len(pair) != 2 or any(not isinstance(name, str) for name in pair):
+            raise InputError(f"disable_collisions: {pair!r} is no pair of links' names")
+        for name in pair:
+            check_frame(model, name, "disable_collisions")
+    return tuple((one, other) for one, other in pairs)
+
+
+def srdf_pairs(srdf: str | PathLike[str] | None) -> list[tuple[str, str]]:
+    """Pairs of links that an SRDF excludes from collisions.
+
+    Not those of the reason "Never", which an assistant has sampled: here they are looked at, which costs little.
+    """
+    if srdf is None:
+        return []
+    try:
+        root = ElementTree.parse(fspath(srdf)).getroot()
+    except (OSError, ElementTree.ParseError):
+        return []
+    said = (e for e in root.findall("disable_collisions") if e.get("reason") != "Never")
+    return [(e.get("link1", ""), e.get("link2", "")) for e in said]
 
 
 def joint_positions(model: pin.Model, q: Array) -> Array:

@@ -14,6 +14,7 @@ A library that someone else could have written is never loaded: see `impactopt.p
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -49,6 +50,7 @@ __all__ = [
     "address",
     "cache_directory",
     "cached",
+    "kept",
     "library_path",
     "model_hash",
     "native_library",
@@ -66,6 +68,7 @@ _NOT_IN_GRAPHS = frozenset(
         "_workers",
         "baseline",
         "bench",
+        "bodies",
         "cases",
         "cli",
         "errors",
@@ -204,6 +207,25 @@ def _directory() -> Path:
     except (UnsafePath, OSError) as error:
         _warn(f"{error}; compiling into a temporary directory, for this process only")
         return temporary_private_directory()
+
+
+def kept(kind: str, digest: str, make: Callable[[], bytes]) -> bytes:
+    """Numbers that take long to find: from the cache, or made and put there.
+
+    kind, digest : what they are called, and a hash of all that they depend on.
+    """
+    path = _directory() / f"{_slug(kind)}-{digest[:40]}"
+    try:
+        check_private_file(path)
+        content = path.read_bytes()
+        if hashlib.sha256(content[32:]).digest() == content[:32]:
+            return content[32:]
+    except (OSError, UnsafePath):
+        pass  # not there yet
+    made = make()
+    with contextlib.suppress(OSError):  # a full disk: they are made again next time
+        write_atomically(path, hashlib.sha256(made).digest() + made)
+    return made
 
 
 def cache_directory() -> Path:

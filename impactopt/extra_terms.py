@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from impactopt.errors import InputError, check_array
-from impactopt.shapes import Capsule, Vector, vector
+from impactopt.shapes import Vector
 from impactopt.terms import Term
 
 REACH = 0.2  # [m] of a hit region: further off the replays' target has ended
@@ -35,70 +35,6 @@ class TorqueRate(Term):
     @property
     def joints(self) -> tuple[str, ...]:
         return tuple(self.limit) if isinstance(self.limit, Mapping) else ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class SelfCollision(Term):
-    """Each pair of shapes stays ``margin`` [m] apart, at the nodes of swing and follow-through.
-
-    pairs None: the hand that strikes against torso and thighs, by
-    :func:`impactopt.skeleton.skeleton_pairs`.
-    """
-
-    name: ClassVar[str] = "self-collision"
-    unit: ClassVar[str] = "m"
-    pairs: tuple[tuple[Capsule, Capsule], ...] | None = None
-    margin: float = 0.01
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.pairs is None:
-            return
-        object.__setattr__(self, "pairs", tuple((first, second) for first, second in self.pairs))
-        for first, second in self.pairs:
-            if not first.radius + second.radius + self.margin > 0:
-                raise InputError(
-                    f"SelfCollision: {first.frame!r} and {second.frame!r} have no size; give a radius"
-                )
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        return tuple(shape.frame for pair in self.pairs or () for shape in pair)
-
-
-@dataclass(frozen=True, kw_only=True)
-class KeepOut(Term):
-    """Shapes stay ``margin`` [m] out of the target before contact, at the nodes of the swing.
-
-    The target is the half-space behind the plane of its face; or with ``size`` (across, up, deep) [m] a box
-    whose face is centred on the problem's point, from which spheres only are kept. The striking point has its
-    rule anyway.
-    """
-
-    name: ClassVar[str] = "keep out"
-    unit: ClassVar[str] = "m"
-    shapes: tuple[Capsule, ...]
-    size: Vector | None = None
-    margin: float = 0.01
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "shapes", tuple(self.shapes))
-        if self.size is None:
-            return
-        size = vector("KeepOut.size [m]", self.size)
-        if min(size) <= 0:
-            raise InputError(f"KeepOut.size is {size}; give three lengths > 0 m")
-        object.__setattr__(self, "size", size)
-        for shape in self.shapes:
-            if shape.end is not None or not shape.radius + self.margin > 0:
-                raise InputError(
-                    f"KeepOut: {shape.frame!r} is kept from a box as a sphere; give a radius and no end"
-                )
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        return tuple(shape.frame for shape in self.shapes)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,6 +46,18 @@ class Trajectory:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Where bodies are at k instants: time (k,) [s]; phase (k,): 0 before, 1 in, 2 after contact; q (k, nq) pin
+    configurations; travel (k,) [m] of the target along its normal.
+    """
+
+    time: Array
+    phase: NDArray[np.intp]
+    q: Array
+    travel: Array
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlannedCollision:
     """The collision that the plan predicts, at its m collocation points.
 
@@ -216,6 +228,62 @@ class Plan:
             contact_end=t1,
             end=rest,
         )
+
+    def motion(self, step: float = 1e-3, *, missed: bool = False) -> Motion:
+        """What the robot's bodies are expected to do, every ``step`` [s] from start to rest.
+
+        In contact the robot is slower than the servo's reference: between the states before and after it goes
+        the cubic that has both states' rates.
+
+        Raises
+        ------
+        InputError : the legs do not reach.
+        """
+        last, t1, _, _ = self.way(2, missed=missed)
+        t0, end = self.contact_start, t1 + last.duration
+        times = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t0, t1), (t1, end))]
+        before, _, _, _ = self.independent(0, times[0], missed=missed)
+        after, _, _, _ = self.independent(2, times[2], missed=missed)
+        during = self.through_contact((times[1] - t0) / max(t1 - t0, 1e-12), missed=missed)
+        time = np.concatenate(times)
+        phase = np.repeat([0, 1, 2], [len(t) for t in times])
+        return Motion(
+            time=time,
+            phase=phase,
+            q=self._closed(np.concatenate([before, during, after])),
+            travel=np.zeros(len(time)) if missed else self.travel(time),
+        )
+
+    def through_contact(self, s: Array, *, missed: bool = False) -> Array:
+        """Independent coordinates (k, ny) at fractions s (k,) of the contact."""
+        t0, (_, t1, _, _) = self.contact_start, self.way(2, missed=missed)
+        (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
+        (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
+        span, way, at = t1 - t0, y1 - y0, s[:, None]
+        bend = at * (1 - at) * ((1 - at) * (span * u0 - way) - at * (span * u1 - way))
+        return np.asarray(y0 + at * way + bend)
+
+    def travel(self, time: Array) -> Array:
+        """How far (k,) [m] the target has gone along the normal at times [s] since the motion's start.
+
+        After contact a free one goes on as fast as it is then.
+        """
+        hit, since = self.collision, np.asarray(time) - self.contact_start
+        if len(hit.time) < 2:
+            return np.zeros(len(since))
+        gone = np.concatenate([[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)])
+        last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
+        return np.interp(since, hit.time, gone, left=0.0) + last * np.maximum(since - hit.time[-1], 0.0)
+
+    def _closed(self, y: Array) -> Array:
+        """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""
+        c = self.coordinates
+        legs = c.split(self.problem.start_posture)[1]
+        q = np.zeros((len(y), self.problem.robot.nq))
+        for k, row in enumerate(y):
+            legs = c.solve_legs(row, legs)
+            q[k] = c.join(row, legs)
+        return q
 
     def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:
         """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through.

@@ -11,17 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt._problem_checks import COLLISIONS, check_at_rest, check_collision, check_names
+from impactopt.bodies.clearance import Bodies
+from impactopt.bodies.world import ground, obstacle_bodies, target_bodies
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, Mistakes, check_array
-from impactopt.extra_terms import HandOrientation, HitCone, SelfCollision
+from impactopt.extra_terms import HandOrientation, HitCone
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem_hash import problem_hash
 from impactopt.reach import reach
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
-from impactopt.skeleton import skeleton_pairs
+from impactopt.shapes import Obstacle, TargetBody
 from impactopt.stance import BothSoles, Stance
 from impactopt.terms import DEFAULT_TERMS, Incidence, Term
 
@@ -87,6 +89,8 @@ class ImpactProblem:
         the same with the restitution of two masses under the contact law. The last two know nothing of
         torque, ZMP and servo during the impact: they are what others plan with, to compare.
     scenarios : what else may be hit, or not, and has to be survived with the same swing.
+    body : what the target looks like, to all but the striking point.
+    obstacles : what else stands about, that nothing may touch.
     terms : what must hold; those of DEFAULT_TERMS that are not given take their defaults.
     objectives : what is maximized, a weighted sum.
     smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
@@ -115,6 +119,8 @@ class ImpactProblem:
     collision: str = "dynamics"
     coefficient_of_restitution: float = 0.0
     scenarios: tuple[Scenario, ...] = ()
+    body: TargetBody = field(default_factory=TargetBody)
+    obstacles: tuple[Obstacle, ...] = ()
     terms: tuple[Term, ...] = ()
     objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
     smoothness: float = 1e-5
@@ -132,6 +138,7 @@ class ImpactProblem:
         if found.attempt(self._check_scenarios):
             for scenario in self.scenarios:
                 found.attempt(partial(scenario.numbers, self.law, self.target))
+        found.attempt(self._check_world)
         termed = found.attempt(self._check_terms)
         if termed:
             for term in self.terms:
@@ -184,6 +191,19 @@ class ImpactProblem:
             if names.count(name) > 1:
                 raise InputError(f"two scenarios are called {name!r}: give each a name of its own")
 
+    def _check_world(self) -> None:
+        if not isinstance(self.body, TargetBody):
+            raise InputError(f"body must be a TargetBody, not {self.body!r}")
+        if not isinstance(self.obstacles, (list, tuple)) or not all(
+            isinstance(o, Obstacle) for o in self.obstacles
+        ):
+            raise InputError(f"obstacles must be a tuple of Obstacle, not {self.obstacles!r}")
+        object.__setattr__(self, "obstacles", tuple(self.obstacles))
+        names = [o.name for o in self.obstacles]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"two obstacles are called {name!r}: give each a name of its own")
+
     def _check_stance(self) -> None:
         if np.any(self.stance.compliance > 0):
             raise InputError(
@@ -197,7 +217,7 @@ class ImpactProblem:
             )
 
     def _check_terms(self) -> None:
-        object.__setattr__(self, "terms", tuple(self._with_pairs(t) for t in self.terms))
+        object.__setattr__(self, "terms", tuple(self.terms))
         kinds = [type(t) for t in self.terms]
         for kind in kinds:
             if kinds.count(kind) > 1:
@@ -216,11 +236,6 @@ class ImpactProblem:
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
         check_at_rest(self.robot, self.coordinates, self.stance.sole_names(self.robot), posture)
-
-    def _with_pairs(self, term: Term) -> Term:
-        if isinstance(term, SelfCollision) and term.pairs is None:
-            return replace(term, pairs=skeleton_pairs(self.robot, self.striker))
-        return term
 
     @property
     def brake_after(self) -> float | None:
@@ -269,6 +284,30 @@ class ImpactProblem:
             with suppress(InputError):
                 return reach(*given, facing=(np.array(hand.axis), direction))
         return reach(*given)
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """All that can touch something: the robot's links and the world, and which pairs are not to.
+
+        Raises
+        ------
+        InputError : the start posture is in the target, in what holds it, or in an obstacle.
+        """
+        model = self.robot.model
+        world = [
+            ground(),
+            *target_bodies(self.body, self.target, self.point, self.normal),
+            *obstacle_bodies(self.obstacles),
+        ]
+        soles = [model.getFrameId(sole.frame) for sole in self.stance.soles(self.robot)]
+        return Bodies(
+            self.robot,
+            tuple(world),
+            self.start_posture,
+            normal=self.normal,
+            striking=int(model.frames[model.getFrameId(self.robot.striker(self.striker).model_frame)].parentJoint),
+            standing=tuple(int(model.frames[k].parentJoint) for k in soles),
+        )
 
     def describe(self) -> dict[str, Any]:
         """The problem in a few plain words and numbers, for reports."""

@@ -42,6 +42,7 @@ class Robot:
     strikers : by name.
     postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
         the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
+    disable_collisions : pairs of links that may pass through each other: an SRDF's, and one's own.
     source : what it was made from, None where that was a model in Python.
     urdf : file whose visual shapes a picture shows, None for simple ones.
 
@@ -63,6 +64,7 @@ class Robot:
     soles: tuple[Sole, ...] = ()
     strikers: Mapping[str, Striker] = field(default_factory=dict)
     postures: Mapping[str, Array] = field(default_factory=dict)
+    disable_collisions: tuple[tuple[str, str], ...] = ()
     source: Source | None = None
     urdf: str | None = None
 
@@ -114,6 +116,8 @@ class Robot:
         model = build.read_urdf(path, srdf, floating=floating)
         model = build.lock_joints(model, locked)
         robot = cls.from_model(model, name=name or model.name, **{"urdf": path, **options})
+        pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
+        robot = dataclasses.replace(robot, disable_collisions=pairs)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, **options}
         return dataclasses.replace(robot, source=Source(urdf=fspath(path), options=given))
 
@@ -133,6 +137,7 @@ class Robot:
         soles: Sequence[Sole] = (),
         strikers: Sequence[Striker] = (),
         postures: Mapping[str, Mapping[str, float] | ArrayLike] | None = None,
+        disable_collisions: Sequence[tuple[str, str]] = (),
         urdf: str | PathLike[str] | None = None,
     ) -> Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
@@ -152,7 +157,8 @@ class Robot:
         soles, strikers : as they are.
         postures : by name: (nq,) configurations, or joint angles [rad] by name on top of the model's posture
             of that name (an SRDF's), or else of zero. The model's other postures are kept.
-        urdf : file whose visual shapes a picture shows.
+        disable_collisions : pairs of links that may pass through each other.
+        urdf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
         """
         model = model.copy()
         checks.check_joint_types(model)
@@ -179,6 +185,7 @@ class Robot:
             upper=upper,
             soles=tuple(soles),
             strikers=build.by_name("striker", strikers),
+            disable_collisions=build.link_pairs(model, disable_collisions),
             urdf=None if urdf is None else str(urdf),
         )
         build.by_name("sole", soles)

@@ -1,4 +1,4 @@
-"""Simple shapes on a robot's frames, and the axes of a target's face."""
+"""Shapes of the world that a problem gives, and the axes of a target's face."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, check_array, did_you_mean
 
 Vector = tuple[float, float, float]
 
@@ -20,30 +20,108 @@ def vector(name: str, value: Sequence[float]) -> Vector:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capsule:
-    """All points within ``radius`` [m] of the line from ``start`` to ``end`` [m], in ``frame``.
+class TargetBody:
+    """What the target looks like to everything but the striking point: its face's middle is the hit point.
 
-    end None: a sphere about ``start``.
+    shape : "box", "ball" or "none"; None: what fits the target, a box of 18 cm for a free mass, a wall of 1.5 x
+        1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x 6 cm.
+    size [m] : (across, up, deep) of a box, of the board or of the nail's block; (diameter,) of a ball; None:
+        those.
 
     Raises
     ------
-    InputError : a negative radius, points that are not three finite numbers.
+    InputError : an unknown shape, lengths that are not positive or too many.
     """
 
-    frame: str
-    radius: float
-    start: Vector = (0.0, 0.0, 0.0)
-    end: Vector | None = None
+    shape: str | None = None
+    size: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        where = f"shape on {self.frame!r}"
-        if not 0 <= self.radius < np.inf:
-            raise InputError(f"{where}: radius is {self.radius:g} m; give a number >= 0")
-        object.__setattr__(self, "start", vector(f"{where}: start [m]", self.start))
-        if self.end is not None:
-            object.__setattr__(self, "end", vector(f"{where}: end [m]", self.end))
-            if np.allclose(self.start, self.end):
-                raise InputError(f"{where}: start and end coincide; leave the end out for a sphere")
+        if self.shape is not None and self.shape not in TARGET_SHAPES:
+            raise InputError(
+                f"TargetBody.shape is {self.shape!r}{did_you_mean(str(self.shape), TARGET_SHAPES)}; give one of "
+                f"{', '.join(TARGET_SHAPES)}"
+            )
+        if self.size is None:
+            return
+        wanted = 1 if self.shape == "ball" else 3
+        size = check_array("TargetBody.size [m]", self.size, (wanted,))
+        if self.shape == "none" or not np.all(size > 0):
+            raise InputError(f"TargetBody.size is {size.tolist()} m; give lengths > 0, and none of shape 'none'")
+        object.__setattr__(self, "size", tuple(size.tolist()))
+
+
+TARGET_SHAPES = ("box", "ball", "none")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle:
+    """A box or a capsule that nothing of the robot may touch, fixed in the world.
+
+    size (3,) [m] : the sides of a box about ``position`` (3,) [m], turned by ``rpy`` [rad] about x, y and z.
+    start, end (3,) [m], radius [m] : of a capsule in their place; without an end, a sphere.
+
+    Raises
+    ------
+    InputError : neither of them, or both; lengths that are not positive.
+    """
+
+    name: str
+    size: Vector | None = None
+    position: Vector = (0.0, 0.0, 0.0)
+    rpy: Vector = (0.0, 0.0, 0.0)
+    start: Vector | None = None
+    end: Vector | None = None
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        where = f"obstacle {self.name!r}"
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise InputError(f"an obstacle's name is {self.name!r}; give a word that reports can call it by")
+        if (self.size is None) == (self.start is None):
+            raise InputError(f"{where}: give either size, of a box, or start and radius, of a capsule")
+        for key in ("size", "position", "rpy", "start", "end"):
+            value = getattr(self, key)
+            if value is not None:
+                object.__setattr__(self, key, vector(f"{where}: {key}", value))
+        if self.size is not None:
+            if min(self.size) <= 0 or self.radius or self.end is not None:
+                raise InputError(f"{where}: a box has a size of three lengths > 0 m, no end and no radius")
+            return
+        if not 0 < self.radius < np.inf or any(self.rpy) or any(self.position):
+            raise InputError(f"{where}: a capsule has a radius > 0 m, a start and an end, and no position or rpy")
+        if self.end is None:
+            object.__setattr__(self, "end", self.start)
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Its middle (3,) [m]."""
+        return np.array(self.position) if self.size is not None else np.add(self.start, self.end) / 2
+
+    @property
+    def half(self) -> NDArray[np.float64]:
+        """Half sides (3,) [m] of the box; of a capsule's axis, along z."""
+        if self.size is not None:
+            return np.array(self.size) / 2
+        return np.array([0.0, 0.0, self._length / 2])
+
+    @property
+    def _length(self) -> float:
+        return float(np.linalg.norm(np.subtract(self.end or (), self.start or ())))
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) axes in the world, as columns."""
+        if self.size is None:
+            if self._length < 1e-9:
+                return np.eye(3)
+            along = np.subtract(self.end or (), self.start or ()) / self._length
+            return face_axes(along)[[1, 2, 0]].T
+        (cr, cp, cy), (sr, sp, sy) = np.cos(self.rpy), np.sin(self.rpy)
+        about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        return np.asarray(about_z @ about_y @ about_x)
 
 
 def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:

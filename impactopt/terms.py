@@ -176,6 +176,34 @@ class LegExtension(Term):
             raise InputError(f"LegExtension.minimum is {self.minimum:g}; give a fraction from 0 to 1")
 
 
+@dataclass(frozen=True, kw_only=True)
+class SelfCollision(Term):
+    """No two links of the robot come nearer than ``margin`` [m], from start to rest, after a miss too.
+
+    Links that a joint connects are left out, and those that touch in the start posture. Where two are nearer
+    than that at the start, they may stay as near.  enabled : False lets links pass through each other.
+    """
+
+    name: ClassVar[str] = "self-collision"
+    unit: ClassVar[str] = "m"
+    margin: float = 0.01
+    enabled: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeepOut(Term):
+    """No link comes nearer than ``margin`` [m] to the target, to the ground and to obstacles.
+
+    The link that strikes may touch the target, from the side that it strikes; held soles stand on the ground.
+    enabled : False lets the robot pass through them.
+    """
+
+    name: ClassVar[str] = "keep out"
+    unit: ClassVar[str] = "m"
+    margin: float = 0.01
+    enabled: bool = True
+
+
 DEFAULT_TERMS: tuple[Term, ...] = (
     TorqueLimit(),
     VelocityLimit(),
@@ -184,4 +212,6 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     Balance(),
     Incidence(),
     LegExtension(),
+    SelfCollision(),
+    KeepOut(),
 )

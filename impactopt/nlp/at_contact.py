@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+import copy
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 
 from impactopt.cone import inward_edges
 from impactopt.extra_terms import HitCone, HitRegion
+from impactopt.nlp.apart import ApartRow, add_apart_rows
 from impactopt.nlp.builder import Builder
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.extra_terms import add_extra_terms
@@ -21,6 +25,9 @@ from impactopt.objectives import AngularMomentum, Objective
 from impactopt.plan import PlannedScenario
 from impactopt.support import support_polygon
 from impactopt.terms import Term
+
+
+Program = TypeVar("Program", bound="ContactProgram")
 
 
 def rotation_rows(normal: Array) -> Array:
@@ -224,8 +231,15 @@ class ContactProgram(Builder):
         """Rows of the extra ones among these terms, the objective, and the program."""
         add_extra_terms(self, terms)
         self.objectives = quantities(self, objectives)
-        objective, quadratic, linear = assemble(self.layout, self.objectives, self._prices())
-        self.program = StructuredProgram(
+        self._worth = assemble(self.layout, self.objectives, self._prices())
+        self.apart_rows: Mapping[ApartRow, tuple[float, float]] = {}
+        self._bare = tuple(self.blocks), self.rows
+
+    @cached_property
+    def program(self) -> StructuredProgram:
+        """All of it, for a solver."""
+        objective, quadratic, linear = self._worth
+        return StructuredProgram(
             self.layout,
             self.blocks,
             self.rows,
@@ -234,6 +248,16 @@ class ContactProgram(Builder):
             linear=linear,
             determined=self._determined(),
         )
+
+    def with_apart(self: Program, rows: Mapping[ApartRow, tuple[float, float]]) -> Program:
+        """The same program with just these rows between bodies: bound [m] and the target's travel [m] of each."""
+        other = copy.copy(self)
+        other.__dict__.pop("program", None)
+        blocks, bare = self._bare
+        other.blocks, other.rows = list(blocks), bare.copy()
+        other.apart_rows = dict(rows)
+        add_apart_rows(other, other.apart_rows)
+        return other
 
     # ------------------------------------------------------------------ structure
     def _determined(self) -> list[tuple[Rank, Index]]:

@@ -102,13 +102,20 @@ class Block:
 
         ``parameters``: (n_p,) for all or (count, n_p).
         """
-        f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
-        n_in, n_out = f.size1_in(0), f.size1_out(0)
+        n_in = functions[name].size1_in(0)
         lifts = [stack(slots) for slots in instances]
         for lift in lifts:
             if lift.size != n_in:
                 raise ValueError(f"block {name} takes {n_in} inputs, was given {lift.size}")
-        count = len(lifts)
+        return cls.of_lift(name, functions, stack(lifts), len(lifts), parameters)
+
+    @classmethod
+    def of_lift(
+        cls, name: str, functions: dict[str, Any], lift: Affine, count: int, parameters: ArrayLike
+    ) -> Block:
+        """As :meth:`make`, of all instances' z (count * n_in) as one expression."""
+        f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
+        n_in, n_out = f.size1_in(0), f.size1_out(0)
         p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))
         value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
         return cls(
@@ -119,7 +126,7 @@ class Block:
             n_in=n_in,
             n_out=n_out,
             count=count,
-            lift=stack(lifts),
+            lift=lift,
             jac_pattern=jacobian.pattern,
             hess_pattern=hessian.pattern,
         )

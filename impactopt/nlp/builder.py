@@ -35,7 +35,7 @@ BASE_BOX = np.array([0.6, 0.6, 0.6, 0.8, 0.8, 1.2])  # [m, rad] how far the base
 class Builder:
     """A program under construction; ``program`` is there at its end."""
 
-    program: StructuredProgram
+    program: Any  # StructuredProgram, in whoever completes it
 
     def __init__(
         self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
@@ -86,6 +86,12 @@ class Builder:
         """Append a block; the index of its first output."""
         at = sum(b.count * b.n_out for b in self.blocks)
         self.blocks.append(Block.make(name, self.functions, instances, parameters))
+        return at
+
+    def add_lifted(self, name: str, lift: Affine, count: int, parameters: Array) -> int:
+        """As :meth:`add_block`, of all instances' z as one expression."""
+        at = sum(b.count * b.n_out for b in self.blocks)
+        self.blocks.append(Block.of_lift(name, self.functions, lift, count, parameters))
         return at
 
     def lift(

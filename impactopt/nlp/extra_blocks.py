@@ -12,12 +12,11 @@ from typing import Any
 import casadi as ca
 
 from impactopt.coordinates import StanceCoordinates
-from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion, KeepOut, SelfCollision
+from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion
 from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, make_block, striker_kinematics
 from impactopt.nlp.mesh import contact_mesh
 from impactopt.objectives import Effort, PeakForce, TargetEnergy
 from impactopt.problem import ImpactProblem
-from impactopt.shapes import Capsule
 
 
 @dataclass(frozen=True)
@@ -44,12 +43,6 @@ def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, Extr
 
 def _of_terms(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:
     out: dict[str, ExtraBlock] = {}
-    if (apart := problem.extra(SelfCollision)) is not None:
-        key = tuple((s.frame, s.end is None) for pair in apart.pairs or () for s in pair)
-        out["self_collision"] = ExtraBlock(key, lambda: self_collision(c, apart))
-    if (out_of := problem.extra(KeepOut)) is not None:
-        key = tuple((s.frame, s.end is None) for s in out_of.shapes)
-        out["keep_out"] = ExtraBlock((out_of.size is None, *key), lambda: keep_out(c, out_of))
     if problem.extra(HandOrientation) is not None:
         out["hand_orientation"] = ExtraBlock((), lambda: hand_orientation(c, problem.striker))
     if (gazing := problem.extra(Gaze)) is not None:
@@ -87,94 +80,6 @@ def effort(n: int) -> BlockExpression:
 
 
 # ---- terms
-
-
-def corners(shape: Capsule) -> list[float]:
-    """What a block takes as a shape's points: start, and end if there is one."""
-    return [*shape.start, *(shape.end or ())]
-
-
-class _Points:
-    """Points of shapes in the world, and the symbols of their numbers."""
-
-    def __init__(self, c: StanceCoordinates) -> None:
-        self.y, self.legs = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl)
-        self._c, self._q = c, c.configuration(self.y, self.legs)
-        self.numbers: list[Any] = []
-
-    def of(self, shape: Capsule) -> list[Any]:
-        rotation, origin = self._c.rb_frame(shape.frame, self._q)
-        out = []
-        for _ in range(1 if shape.end is None else 2):
-            local = ca.SX.sym("p", 3)
-            self.numbers.append(local)
-            out.append(origin + ca.mtimes(rotation, local))
-        return out
-
-
-def self_collision(c: StanceCoordinates, term: SelfCollision) -> BlockExpression:
-    """z = y, legs;  p = of each pair the points of both shapes and R, radii and margin.
-
-    out = (d^2 - R^2) / 2R [m] with the distance d of the lines: smooth, and d - R where that is small.
-    """
-    points, out = _Points(c), []
-    for first, second in term.pairs or ():
-        a, b, reach = points.of(first), points.of(second), ca.SX.sym("R")
-        points.numbers.append(reach)
-        out.append((squared_distance(a, b) - reach**2) / (2 * reach))
-    return make_block([points.y, points.legs], points.numbers, {"gap": ca.vertcat(*out)})
-
-
-def squared_distance(a: list[Any], b: list[Any]) -> Any:
-    """Of two points or lines, given by their ends, SX. Once differentiable, unless two lines are parallel.
-
-    Source: Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
-    """
-    if len(a) == len(b) == 1:
-        return ca.sumsqr(a[0] - b[0])
-    if len(a) == 1:
-        return squared_distance(b, a)
-    u = a[1] - a[0]
-    r = a[0] - b[0]
-    if len(b) == 1:
-        return ca.sumsqr(r + _within(-ca.dot(u, r) / ca.sumsqr(u)) * u)
-    v = b[1] - b[0]
-    uu, vv, uv, ur, vr = ca.sumsqr(u), ca.sumsqr(v), ca.dot(u, v), ca.dot(u, r), ca.dot(v, r)
-    s = _within((uv * vr - ur * vv) / (uu * vv - uv**2 + 1e-12 * uu * vv))
-    t = (uv * s + vr) / vv
-    # where that leaves the second line, its end counts
-    s = ca.if_else(t < 0, _within(-ur / uu), ca.if_else(t > 1, _within((uv - ur) / uu), s))
-    return ca.sumsqr(r + s * u - _within(t) * v)
-
-
-def _within(x: Any) -> Any:
-    return ca.fmin(ca.fmax(x, 0.0), 1.0)
-
-
-def keep_out(c: StanceCoordinates, term: KeepOut) -> BlockExpression:
-    """z = y, legs;  p = point (3), axes of the face (9, by rows), half of the box's size (3) if it is one; of
-    each shape its points and its radius with the margin.
-
-    out [m], not negative outside = of each point the distance before the face; or as :func:`self_collision`,
-    to the box.
-    """
-    points, gaps = _Points(c), []
-    point, rows = ca.SX.sym("point", 3), ca.SX.sym("axes", 9)
-    axes = ca.reshape(rows, 3, 3).T  # CasADi is column-major
-    half = ca.SX.sym("half", 0 if term.size is None else 3)
-    for shape in term.shapes:
-        ends, reach = points.of(shape), ca.SX.sym("R")
-        points.numbers.append(reach)
-        for end in ends:
-            way = ca.mtimes(axes, end - point)
-            if term.size is None:
-                gaps.append(-way[0] - reach)
-                continue
-            middle = ca.vertcat(way[0] - half[2], way[1], way[2])
-            beyond = ca.fmax(ca.fabs(middle) - ca.vertcat(half[2], half[0], half[1]), 0.0)
-            gaps.append((ca.sumsqr(beyond) - reach**2) / (2 * reach))
-    numbers = [point, rows, half, *points.numbers]
-    return make_block([points.y, points.legs], numbers, {"gap": ca.vertcat(*gaps)})
 
 
 def hand_orientation(c: StanceCoordinates, striker: str) -> BlockExpression:

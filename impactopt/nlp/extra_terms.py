@@ -13,12 +13,9 @@ from impactopt.extra_terms import (
     HandOrientation,
     HitCone,
     HitRegion,
-    KeepOut,
-    SelfCollision,
     TorqueRate,
 )
-from impactopt.nlp.extra_blocks import corners
-from impactopt.nlp.layout import Affine, Array, Group
+from impactopt.nlp.layout import Affine, Group
 from impactopt.nlp.objective import start_torque
 from impactopt.nlp.rows import Measure, Place, degrees, millimetres
 from impactopt.shapes import face_axes
@@ -71,48 +68,6 @@ def _torque_rate(t: Transcription, term: TorqueRate) -> None:
 
 def _repeated(duration: Group, count: int) -> Affine:
     return duration[0].apply(np.ones((count, 1)))
-
-
-def _self_collision(t: ContactProgram, term: SelfCollision) -> None:
-    names = [f"{first.frame} and {second.frame}" for first, second in term.pairs or ()]
-    numbers = [[*corners(a), *corners(b), a.radius + b.radius + term.margin] for a, b in term.pairs or ()]
-    spots = [*t.swing_spots(), *t.follow_spots()]
-    _each(t, "self_collision", term.name, spots, np.concatenate(numbers), _distinct(names))
-
-
-def _keep_out(t: ContactProgram, term: KeepOut) -> None:
-    numbers = [*t.problem.point, *face_axes(t.problem.normal).ravel(), *(a / 2 for a in term.size or ())]
-    names = []
-    for shape in term.shapes:
-        numbers += [*corners(shape), shape.radius + term.margin]
-        names += [shape.frame] if shape.end is None else [f"{shape.frame} start", f"{shape.frame} end"]
-    _each(t, "keep_out", term.name, t.swing_spots()[:-1], np.array(numbers), _distinct(names))
-
-
-def _distinct(names: list[str]) -> list[str]:
-    """Names with a number where one comes again."""
-    return [f"{n} {names[:k].count(n) + 1}" if names.count(n) > 1 else n for k, n in enumerate(names)]
-
-
-def _each(
-    t: ContactProgram,
-    block: str,
-    term: str,
-    spots: list[tuple[Place, list[Affine]]],
-    numbers: Array,
-    names: list[str],
-) -> None:
-    """At each place, all outputs of a block [m] are not negative."""
-    at = t.add_block(block, [slots for _, slots in spots], numbers)
-    for i, (place, _) in enumerate(spots):
-        t.rows.add(
-            term=term,
-            place=place,
-            components=names,
-            outputs=at + i * len(names) + np.arange(len(names)),
-            lower=0,
-            measure=millimetres("too near"),
-        )
 
 
 def _hand_orientation(t: ContactProgram, term: HandOrientation) -> None:
@@ -179,8 +134,6 @@ def _hit_cone(t: ContactProgram, term: HitCone) -> None:
 
 _ADD: dict[type[Term], Callable[[Any, Any], None]] = {
     TorqueRate: _torque_rate,
-    SelfCollision: _self_collision,
-    KeepOut: _keep_out,
     HandOrientation: _hand_orientation,
     Gaze: _gaze,
     HitRegion: _hit_region,

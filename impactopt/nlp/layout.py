@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -35,6 +36,13 @@ class Affine:
     @classmethod
     def zeros(cls, size: int) -> Affine:
         return cls.constant(np.zeros(size))
+
+    @classmethod
+    def of_matrix(cls, matrix: Any, const: Array) -> Affine:
+        """matrix (size, n), sparse, times the variables, plus const (size,)."""
+        entries = sp.coo_array(matrix)
+        rows, cols = (np.asarray(i, dtype=np.intp) for i in (entries.row, entries.col))
+        return cls(len(const), rows, cols, np.asarray(entries.data), np.asarray(const))
 
     def __add__(self, other: Affine) -> Affine:
         return add([self, other])

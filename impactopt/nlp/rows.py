@@ -7,7 +7,7 @@ measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -132,6 +132,19 @@ class Rows:
     lower: list[Array] = field(default_factory=list)
     upper: list[Array] = field(default_factory=list)
     origins: list[Row] = field(default_factory=list)
+
+    def copy(self) -> Rows:
+        """The same rows, to which others can be added."""
+        return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
+
+    def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
+        """Append rows of these origins:  lower <= out[outputs]."""
+        n = len(origins)
+        self.outputs.append(np.asarray(outputs, dtype=np.intp))
+        self.affine.append(Affine.zeros(n))
+        self.lower.append(np.full(n, lower))
+        self.upper.append(np.full(n, np.inf))
+        self.origins.extend(origins)
 
     def add(
         self,

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.coordinates import StanceCoordinates
-from impactopt.extra_terms import KeepOut, TorqueRate
+from impactopt.extra_terms import TorqueRate
 from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.layout import Affine, Array
@@ -23,7 +23,7 @@ from impactopt.plan import total_ground_wrench
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
 
-OF_MOTIONS = (TorqueRate, KeepOut, Effort)  # terms and objectives that say nothing of a strike
+OF_MOTIONS = (TorqueRate, Effort)  # terms and objectives that say nothing of a strike
 
 
 class StrikeTranscription(ContactProgram):

@@ -20,6 +20,7 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.extra_terms import TorqueRate
 from impactopt.motion import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.nlp import blocks as symbolic
+from impactopt.nlp.apart import apart_functions
 from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.clearance import add_clearance
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
@@ -67,7 +68,7 @@ def block_functions(
             return [in_lanes(function, b.lanes) for function in found]
 
         out |= cached(f"{robot.name}-{name}", (name, *recipe, *block.key), functions, report=report)
-    return out
+    return out | apart_functions(report)
 
 
 class Transcription(ContactProgram):

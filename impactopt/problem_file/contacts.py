@@ -11,9 +11,18 @@ from pydantic import ConfigDict, Field, create_model
 from impactopt import contact
 from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import AtLeastOne, NotNegative, Positive
+from impactopt.shapes import TargetBody
 
 TargetKind = Literal["free mass", "wall", "nail", "board"]
 LawKind = Literal["spring damper", "Kelvin-Voigt", "Hunt-Crossley", "Hertz"]
+
+
+class Body(Section):
+    """What the target looks like; its face's middle is the hit point."""
+
+    kind = TargetBody
+    shape: Literal["box", "ball", "none"] = optional("left out: what fits the target's kind")
+    size: list[Positive] = optional("of a box [across, up, deep], of a ball [diameter] [m]", "size_m")
 
 
 class Target(Section):
@@ -21,7 +30,9 @@ class Target(Section):
 
     model_config = ConfigDict(extra="ignore")
     choice: ClassVar[str] = "target_kind"
+    apart: ClassVar[tuple[str, ...]] = ("body",)
     target_kind: TargetKind = Field(default="free mass", alias="kind", description="what it is")
+    body: Body = optional("")
 
 
 class FreeMass(Target):

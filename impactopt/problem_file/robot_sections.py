@@ -95,6 +95,7 @@ class RobotSection(Section):
     torque_limit: PerJoint = optional("of all joints or by joint [N m]", "torque_limit_N_m")
     velocity_limit: PerJoint = optional("of all joints or by joint [rad/s]", "velocity_limit_rad_s")
     position_limit: dict[str, Range] = optional("[lower, upper] by joint [rad]", "position_limit_rad")
+    disable_collisions: list[tuple[str, str]] = optional("pairs of links that may pass through each other")
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
     strikers: list[StrikerSection] = optional("points that hit")
     tools: list[ToolSection] = optional("what the robot holds")

@@ -41,15 +41,17 @@ class Section(BaseModel):
 
     Of a class below, the docstring's first sentence says in the reference what the section is about.
     kind : the class that it describes.  choice : the field that only says which kind of section this is.
+    apart : fields that are sections of something else.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
     kind: ClassVar[Any] = None
     choice: ClassVar[str] = ""
+    apart: ClassVar[tuple[str, ...]] = ()
 
     def given(self) -> dict[str, Any]:
         """The keys that the file has, by the names of the class's fields."""
-        return self.model_dump(exclude_unset=True, exclude={self.choice})
+        return self.model_dump(exclude_unset=True, exclude={self.choice, *self.apart})
 
     def build(self) -> Any:
         """The thing that this section describes."""

@@ -38,6 +38,7 @@ from impactopt.problem_file.values import (
 )
 from impactopt.robot import Robot
 from impactopt.scenario import Scenario
+from impactopt.shapes import Obstacle
 from impactopt.stance import BothSoles, FixedBase, OneSole
 from impactopt.stance import Stance as Stances
 
@@ -136,6 +137,19 @@ class ScenarioSection(Section):
     )
 
 
+class ObstacleSection(Section):
+    """A box or a capsule that nothing of the robot may touch."""
+
+    kind = Obstacle
+    name: str = required("what reports call it")
+    size: Vector = optional("sides of a box [m]", "size_m")
+    position: Vector = optional("middle of the box, world [m]", "position_m")
+    rpy: Vector = optional("turns of the box about x, y and z [rad]", "rpy_rad")
+    start: Vector = optional("of a capsule's axis, world [m]", "start_m")
+    end: Vector = optional("of its axis [m]; left out: a sphere", "end_m")
+    radius: Positive = optional("of the capsule [m]", "radius_m")
+
+
 class Objective(Section):
     """Prices that only make the optimum unique, and its end natural."""
 
@@ -213,6 +227,7 @@ class File(Section):
     follow: Follow = optional("")
     collision: Collision = optional("")
     scenarios: list[ScenarioSection] = optional("")
+    obstacles: list[ObstacleSection] = optional("")
     objectives: Objectives = optional("")
     objective: Objective = optional("")
     terms: Terms = optional("")
@@ -267,6 +282,10 @@ class File(Section):
             if "contact_duration" in given:
                 given["contact_duration"] = tuple(given["contact_duration"])
             out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
+        if self.target.body is not None:
+            out["body"] = self.target.body.build()
+        if self.obstacles is not None:
+            out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
         if self.scenarios is not None:
             out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
         for name, section in (("terms", self.terms), ("objectives", self.objectives)):

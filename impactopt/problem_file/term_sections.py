@@ -18,7 +18,6 @@ from impactopt.problem_file.values import (
     UnitVector,
     Vector,
 )
-from impactopt.shapes import Capsule
 
 
 class TorqueLimit(Section):
@@ -84,26 +83,6 @@ class LegExtension(Section):
     minimum: Restitution = optional("of the start posture's leg determinant; 0 would be a straight knee")
 
 
-class Shape(Section):
-    """A sphere, or with an end a capsule, on a frame of the robot."""
-
-    kind = Capsule
-    frame: str = required("of the robot")
-    radius: NotNegative = required("[m]", "radius_m")
-    start: Vector = optional("of its axis in the frame [m]", "start_m")
-    end: Vector = optional("of its axis [m]; left out: a sphere about the start", "end_m")
-
-
-class Pair(Section):
-    """Two shapes that stay apart."""
-
-    first: Shape = required("one of them")
-    second: Shape = required("the other")
-
-    def build(self) -> tuple[Any, Any]:
-        return self.first.build(), self.second.build()
-
-
 class TorqueRate(Section):
     """|d torque/dt| is bounded, from node to node of swing and follow-through."""
 
@@ -112,29 +91,20 @@ class TorqueRate(Section):
 
 
 class SelfCollision(Section):
-    """Pairs of shapes on the robot stay apart in swing and follow-through."""
+    """Links of the robot keep apart, from start to rest; those that a joint connects or that touch at the start are
+    left out."""
 
-    kind = extra_terms.SelfCollision
-    pairs: list[Pair] = optional("what stays apart; left out: the hand that strikes, torso and thighs")
-    margin: NotNegative = optional("between the shapes [m]", "margin_m")
-
-    def build(self) -> Any:
-        pairs = None if self.pairs is None else tuple(pair.build() for pair in self.pairs)
-        return self.kind(**{**self.given(), "pairs": pairs})
+    kind = terms.SelfCollision
+    margin: NotNegative = optional("between two links [m]", "margin_m")
+    enabled: bool = optional("false: links may pass through each other")
 
 
 class KeepOut(Section):
-    """Shapes on the robot stay out of the target before contact."""
+    """The robot keeps off the target, the ground and obstacles; the link that strikes may touch the target."""
 
-    kind = extra_terms.KeepOut
-    shapes: list[Shape] = required("what stays out")
-    size: Vector = optional(
-        "across, up, deep, of a box that is the target [m]; left out: all behind its face", "size_m"
-    )
-    margin: NotNegative = optional("between shapes and target [m]", "margin_m")
-
-    def build(self) -> Any:
-        return self.kind(**{**self.given(), "shapes": tuple(shape.build() for shape in self.shapes)})
+    kind = terms.KeepOut
+    margin: NotNegative = optional("from a link to any of them [m]", "margin_m")
+    enabled: bool = optional("false: the robot may pass through them")
 
 
 class HandOrientation(Section):
@@ -172,7 +142,7 @@ class HitCone(Section):
 
 
 class Terms(Section):
-    """What the plan must respect; of these, torque_limit to leg_extension hold if left out too."""
+    """What the plan must respect; of these, torque_limit to keep_out hold if left out too."""
 
     torque_limit: TorqueLimit = optional("")
     velocity_limit: VelocityLimit = optional("")
@@ -181,9 +151,9 @@ class Terms(Section):
     balance: Balance = optional("")
     incidence: Incidence = optional("")
     leg_extension: LegExtension = optional("")
-    torque_rate: TorqueRate = optional("")
     self_collision: SelfCollision = optional("")
     keep_out: KeepOut = optional("")
+    torque_rate: TorqueRate = optional("")
     hand_orientation: HandOrientation = optional("")
     gaze: Gaze = optional("")
     hit_region: HitRegion = optional("")

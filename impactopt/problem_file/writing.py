@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Mapping
 from dataclasses import fields
@@ -12,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.extra_terms import SelfCollision
 from impactopt.problem import ImpactProblem
-from impactopt.problem_file.contacts import LAWS, TARGETS
+from impactopt.problem_file.contacts import LAWS, TARGETS, Body
 from impactopt.problem_file.describing import comment_at
 from impactopt.problem_file.reading import problem_file_from_data
 from impactopt.problem_file.robot_writing import robot_data
@@ -26,14 +24,15 @@ from impactopt.problem_file.sections import (
     Follow,
     Objective,
     Objectives,
+    ObstacleSection,
     Problem,
     ScenarioSection,
     Swing,
 )
 from impactopt.problem_file.solver_sections import SolverSettings
-from impactopt.problem_file.term_sections import Shape, Terms
+from impactopt.problem_file.term_sections import Terms
 from impactopt.problem_file.toml import plain_value, write_toml
-from impactopt.skeleton import skeleton_pairs
+from impactopt.shapes import TargetBody
 from impactopt.stance import OneSole
 from impactopt.terms import DEFAULT_TERMS
 
@@ -103,10 +102,9 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     if problem.objectives != ImpactProblem.objectives:
         data["objectives"] = _parts(Objectives, problem.objectives)
     data["terms"] = _parts(Terms, [term for term in problem.terms if term not in DEFAULT_TERMS])
-    apart = problem.extra(SelfCollision)
-    with contextlib.suppress(InputError):  # a robot without a torso has no pairs by itself
-        if apart is not None and apart.pairs == skeleton_pairs(problem.robot, problem.striker):
-            del data["terms"]["self_collision"]["pairs"]
+    if problem.body != TargetBody():
+        data["target"]["body"] = _section(Body, problem.body)
+    data["obstacles"] = [_section(ObstacleSection, obstacle) for obstacle in problem.obstacles]
     order = ["problem", *(name for name in File.model_fields if name != "problem")]
     return {name: data[name] for name in order if data.get(name)}
 
@@ -139,7 +137,7 @@ def _of_kind(what: str, thing: Any, kinds: Mapping[str, type[Section]], key: str
 
 def _section(section: type[Section], thing: Any) -> dict[str, Any]:
     """A thing that a section describes, without what is a default."""
-    names = [name for name in section.model_fields if name != section.choice]
+    names = [name for name in section.model_fields if name not in (section.choice, *section.apart)]
     return _different(section, {name: getattr(thing, name) for name in names})
 
 
@@ -157,15 +155,7 @@ def _written(name: str, value: Any) -> Any:
         return "anywhere"
     if name in ("duration", "contact_duration") and value[0] == value[1]:
         return value[0]
-    if name == "pairs":
-        return [{"first": _shape(first), "second": _shape(second)} for first, second in value]
-    if name == "shapes":
-        return [_shape(shape) for shape in value]
     return plain_value(value)
-
-
-def _shape(shape: Any) -> dict[str, Any]:
-    return _section(Shape, shape)
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.report.solids import Solid, box, cylinder, rounded_box, sphere
+from impactopt.bodies.pieces import ROD, inertia_box
+from impactopt.bodies.solids import Solid, cylinder, sphere
+from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
 from impactopt.robot import Robot, Striker
 
 __all__ = ["Visual", "visuals_of"]
@@ -21,8 +21,7 @@ __all__ = ["Visual", "visuals_of"]
 Array = NDArray[np.float64]
 GREY = (0.72, 0.74, 0.77)  # of what has no colour of its own
 JOINT, BONE = (0.35, 0.37, 0.40), (0.55, 0.57, 0.60)
-THIN, THICK = 0.012, 0.028  # [m] radii of a bone, and of the ball at its joint
-SIDE = 0.02  # [m] least side of a box of inertia
+THIN, THICK = ROD, 0.028  # [m] radii of a bone, and of the ball at its joint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,99 +44,24 @@ def visuals_of(robot: Robot) -> list[Visual]:
 
 
 def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
-    try:
-        root = ElementTree.parse(urdf).getroot()
-    except (OSError, ElementTree.ParseError):
+    root = urdf_root(urdf)
+    if root is None:
         return []
     colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
-    model, found = robot.model, []
-    for link in root.findall("link"):
-        if not model.existFrame(link.get("name", ""), pin.FrameType.BODY):
-            continue
-        frame = model.frames[model.getFrameId(link.get("name", ""), pin.FrameType.BODY)]
-        for visual in link.findall("visual"):
-            solid = _solid(visual.find("geometry"), urdf)
-            if solid is None:
-                continue
-            material = visual.find("material")
-            colour = None if material is None else _colour(material) or colours.get(material.get("name", ""))
-            place = frame.placement * _origin(visual.find("origin"))
-            found.append(
-                Visual(
-                    joint=int(frame.parentJoint),
-                    solid=solid.moved(place.rotation, place.translation),
-                    colour=colour or GREY,
-                )
-            )
+    found = []
+    for shape in shapes_of(robot.model, root, urdf, "visual"):
+        material = shape.element.find("material")
+        colour = None if material is None else _colour(material) or colours.get(material.get("name", ""))
+        found.append(Visual(joint=shape.joint, solid=shape.solid, colour=colour or GREY))
     return found
-
-
-def _solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
-    """The solid of a <geometry>; None if it is none, or its mesh cannot be read."""
-    for shape in geometry if geometry is not None else ():
-        with contextlib.suppress(ValueError, RuntimeError, OSError, KeyError):
-            if shape.tag == "box":
-                return box(_numbers(shape.attrib["size"]))
-            if shape.tag == "cylinder":
-                return cylinder(float(shape.attrib["radius"]), float(shape.attrib["length"]))
-            if shape.tag == "sphere":
-                return sphere(float(shape.attrib["radius"]))
-            if shape.tag == "mesh":
-                scale = _numbers(shape.get("scale", "1 1 1"))
-                return read_mesh(find_mesh(shape.attrib["filename"], urdf), scale)
-    return None
-
-
-def find_mesh(name: str, urdf: Path) -> Path:
-    """The file of a mesh: a path from the URDF, or package://NAME/..., where a folder above it holds NAME.
-
-    Raises
-    ------
-    FileNotFoundError : there is none.
-    """
-    path = Path(name.removeprefix("package://").removeprefix("file://"))
-    above = [*urdf.resolve().parents]
-    places = [folder / path for folder in above]
-    if name.startswith("package://"):  # the folder may be called otherwise than the package
-        places += [folder.joinpath(*path.parts[1:]) for folder in above]
-    for place in places if not path.is_absolute() else [path]:
-        if place.is_file():
-            return place
-    raise FileNotFoundError(name)
-
-
-def read_mesh(path: Path, scale: Array) -> Solid:
-    """The triangles of a mesh file: STL, or another kind that coal reads, such as Collada and OBJ."""
-    data = path.read_bytes()
-    count = int.from_bytes(data[80:84], "little")
-    if path.suffix.lower() == ".stl" and len(data) == 84 + 50 * count:  # binary; coal takes seconds for it
-        facets = np.frombuffer(data, offset=84, dtype=[("at", "<f4", (4, 3)), ("attribute", "<u2")])
-        vertices = facets["at"][:, 1:].reshape(-1, 3).astype(float)
-        return Solid(vertices=scale * vertices, triangles=np.arange(3 * count).reshape(-1, 3))
-    mesh = coal.MeshLoader().load(str(path), scale)
-    corners = [mesh.tri_indices(k) for k in range(mesh.num_tris)]
-    return Solid(
-        vertices=np.array(mesh.vertices()), triangles=np.array([[t[0], t[1], t[2]] for t in corners])
-    )
-
-
-def _origin(origin: ElementTree.Element | None) -> pin.SE3:
-    if origin is None:
-        return pin.SE3.Identity()
-    xyz, rpy = (_numbers(origin.get(key, "0 0 0")) for key in ("xyz", "rpy"))
-    return pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
 
 
 def _colour(material: ElementTree.Element) -> tuple[float, float, float] | None:
     colour = material.find("color")
     if colour is None:
         return None
-    red, green, blue, *_ = _numbers(colour.get("rgba", "")).tolist()
+    red, green, blue, *_ = numbers(colour.get("rgba", "")).tolist()
     return red, green, blue
-
-
-def _numbers(text: str) -> Array:
-    return np.array([float(word) for word in text.split()])
 
 
 def _from_inertia(robot: Robot) -> list[Visual]:
@@ -145,7 +69,7 @@ def _from_inertia(robot: Robot) -> list[Visual]:
     for j in range(1, model.njoints):
         inertia = model.inertias[j]
         if inertia.mass > 0:
-            found.append(Visual(joint=j, solid=_inertia_box(inertia)))
+            found.append(Visual(joint=j, solid=inertia_box(inertia)))
         parent = int(model.parents[j])
         if parent or not robot.floating:
             found.append(Visual(joint=j, solid=sphere(THICK), colour=JOINT))
@@ -174,12 +98,3 @@ def _bone(joint: int, end: Array) -> list[Visual]:
     solid = cylinder(THIN, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2]))
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), end / length).matrix()
     return [Visual(joint=joint, solid=solid.moved(turn, np.zeros(3)), colour=BONE)]
-
-
-def _inertia_box(inertia: pin.Inertia) -> Solid:
-    """The solid box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis."""
-    moments, axes = np.linalg.eigh(np.array(inertia.inertia))
-    squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
-    axes = axes if np.linalg.det(axes) > 0 else -axes
-    sides = np.sqrt(np.maximum(squares, SIDE**2))
-    return rounded_box(sides).moved(axes, np.array(inertia.lever))

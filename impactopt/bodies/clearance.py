@@ -1,0 +1,263 @@
+"""How far all bodies of a scene are apart: fast by spheres and planes, and exactly by their hulls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.fit import Planes
+from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
+from impactopt.bodies.world import WorldBody
+from impactopt.errors import InputError
+from impactopt.robot import Robot
+
+__all__ = ["Bodies", "Near", "Places", "Touch"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+MISSED = 3  # phase in which there is no target
+FAR = 1.0  # [m] no clearance beyond this is asked for
+DEEPEST = -1e-6  # [m] what is deeper is a touch
+
+
+class Touch(NamedTuple):
+    """Two bodies in each other: names, from when till when [s], and how deep [m] at most."""
+
+    one: str
+    other: str
+    start: float
+    end: float
+    depth: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Places:
+    """Where the bodies are at k instants.
+
+    rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.  travel (k,) [m] : of the
+    target along its normal.  phase (k,) : 0 before, 1 in, 2 after contact.
+    """
+
+    rotation: Array
+    translation: Array
+    travel: Array
+    phase: Index
+
+    @classmethod
+    def of(cls, robot: Robot, q: Array, travel: Array, phase: Index) -> Places:
+        """Of configurations q (k, nq)."""
+        model, data = robot.model, robot.model.createData()
+        rotation = np.zeros((len(q), model.njoints, 3, 3))
+        translation = np.zeros((len(q), model.njoints, 3))
+        for k, posture in enumerate(q):
+            pin.forwardKinematics(model, data, posture)
+            for j in range(1, model.njoints):
+                rotation[k, j], translation[k, j] = data.oMi[j].rotation, data.oMi[j].translation
+        rotation[:, 0] = np.eye(3)
+        return cls(rotation=rotation, translation=translation, travel=travel, phase=phase)
+
+    def __len__(self) -> int:
+        return len(self.travel)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Near:
+    """What comes near: at instant ``at`` (m,), a sphere of the robot to another link or a body of the world.
+
+    sphere (m,) : its number.  joint (m,) : that moves it.  other (m,) : joint of the link; or -1 - the index of the
+    world's body.  gap (m,) [m] : between sphere and planes, < 0 if in each other.
+    """
+
+    at: Index
+    sphere: Index
+    joint: Index
+    other: Index
+    gap: Array
+
+    def least(self) -> Near:
+        """Of each instant and pair the sphere that is nearest."""
+        order = np.argsort(self.gap, kind="stable")
+        keys = np.column_stack([self.at, self.joint, self.other])[order]
+        chosen = order[np.unique(keys, axis=0, return_index=True)[1]]
+        return Near(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+
+class Bodies:
+    """All bodies of a scene, and which pairs of them are not to touch."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        world: tuple[WorldBody, ...],
+        start: Array,
+        *,
+        normal: Array,
+        striking: int,
+        standing: tuple[int, ...],
+    ) -> None:
+        """start (nq,) : the posture in which what touches may touch for good.  normal (3,) : the blow's.
+
+        striking, standing : joints of the link that strikes, and of the soles that are held.
+        """
+        self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
+        self.start, self.standing = start, standing
+        self.links: RobotBodies = bodies_of(robot)
+        left_out = {frozenset(pair) for pair in robot.disable_collisions}
+        self.pairs, self.touching = self.links.piece_pairs(start, left_out)
+        at = Places.of(robot, start[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+        self.world_pairs: list[Pair] = []
+        for w, body in enumerate(world):
+            for j in self.links.joints:
+                rooted = j in standing or (not robot.floating and robot.model.parents[j] == 0)
+                on_ground = body.name == "ground" and rooted
+                mine = j == striking
+                if on_ground or (mine and body.strikable) or (body.core and not mine):
+                    continue
+                if (body.of_target or w) and self.exact(at, 0, (j, -1 - w)) < 0:
+                    raise InputError(
+                        f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start from another "
+                        "posture, or move the body or make it smaller"
+                    )
+                if not w and self.exact(at, 0, (j, -1)) <= 0:
+                    self.touching.append((self.links.name(j), body.name))
+                    continue
+                self.world_pairs.append((j, w))
+
+    # ------------------------------------------------------------------ by spheres and planes
+    @cached_property
+    def _of_joint(self) -> dict[int, Index]:
+        return {j: np.flatnonzero(self.links.joint == j) for j in self.links.joints}
+
+    @cached_property
+    def directed(self) -> dict[Pair, Pair]:
+        """Of each pair of joints whose spheres are held against whose planes: spheres of the one that they fit."""
+        out = self.links.out
+        return {(a, b): (a, b) if out[a] <= out[b] else (b, a) for a, b in self.pairs}
+
+    def _ball_gaps(self, at: Places) -> Array:
+        """(k, pairs) [m] at least between what two joints move."""
+        balls = self.links.balls
+        place = {j: k for k, j in enumerate(balls)}
+        centre = np.stack([self._placed(at, j, balls[j][0][None])[:, 0] for j in balls], axis=1)
+        radius = np.array([balls[j][1] for j in balls])
+        one, two = (np.array([place[p[k]] for p in self.pairs], dtype=np.intp) for k in (0, 1))
+        apart = np.linalg.norm(centre[:, one] - centre[:, two], axis=2)
+        return np.asarray(apart - radius[one] - radius[two])
+
+    @staticmethod
+    def _placed(at: Places, joint: int, points: Array) -> Array:
+        """Points (m, 3) of a joint's frame in the world (k, m, 3)."""
+        return np.asarray(points @ at.rotation[:, joint].transpose(0, 2, 1) + at.translation[:, joint, None])
+
+    def near(self, at: Places, within: float) -> Near:
+        """All spheres that are nearer than ``within`` [m] to what they are not to touch."""
+        links, found = self.links, list[tuple[Index, Index, int, int, Array]]()
+        close = self._ball_gaps(at) < within
+        for n, pair in enumerate(self.pairs):
+            when = np.flatnonzero(close[:, n])
+            if not len(when):
+                continue
+            a, b = self.directed[pair]
+            own = self._of_joint[a]
+            points = links.centre[own] @ at.rotation[when, a].transpose(0, 2, 1) + at.translation[when, a, None]
+            local = np.matmul(points - at.translation[when, b, None], at.rotation[when, b])
+            gap = _outside(links.planes[b], local) - links.radius[own]
+            i, c = np.nonzero(gap < within)
+            found.append((when[i], own[c], a, b, gap[i, c]))
+        for w, body in enumerate(self.world):
+            joints = [j for j, k in self.world_pairs if k == w]
+            when = np.flatnonzero(self.present(body, at))
+            shift = body.place + np.outer(at.travel[when], self.normal) * body.moves
+            for j in joints if len(when) else ():
+                own = self._of_joint[j]
+                points = links.centre[own] @ at.rotation[when, j].transpose(0, 2, 1) + at.translation[when, j, None]
+                gap = _outside(body.planes, (points - shift[:, None]) @ body.rotation) - links.radius[own]
+                i, c = np.nonzero(gap < within)
+                found.append((when[i], own[c], j, -1 - w, gap[i, c]))
+        none = np.zeros(0, dtype=np.intp)
+        instants = np.concatenate([none, *(f[0] for f in found)])
+        sphere = np.concatenate([none, *(f[1] for f in found)])
+        counts = [len(f[0]) for f in found]
+        joint = np.repeat([f[2] for f in found], counts).astype(np.intp)
+        other = np.repeat([f[3] for f in found], counts).astype(np.intp)
+        return Near(
+            at=instants,
+            sphere=sphere,
+            other=other,
+            joint=joint,
+            gap=np.concatenate([np.zeros(0), *(f[4] for f in found)]),
+        )
+
+    @staticmethod
+    def present(body: WorldBody, at: Places) -> NDArray[np.bool_]:
+        """When (k,) a body of the world is there to be touched."""
+        return np.asarray(at.phase == 0) if body.before else (at.phase != MISSED) | (not body.of_target)
+
+    # ------------------------------------------------------------------ exactly
+    def exact(self, at: Places, k: int, pair: Pair) -> float:
+        """Distance [m] of a pair at instant k, of two joints; or of joint and world's body, as (j, -1 - w)."""
+        a, b = pair
+        here = transform(at.rotation[k, a], at.translation[k, a])
+        if b < 0:
+            body = self.world[-1 - b]
+            moved = body.place + at.travel[k] * self.normal * body.moves
+            there = transform(body.rotation, moved)
+            return min(distance(piece.shape, here, body.shape, there) for piece in self.links.of_joint[a])
+        there = transform(at.rotation[k, b], at.translation[k, b])
+        return min(distance(one.shape, here, two.shape, there) for one, two in self.pairs[a, b])
+
+    def _slack(self) -> float:
+        """[m] by how much bodies may be nearer than their spheres and planes say."""
+        return max(self.links.short.values(), default=0.0)
+
+    def lower_bounds(self, at: Places, within: float) -> Iterator[tuple[float, int, Pair]]:
+        """No pair is nearer than this [m] at that instant, but for what spheres fall short; nearest first."""
+        near = self.near(at, within).least()
+        for n in np.argsort(near.gap, kind="stable"):
+            a, b = int(near.joint[n]), int(near.other[n])
+            yield float(near.gap[n]), int(near.at[n]), self.known(a, b)
+
+    def known(self, joint: int, other: int) -> Pair:
+        """A pair as it stands in ``pairs``, if it is one of two joints."""
+        return (joint, other) if other < 0 or (joint, other) in self.pairs else (other, joint)
+
+    def nearest(self, at: Places, within: float = 0.1) -> tuple[float, int, Pair | None]:
+        """The least exact distance [m] of any pair at any instant, when, and of which; FAR, 0, None beyond it."""
+        least, when, which = FAR, 0, None
+        for bound, k, pair in self.lower_bounds(at, within):
+            if bound - self._slack() >= least:
+                break
+            found = self.exact(at, k, pair)
+            if found < least:
+                least, when, which = found, k, pair
+        return least, when, which
+
+    def touches(self, time: Array, at: Places) -> list[Touch]:
+        """All that touches what it should not, deepest first."""
+        found: dict[Pair, list[tuple[int, float]]] = {}
+        for _, k, pair in self.lower_bounds(at, self._slack()):
+            depth = self.exact(at, k, pair)
+            if depth < DEEPEST:
+                found.setdefault(pair, []).append((k, depth))
+        out = []
+        for pair, hits in found.items():
+            instants = time[[k for k, _ in hits]]
+            depth = -min(d for _, d in hits)
+            out.append(Touch(*self.names(pair), float(instants.min()), float(instants.max()), depth))
+        return sorted(out, key=lambda t: -t.depth)
+
+    def names(self, pair: Pair) -> tuple[str, str]:
+        """What messages call the two."""
+        a, b = pair
+        return self.links.name(a), self.links.name(b) if b >= 0 else self.world[-1 - b].name
+
+
+def _outside(planes: Planes, points: Array) -> Array:
+    """How far (k, m) [m] points (k, m, 3) are from a body at least, < 0 inside."""
+    return np.asarray((points @ planes.normal.T - planes.offset).max(axis=2))

@@ -1,0 +1,171 @@
+"""What a robot's links are made of, as convex hulls: from its own files, or of its links' inertia."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from impactopt.bodies.solids import Solid, cylinder, rounded_box
+from impactopt.bodies.urdf import shapes_of, urdf_root
+from impactopt.codegen import kept
+from impactopt.robot import Robot, Tool
+
+__all__ = ["Piece", "convex", "inertia_box", "pieces_of"]
+
+Array = NDArray[np.float64]
+ROD = 0.012  # [m] radius of a tool
+SIDE = 0.02  # [m] least side of a box of inertia
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piece:
+    """The convex hull of a shape of a link.
+
+    joint : index in the model of the joint that moves it; its frame is that of the numbers.
+    vertices (k, 3) [m], triangles (m, 3) : of the hull, counter-clockwise seen from outside.
+    """
+
+    link: str
+    joint: int
+    vertices: Array
+    triangles: NDArray[np.intp]
+
+    @cached_property
+    def shape(self) -> Any:
+        """The hull as coal has it."""
+        return convex(self.vertices, self.triangles)
+
+
+def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
+    """A coal.Convex of a hull."""
+    points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    points.extend(list(vertices))
+    facets.extend([coal.Triangle(*(int(i) for i in t)) for t in triangles])
+    return coal.Convex(points, facets)
+
+
+def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
+    """The pieces of a robot, and in words where they are from.
+
+    They are hulls of its URDF's collision shapes, or of the visual ones of a link that has no others; for a
+    robot without any, rounded boxes of its links' inertia. Tools are rods to their heads.
+    """
+    found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
+    if not found:
+        found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
+    found += [_rod(robot, tool) for tool in _tools(robot)]
+    return tuple(found), source
+
+
+def _tools(robot: Robot) -> tuple[Tool, ...]:
+    return robot.source.tools if robot.source is not None else ()
+
+
+def _from_urdf(robot: Robot) -> Iterator[Piece]:
+    urdf = Path(robot.urdf) if robot.urdf is not None else None
+    root = urdf_root(urdf) if urdf is not None else None
+    if root is None or urdf is None:
+        return
+    found = {kind: list(shapes_of(robot.model, root, urdf, kind)) for kind in ("collision", "visual")}
+    bodied = {shape.link for shape in found["collision"]}
+    for shape in [*found["collision"], *(s for s in found["visual"] if s.link not in bodied)]:
+        piece = _hull(shape.link, shape.joint, shape.solid)
+        if piece is not None:
+            yield piece
+
+
+def _from_inertia(robot: Robot) -> Iterator[Piece]:
+    model = robot.model
+    held = [pin.Inertia.Zero() for _ in range(model.njoints)]
+    for tool in _tools(robot):
+        frame = model.frames[model.getFrameId(tool.frame)]
+        own = pin.Inertia(tool.mass, tool.center, tool.inertia)
+        held[frame.parentJoint] += frame.placement.act(own)
+    for j in range(1, model.njoints):
+        inertia = model.inertias[j]
+        if held[j].mass > 0:
+            inertia = _without(inertia, held[j])
+        if inertia.mass > 1e-6:
+            piece = _hull(model.names[j], j, inertia_box(inertia))
+            if piece is not None:
+                yield piece
+
+
+def _without(whole: Any, part: Any) -> Any:
+    """The inertia that is left of a link when what it holds is taken away."""
+    mass = whole.mass - part.mass
+    if mass <= 1e-6:
+        return pin.Inertia.Zero()
+    lever = (whole.mass * whole.lever - part.mass * part.lever) / mass
+
+    def about_origin(body: Any) -> Array:
+        c = np.array(body.lever)
+        return np.array(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
+
+    left = about_origin(whole) - about_origin(part)
+    left -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+    return pin.Inertia(mass, lever, left)
+
+
+def inertia_box(inertia: Any) -> Solid:
+    """The solid box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis, rounded."""
+    moments, axes = np.linalg.eigh(np.array(inertia.inertia))
+    squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
+    axes = axes if np.linalg.det(axes) > 0 else -axes
+    sides = np.sqrt(np.maximum(squares, SIDE**2))
+    return rounded_box(sides).moved(axes, np.array(inertia.lever))
+
+
+def _rod(robot: Robot, tool: Tool) -> Piece:
+    frame = robot.model.frames[robot.model.getFrameId(tool.frame)]
+    length = max(float(np.linalg.norm(tool.head)), 2 * ROD)
+    along = np.asarray(tool.head) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
+    solid = cylinder(ROD, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2]))
+    place = frame.placement
+    solid = solid.moved(turn, np.zeros(3)).moved(place.rotation, place.translation)
+    piece = _hull(tool.name, int(frame.parentJoint), solid)
+    assert piece is not None  # a cylinder has a hull
+    return piece
+
+
+def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
+    """The hull of a solid, from disk if it was made before; None where it has no volume."""
+    digest = hashlib.sha256(np.round(solid.vertices, 9).tobytes()).hexdigest()
+
+    def make() -> bytes:
+        file = io.BytesIO()
+        np.savez(file, **_hull_of(solid.vertices))
+        return file.getvalue()
+
+    with np.load(io.BytesIO(kept("hull", digest, make)), allow_pickle=False) as found:
+        vertices, triangles = found["vertices"], found["triangles"]
+    return Piece(link=link, joint=joint, vertices=vertices, triangles=triangles) if len(triangles) else None
+
+
+def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
+    """Vertices and triangles of the hull of points (k, 3), none where it has no volume."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return {"vertices": np.zeros((0, 3)), "triangles": np.zeros((0, 3), dtype=np.intp)}
+    place = np.full(len(points), -1)
+    place[hull.vertices] = np.arange(len(hull.vertices))
+    triangles = place[hull.simplices]
+    # Qhull does not order a facet's corners: turn those that look inwards
+    vertices = points[hull.vertices]
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return {"vertices": vertices, "triangles": triangles}

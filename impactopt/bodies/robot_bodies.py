@@ -1,0 +1,173 @@
+"""A robot's bodies: the hulls of its links, spheres and planes about them, and which of them can meet."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import weakref
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from impactopt.bodies.fit import Planes, Spheres, enclose, fill, surface_points
+from impactopt.bodies.pieces import Piece, pieces_of
+from impactopt.codegen import kept
+from impactopt.robot import Robot
+
+__all__ = ["RobotBodies", "bodies_of", "distance", "transform"]
+
+Array = NDArray[np.float64]
+Pair = tuple[int, int]
+SPACING, LEAST = 1 / 40, 0.003  # of points on a body's surface: of its extent, and [m]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RobotBodies:
+    """What of a robot can touch.
+
+    pieces : hulls of links, exact.  source : where they are from, in words.
+    joint (c,), centre (c, 3) [m], radius (c,) [m] : spheres that cover them, in the frame of that joint.
+    planes : about the hull of all that a joint moves.
+    out, short [m] : by joint, how far its spheres stick out of that hull, and fall short of its surface.
+    """
+
+    robot: Robot
+    pieces: tuple[Piece, ...]
+    source: str
+    joint: NDArray[np.intp]
+    centre: Array
+    radius: Array
+    planes: dict[int, Planes]
+    out: dict[int, float]
+    short: dict[int, float]
+
+    @cached_property
+    def joints(self) -> tuple[int, ...]:
+        """The joints that move anything, in the model's order."""
+        return tuple(sorted({piece.joint for piece in self.pieces}))
+
+    @cached_property
+    def of_joint(self) -> dict[int, tuple[Piece, ...]]:
+        """The pieces that a joint moves."""
+        return {j: tuple(p for p in self.pieces if p.joint == j) for j in self.joints}
+
+    @cached_property
+    def balls(self) -> dict[int, tuple[Array, float]]:
+        """Of each joint's pieces the centre (3,) and radius [m] of a sphere about all of them."""
+        out = {}
+        for j, pieces in self.of_joint.items():
+            points = np.concatenate([p.vertices for p in pieces])
+            centre = (points.max(axis=0) + points.min(axis=0)) / 2
+            out[j] = centre, float(np.linalg.norm(points - centre, axis=1).max())
+        return out
+
+    def name(self, joint: int) -> str:
+        """What messages call the body that a joint moves: its largest link."""
+        pieces = self.of_joint[joint]
+        return max(pieces, key=lambda p: float(np.prod(np.ptp(p.vertices, axis=0)))).link
+
+    def piece_pairs(
+        self, q: Array, disabled: Iterable[frozenset[str]] = ()
+    ) -> tuple[dict[Pair, tuple[tuple[Piece, Piece], ...]], list[tuple[str, str]]]:
+        """Pairs of joints whose bodies can meet, with their pairs of pieces; and links that touch at ``q``.
+
+        Left out are links that a joint connects, those of ``disabled`` (names of two links each), and those
+        whose hulls touch in the start posture ``q`` (nq,): neighbours beyond a short link always do.
+        """
+        model, data = self.robot.model, self.robot.model.createData()
+        pin.forwardKinematics(model, data, q)
+        places = {j: transform(data.oMi[j].rotation, data.oMi[j].translation) for j in self.joints}
+        out: dict[Pair, tuple[tuple[Piece, Piece], ...]] = {}
+        touching, without = [], set(disabled)
+        for n, a in enumerate(self.joints):
+            for b in self.joints[:n]:
+                if b == int(model.parents[a]):
+                    continue
+                left = []
+                (centre_a, radius_a), (centre_b, radius_b) = self.balls[a], self.balls[b]
+                apart = np.linalg.norm(data.oMi[a].act(centre_a) - data.oMi[b].act(centre_b))
+                far = apart > radius_a + radius_b
+                for one in self.of_joint[a]:
+                    for two in self.of_joint[b]:
+                        if frozenset((one.link, two.link)) in without:
+                            continue
+                        if not far and distance(one.shape, places[a], two.shape, places[b]) <= 0:
+                            touching.append((one.link, two.link))
+                        else:
+                            left.append((one, two))
+                if left:
+                    out[a, b] = tuple(left)
+        return out, touching
+
+
+_KNOWN: weakref.WeakKeyDictionary[Robot, RobotBodies] = weakref.WeakKeyDictionary()
+
+
+def bodies_of(robot: Robot) -> RobotBodies:
+    """The robot's bodies; spheres and planes are fitted once and kept on disk by what they are about."""
+    if robot not in _KNOWN:
+        pieces, source = pieces_of(robot)
+        fitted = {j: _fitted([p for p in pieces if p.joint == j]) for j in sorted({p.joint for p in pieces})}
+        spheres = {j: found for j, (found, _) in fitted.items()}
+        _KNOWN[robot] = RobotBodies(
+            robot=robot,
+            pieces=pieces,
+            source=source,
+            joint=np.repeat(list(spheres), [len(s.radius) for s in spheres.values()]).astype(np.intp),
+            centre=np.concatenate([np.zeros((0, 3)), *(s.centre for s in spheres.values())]),
+            radius=np.concatenate([np.zeros(0), *(s.radius for s in spheres.values())]),
+            planes={j: planes for j, (_, planes) in fitted.items()},
+            out={j: s.out for j, s in spheres.items()},
+            short={j: s.short for j, s in spheres.items()},
+        )
+    return _KNOWN[robot]
+
+
+def _fitted(pieces: list[Piece]) -> tuple[Spheres, Planes]:
+    """Spheres over the surfaces of pieces, and planes about all of them; from disk if they were fitted before."""
+    digest = hashlib.sha256(b"1")
+    for piece in pieces:
+        digest.update(np.round(piece.vertices, 9).tobytes())
+
+    def fit() -> bytes:
+        points = np.concatenate([p.vertices for p in pieces])
+        spacing = max(SPACING * float(np.ptp(points, axis=0).max()), LEAST)
+        surface = np.concatenate([surface_points(p.vertices, p.triangles, spacing) for p in pieces])
+        hull = ConvexHull(points)
+        spheres, planes = fill(hull, surface), enclose(points[hull.vertices], hull.equations[:, :3])
+        file = io.BytesIO()
+        numbers = {f"spheres_{f.name}": getattr(spheres, f.name) for f in fields(Spheres)}
+        numbers |= {f"planes_{f.name}": getattr(planes, f.name) for f in fields(Planes)}
+        np.savez(file, **numbers)
+        return file.getvalue()
+
+    with np.load(io.BytesIO(kept("bodies", digest.hexdigest(), fit)), allow_pickle=False) as found:
+        of = {
+            kind: {f.name: _plain(found[f"{name}_{f.name}"]) for f in fields(kind)}
+            for name, kind in (("spheres", Spheres), ("planes", Planes))
+        }
+    return Spheres(**of[Spheres]), Planes(**of[Planes])
+
+
+def _plain(value: Array) -> Any:
+    return value if value.ndim else float(value)
+
+
+def transform(rotation: Array, translation: Array) -> Any:
+    """A coal.Transform3s."""
+    return coal.Transform3s(np.asarray(rotation), np.asarray(translation))
+
+
+def distance(one: Any, at_one: Any, two: Any, at_two: Any) -> float:
+    """Between two coal shapes, at these places [m]; below zero: how deep one is in the other."""
+    return float(coal.distance(one, at_one, two, at_two, _REQUEST, coal.DistanceResult()))
+
+
+_REQUEST = coal.DistanceRequest()

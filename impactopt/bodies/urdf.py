@@ -1,0 +1,88 @@
+"""The shapes that a URDF gives its links, as triangles in the frames of a robot's joints."""
+
+from __future__ import annotations
+
+import contextlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.meshes import find_mesh, read_mesh
+from impactopt.bodies.solids import Solid, box, cylinder, sphere
+
+__all__ = ["LinkShape", "numbers", "shapes_of", "urdf_root"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkShape:
+    """A shape of a link: ``joint`` of the model that moves it, ``solid`` in that joint's frame [m].
+
+    element : the URDF's <collision> or <visual>.
+    """
+
+    link: str
+    joint: int
+    solid: Solid
+    element: ElementTree.Element
+
+
+def urdf_root(urdf: Path) -> ElementTree.Element | None:
+    """The root of a URDF; None if it cannot be read."""
+    try:
+        return ElementTree.parse(urdf).getroot()
+    except (OSError, ElementTree.ParseError):
+        return None
+
+
+def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> Iterator[LinkShape]:
+    """All readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
+
+    Meshes that are missing or damaged are left out.
+    """
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if not model.existFrame(name, pin.FrameType.BODY):
+            continue
+        frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        for element in link.findall(kind):
+            solid = _solid(element.find("geometry"), urdf)
+            if solid is not None:
+                place = frame.placement * _origin(element.find("origin"))
+                moved = solid.moved(place.rotation, place.translation)
+                yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
+
+
+def numbers(text: str) -> Array:
+    """The numbers in a text, apart by spaces."""
+    return np.array([float(word) for word in text.split()])
+
+
+def _solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
+    """The solid of a <geometry>; None if it is none, or its mesh cannot be read."""
+    for shape in geometry if geometry is not None else ():
+        with contextlib.suppress(ValueError, RuntimeError, OSError, KeyError):
+            if shape.tag == "box":
+                return box(numbers(shape.attrib["size"]))
+            if shape.tag == "cylinder":
+                return cylinder(float(shape.attrib["radius"]), float(shape.attrib["length"]))
+            if shape.tag == "sphere":
+                return sphere(float(shape.attrib["radius"]))
+            if shape.tag == "mesh":
+                scale = numbers(shape.get("scale", "1 1 1"))
+                return read_mesh(find_mesh(shape.attrib["filename"], urdf), scale)
+    return None
+
+
+def _origin(origin: ElementTree.Element | None) -> Any:
+    if origin is None:
+        return pin.SE3.Identity()
+    xyz, rpy = (numbers(origin.get(key, "0 0 0")) for key in ("xyz", "rpy"))
+    return pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)

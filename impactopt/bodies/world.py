@@ -1,0 +1,155 @@
+"""The bodies of the world: the ground, the target and what holds it, and the user's obstacles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.bodies.fit import Planes, enclose
+from impactopt.contact.board import Board
+from impactopt.contact.nail import Nail
+from impactopt.contact.targets import RigidWall, Target
+from impactopt.shapes import Obstacle, TargetBody, face_axes
+
+__all__ = ["BEHIND", "WorldBody", "ground", "obstacle_bodies", "target_bodies"]
+
+Array = NDArray[np.float64]
+BEHIND = 0.08  # [m] behind its face a target is its core, which the striker has not to reach before contact
+DEEP = 0.5  # [m] how far the core goes
+FLOOR, THICK = 10.0, 0.5  # [m] half sides of the ground
+# [m] of targets: (across, up, deep)
+BOX, WALL, BOARD, BLOCK = (0.18, 0.18, 0.18), (1.5, 1.5, 0.1), (0.30, 0.24, 0.02), (0.2, 0.2, 0.06)
+SUPPORT = (0.04, 0.24, 0.12)  # under either end of a board
+NAIL_LENGTH, NAIL_RADIUS = 0.07, 0.004
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorldBody:
+    """A box with half sides ``half`` (3,) [m], inflated by ``radius`` [m], at ``place`` with axes ``rotation``.
+
+    half zero: a sphere; only its last number not zero: a capsule along its z axis.
+    of_target : it comes and goes with the target.  moves : with it, along the normal.  strikable : the link that strikes may touch it.
+    before : it is there until contact only; core: of the target, which the striker is to reach from its face.
+    """
+
+    name: str
+    half: Array
+    place: Array
+    rotation: Array
+    radius: float = 0.0
+    of_target: bool = False
+    moves: bool = False
+    strikable: bool = False
+    before: bool = False
+    core: bool = False
+
+    @cached_property
+    def planes(self) -> Planes:
+        """About it, in its own frame."""
+        corners = self.half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return enclose(np.unique(corners, axis=0), np.concatenate([np.eye(3), -np.eye(3)]), self.radius)
+
+    @cached_property
+    def shape(self) -> Any:
+        """As coal has it."""
+        if not self.radius:
+            return coal.Box(*(2 * self.half))
+        return coal.Capsule(self.radius, 2 * self.half[2]) if self.half[2] > 0 else coal.Sphere(self.radius)
+
+
+def ground() -> WorldBody:
+    """The half-space below z = 0, as a large box."""
+    return WorldBody(
+        name="ground",
+        half=np.array([FLOOR, FLOOR, THICK]),
+        place=np.array([0.0, 0.0, -THICK]),
+        rotation=np.eye(3),
+    )
+
+
+def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array) -> list[WorldBody]:
+    """What is hit: its face's middle is at the point, and it reaches from there along the normal."""
+    rows = face_axes(normal)  # normal, across, up
+    axes = np.column_stack([rows[1], rows[2], rows[0]])  # of boxes: across, up, deep
+
+    def box(name: str, size: Any, start: float = 0.0, across: float = 0.0, **how: Any) -> WorldBody:
+        half = np.asarray(size, dtype=float) / 2
+        place = point + axes @ np.array([across, 0.0, start + half[2]])
+        return WorldBody(name=name, half=half, place=place, rotation=axes, of_target=True, **how)
+
+    if body.shape == "none":
+        return []
+    moves = not isinstance(target, RigidWall)
+    size = body.size
+    if body.shape == "ball":
+        radius = (size or BOX)[0] / 2
+        place = point + radius * normal
+        still = np.zeros(3)
+        main = WorldBody(
+            name="target",
+            half=still,
+            place=place,
+            rotation=axes,
+            radius=radius,
+            of_target=True,
+            moves=moves,
+            strikable=True,
+        )
+        return [main]
+    if isinstance(target, Nail):
+        out = max(NAIL_LENGTH - target.depth, 0.0)
+        block = box("target's block", size or BLOCK, out, strikable=True)
+        if out < 2 * NAIL_RADIUS:
+            return [block]
+        half = np.array([0.0, 0.0, out / 2 - NAIL_RADIUS])
+        place = point + normal * out / 2
+        shank = WorldBody(
+            name="target",
+            half=half,
+            place=place,
+            rotation=axes,
+            radius=NAIL_RADIUS,
+            of_target=True,
+            moves=True,
+            strikable=True,
+        )
+        return [shank, block]
+    if isinstance(target, Board):
+        size = size or BOARD
+        across = (size[0] - SUPPORT[0]) / 2
+        post = (SUPPORT[0], size[1], SUPPORT[2])
+        supports = [
+            box("target's support", post, size[2], way * across) for way in (-1.0, 1.0)
+        ]  # what held the board stays when it is broken
+        main = box("target", size, moves=True, strikable=True, before=True)
+        return [main, *supports, _core(box, size)]
+    usual = WALL if isinstance(target, RigidWall) else BOX
+    size = size or usual
+    return [box("target", size, moves=moves, strikable=True), _core(box, size)]
+
+
+def _core(box: Any, size: tuple[float, ...]) -> WorldBody:
+    """What is behind the face: a link that strikes is not to come from there."""
+    body: WorldBody = box(
+        "target from behind", (size[0], size[1], DEEP), BEHIND, strikable=False, before=True, core=True
+    )
+    return body
+
+
+def obstacle_bodies(obstacles: tuple[Obstacle, ...]) -> list[WorldBody]:
+    """The user's boxes and capsules."""
+    return [
+        WorldBody(
+            name=o.name,
+            half=o.half,
+            place=o.centre,
+            rotation=o.rotation,
+            radius=o.radius,
+        )
+        for o in obstacles
+    ]

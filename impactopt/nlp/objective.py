@@ -85,7 +85,9 @@ def _effort(t: Transcription) -> Quantity:
     durations = [t.swing_T] * swing + [t.follow.T] * follow
     slots = [[tau, T[0]] for tau, T in zip(t.torques, durations, strict=False)]
     at = t.add_block("effort", slots, np.zeros(0))
-    of_node = t.lift("effort of a node", at + np.arange(len(slots)))[0]
+    places = [*map(t.swing_place, t.swing_nodes), *map(t.follow.place_at, t.follow_nodes)]
+    labels = [place.name for place in places]  # by which a program with more nodes finds them again
+    of_node = t.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
     first, *of_swing = trapezoid(np.concatenate([[0.0], t.swing_nodes]))
     weights = np.array([*of_swing, *trapezoid(t.follow_nodes)])
     start = first * float(np.sum(start_torque(t) ** 2))

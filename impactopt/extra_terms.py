@@ -24,6 +24,8 @@ class TorqueRate(Term):
 
     name: ClassVar[str] = "torque rate"
     unit: ClassVar[str] = "of limit"
+    whole_motion: ClassVar[bool] = True
+    needs_torques: ClassVar[bool] = True
     limit: float | Mapping[str, float]
 
     def __post_init__(self) -> None:
@@ -77,6 +79,7 @@ class KeepOut(Term):
 
     name: ClassVar[str] = "keep out"
     unit: ClassVar[str] = "m"
+    whole_motion: ClassVar[bool] = True
     shapes: tuple[Capsule, ...]
     size: Vector | None = None
     margin: float = 0.01

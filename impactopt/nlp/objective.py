@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.errors import InputError
 from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
@@ -28,6 +29,7 @@ from impactopt.objectives import (
 )
 from impactopt.plan import complete_reference
 from impactopt.statics import static_wrenches
+from impactopt.terms import kind_of
 
 if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
@@ -49,7 +51,20 @@ class Quantity:
 
 def quantities(t: ContactProgram, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
     """Objectives with their quantities; adds what they need to the program."""
-    return [(o, _QUANTITIES[type(o)](t)) for o in objectives]
+    return [(o, _quantity(t, o)) for o in objectives]
+
+
+def _quantity(t: ContactProgram, objective: Objective) -> Quantity:
+    if type(objective).quantity is Objective.quantity:
+        return _QUANTITIES[kind_of(objective, Objective)](t)
+    found = objective.quantity(t)  # a user's own
+    whole = found if isinstance(found, Quantity) else Quantity(found)
+    if not isinstance(whole.affine, Affine) or whole.affine.size != 1:
+        raise InputError(
+            f"{type(objective).__name__}.quantity gave {found!r}; give one affine expression, such as "
+            "program.swing_T[0], or an impactopt.nlp.objective.Quantity"
+        )
+    return whole
 
 
 def _impulse(t: ContactProgram) -> Quantity:

@@ -35,12 +35,14 @@ def drive(
 ) -> None:
     """Plan blow after blow on a nail, each where the one before has left it, until it is in, as in arm7.
 
-    Exit code: 0 it is in, 1 it is not, 2 bad input.
+    A series that ends before that goes to DIR/failed if there is one in DIR whose nail is in. Exit code: 0 it
+    is in, 1 it is not, 2 bad input.
     """
     with plain_errors("interrupted before the nail was in", verbose=verbose) as console:
         from impactopt.blows import drive_nail
-        from impactopt.output import make_directory, plain, write_file
+        from impactopt.output import make_directory, plain
         from impactopt.problem_file import parse_settings, read_problem_file
+        from impactopt.result_folder import keep_series, set_aside
         from impactopt.screen import Progress, blows_table
 
         check_loudness(quiet, verbose)
@@ -55,15 +57,16 @@ def drive(
                 **read.solver.arguments(),
             )
         done = plain(series.describe())
-        text = json.dumps(done, indent=2)
         if directory is not None:
-            write_file(directory / "blows.json", lambda file: file.write(f"{text}\n".encode()))
+            keep_series(done, directory)
         if as_json:
-            typer.echo(text)
+            typer.echo(json.dumps(done, indent=2))
         else:
             from rich.console import Console
 
             Console().print(blows_table(done))
             typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
+            if aside := set_aside(done):
+                typer.echo(aside)
         if not series.done:
             raise typer.Exit(NOT_IN)

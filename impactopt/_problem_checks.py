@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.contact.laws import ContactLaw, SpringDamper
+from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, did_you_mean
@@ -45,6 +45,14 @@ def check_collision(problem: Any) -> None:
         thing = getattr(problem, name)
         if not isinstance(thing, kind):
             raise InputError(f"{name} must be a {kind.__name__} of impactopt.contact, not {thing!r}")
+    law = problem.law
+    rough = rough_at([lambda x, rate: law.branch(x, rate, True), lambda x, rate: law.branch(x, rate, False)])
+    if rough is not None:
+        raise InputError(
+            f"the law {type(law).__name__} has no finite force, slope or curvature at a penetration of "
+            f"{1e3 * rough:g} mm, where a plan's search passes: write its powers with "
+            "impactopt.contact.power, as power(x, 1.5)"
+        )
     if problem.collision not in COLLISIONS:
         near = did_you_mean(problem.collision, COLLISIONS)
         raise InputError(f"unknown collision {problem.collision!r}{near}: there are {', '.join(COLLISIONS)}")
@@ -66,7 +74,7 @@ def check_collision(problem: Any) -> None:
             f'{type(problem.target).__name__}; take collision="dynamics"'
         )
     if problem.collision == "dynamics":  # refuses what has switches
-        target, law = problem.target, problem.law
+        target = problem.target
         target.smooth([0.0] * target.n_states, 0.0, 0)
         if not target.turns and law.formula()[0] != law.formula()[1]:
             raise InputError(

@@ -44,11 +44,13 @@ def strike(
 ) -> None:
     """Find the posture and velocity at contact that hit hardest, with no motion that leads to them.
 
-    From several starts, as local optima differ much. Exit code: 0 solved, 1 not solved, 2 bad input.
+    From several starts, as local optima differ much. What is not solved goes to DIR/failed if there is a good
+    result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
-        from impactopt.output import make_directory, record_of_strike, save_record
+        from impactopt.output import make_directory, record_of_strike
         from impactopt.problem_file import parse_settings, read_problem_file
+        from impactopt.result_folder import keep_record, set_aside
         from impactopt.screen import Progress
         from impactopt.strike import optimize_strike
 
@@ -72,7 +74,7 @@ def strike(
             progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
         record = record_of_strike(solution, problem=read.text, problem_path=read.path)
         record.summary["command"] = command_line(context)
-        written = [] if directory is None else save_record(record, directory)
+        written = [] if directory is None else keep_record(record, directory)
         if as_json:
             typer.echo(json.dumps(record.summary, indent=2))
         else:
@@ -87,5 +89,7 @@ def strike(
                 shown.print(violation_table(record.summary["violations"]))
             for path in written:
                 shown.print(str(path), highlight=False, markup=False, soft_wrap=True)
+            if aside := set_aside(record.summary):
+                shown.print(aside, highlight=False, markup=False, soft_wrap=True)
         if not solution.status.usable:
             raise typer.Exit(NOT_SOLVED)

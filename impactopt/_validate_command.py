@@ -66,7 +66,7 @@ def validate(
     Exit code: 0 stands (or the engine holds the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
-        from impactopt.output import make_directory, write_file
+        from impactopt.output import make_directory, remove_file, write_file
         from impactopt.problem_file import parse_settings
         from impactopt.replay import load_planned, replay
         from impactopt.screen import Progress
@@ -103,7 +103,8 @@ def validate(
 
                 text = f"{json.dumps(done.report, indent=2)}\n".encode()
                 written.append(directory / "replay.json")
-                write_file(written[0], lambda file: file.write(text))
+                drawn = directory / "replay.png"  # of another replay, or of none
+                write_file(written[0], lambda file: file.write(text), before=lambda: remove_file(drawn))
                 written += save_pictures(done.record, directory, ["replay"])
             if animation is not None:
                 progress.say("drawing the motion")

@@ -115,7 +115,8 @@ def solve(
 ) -> None:
     """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
 
-    Ctrl-C stops the solver; its best iterate is kept. Exit code: 0 solved, 1 not solved, 2 bad input.
+    Ctrl-C stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if there is a
+    good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
         from impactopt.output import make_directory
@@ -235,13 +236,13 @@ def _baseline(problem: ImpactProblem) -> dict[str, object]:
 
 
 def _write(record: Record, directory: Path, progress: Progress) -> list[Path]:
-    from impactopt.output import save_record
+    from impactopt.result_folder import keep_record
 
-    written = [*save_record(record, directory)]
+    written = [*keep_record(record, directory)]
     progress.say("drawing pictures")
     from impactopt.plotting import save_pictures
 
-    return written + save_pictures(record, directory)
+    return written + save_pictures(record, written[0].parent)
 
 
 def _show(record: Record, written: list[Path], as_json: bool) -> None:
@@ -250,6 +251,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         return
     from rich.console import Console
 
+    from impactopt.result_folder import set_aside
     from impactopt.screen import result_table, starts_table, violation_table
 
     console, summary = Console(), record.summary
@@ -276,6 +278,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     )
     names = ", ".join(path.name for path in written)
     console.print(f"{written[0].parent}: {names}", highlight=False, soft_wrap=True)
+    if aside := set_aside(summary):
+        console.print(aside, markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

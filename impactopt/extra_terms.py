@@ -24,6 +24,8 @@ class TorqueRate(Term):
 
     name: ClassVar[str] = "torque rate"
     unit: ClassVar[str] = "of limit"
+    whole_motion: ClassVar[bool] = True
+    needs_torques: ClassVar[bool] = True
     limit: float | Mapping[str, float]
 
     def __post_init__(self) -> None:

@@ -6,17 +6,22 @@ gives up half a newton second for a joule more in the target.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from impactopt.errors import InputError
+from impactopt.terms import check_known, kind_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
     """Base of all objectives: ``name`` is what reports call it, ``unit`` is that of its quantity.
+
+    One of a user's own has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and
+    ``needs_torques`` are as of :class:`impactopt.terms.Term`.
 
     weight [N s a unit] : what one unit of it is worth, or of a cost, what it takes off.
 
@@ -29,6 +34,8 @@ class Objective:
     unit: ClassVar[str] = ""
     cost: ClassVar[bool] = False  # less of it is better
     contact: ClassVar[bool] = False  # it is a quantity of a contact that lasts
+    whole_motion: ClassVar[bool] = False
+    needs_torques: ClassVar[bool] = False
     weight: float
 
     def __post_init__(self) -> None:
@@ -39,6 +46,19 @@ class Objective:
             raise InputError(
                 f"{kind}.weight is {self.weight:g}; give a number > 0, the price: {kind} is kept small"
             )
+
+    def blocks(self, problem: Any, coordinates: Any) -> Mapping[str, Any]:
+        """Nonlinear functions that the quantity needs, by name: :func:`impactopt.nlp.blocks.make_block`."""
+        return {}
+
+    def quantity(self, program: Any) -> Any:
+        """What is weighed: one affine expression of a program's variables, or with squares of variables a
+        :class:`impactopt.nlp.objective.Quantity`.
+
+        program : under construction, :class:`impactopt.nlp.at_contact.ContactProgram`. The package's own
+        objectives have theirs there.
+        """
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +127,8 @@ class Effort(Objective):
     name: ClassVar[str] = "effort"
     unit: ClassVar[str] = "s"
     cost: ClassVar[bool] = True
+    whole_motion: ClassVar[bool] = True
+    needs_torques: ClassVar[bool] = True
     weight: float = 0.01
 
 
@@ -122,7 +144,8 @@ def check_objectives(
 
     Raises
     ------
-    InputError : none, something else, two of a kind, one that the problem has no quantity for.
+    InputError : none, something else, two of a kind, one that the problem has no quantity for, one of a
+        user's own that says not what it is.
     """
     if not isinstance(objectives, (list, tuple)) or not all(isinstance(o, Objective) for o in objectives):
         raise InputError(
@@ -130,10 +153,13 @@ def check_objectives(
         )
     if not objectives:
         raise InputError("objectives is empty: give what the plan is for, such as (Impulse(),)")
-    kinds = [type(o) for o in objectives]
+    check_known(objectives, Objective, "quantity")
+    kinds, names = [kind_of(o, Objective) for o in objectives], [o.name for o in objectives]
     for o, kind in zip(objectives, kinds, strict=True):
         if kinds.count(kind) > 1:
             raise InputError(f"two objectives of kind {kind.__name__}: give one")
+        if names.count(o.name) > 1:
+            raise InputError(f"two objectives are called {o.name!r}: give {type(o).__name__} another name")
         if o.contact and not contact:
             raise InputError(
                 f'{kind.__name__} is of a contact that lasts: give collision="dynamics", or leave it out'

@@ -1,7 +1,8 @@
 """What a solve leaves on disk: `solution.npz` with all numbers, and `summary.json` for a glance.
 
 `solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
-its place and then moved there, so that a reader never sees half of one.
+its place and then moved there, so that a reader never sees half of one. When new numbers take the place of
+old ones, what was made of those goes first: whenever a process ends, all files are of one result.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ __all__ = [
     "plain",
     "record_of",
     "record_of_strike",
+    "remove_file",
     "replay_arrays",
     "save_record",
     "summary_of",
@@ -44,6 +46,15 @@ __all__ = [
 
 FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
+# what is made of the numbers beside them: by `impactopt show`, by `impactopt validate`, pictures
+DERIVED = (
+    "report.html",
+    "replay.json",
+    *(
+        f"{picture}.png"
+        for picture in ("force", "zmp", "torque", "strobe", "motion", "ellipsoid", "iterations", "replay")
+    ),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,6 +226,8 @@ def make_directory(directory: str | os.PathLike[str]) -> Path:
 def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path, Path]:
     """Write `solution.npz` and `summary.json` into the directory, which is made if it is not there.
 
+    What an earlier result has left there goes, of the files that this package makes (`DERIVED`).
+
     Raises
     ------
     InputError : they cannot be written.
@@ -225,13 +238,35 @@ def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path
     if record.problem_path is not None:  # relative, so that results and problems can move together
         extra["problem_path"] = os.path.relpath(record.problem_path.resolve(), path.resolve())
     numbers: dict[str, Any] = {**record.arrays, **extra}
-    write_file(path / NUMBERS, lambda file: np.savez(file, **numbers))
+
+    def clear() -> None:
+        for name in (SUMMARY, *DERIVED):
+            remove_file(path / name)
+
+    write_file(path / NUMBERS, lambda file: np.savez(file, **numbers), before=clear)
     write_file(path / SUMMARY, lambda file: file.write(f"{summary}\n".encode()))
     return path / NUMBERS, path / SUMMARY
 
 
-def write_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+def remove_file(path: Path) -> None:
+    """Remove a file if it is there.
+
+    Raises
+    ------
+    InputError : it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write over {path}: {error.strerror}") from error
+
+
+def write_file(
+    path: Path, write: Callable[[IO[bytes]], Any], *, before: Callable[[], object] | None = None
+) -> None:
     """Let `write` fill a new file that then takes the place of `path` in one step.
+
+    before : what is to be done just before that, when nothing of the new file can fail any more.
 
     Raises
     ------
@@ -243,6 +278,8 @@ def write_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
             write(file)
             file.flush()
             os.fsync(file.fileno())  # a name that is there before its content would be an empty file
+        if before is not None:
+            before()
         os.replace(temporary, path)
     except BaseException as error:
         with contextlib.suppress(OSError):

@@ -25,7 +25,7 @@ from impactopt.robot import Robot
 from impactopt.scenario import Scenario
 from impactopt.shapes import Obstacle, TargetBody
 from impactopt.stance import BothSoles, Stance
-from impactopt.terms import DEFAULT_TERMS, Incidence, Term
+from impactopt.terms import DEFAULT_TERMS, Incidence, Term, check_known, kind_of
 
 Array = NDArray[np.float64]
 __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
@@ -217,8 +217,12 @@ class ImpactProblem:
             )
 
     def _check_terms(self) -> None:
+        listed = isinstance(self.terms, (list, tuple))
+        if not listed or not all(isinstance(t, Term) for t in self.terms):
+            raise InputError(f"terms must be a tuple of terms, such as (TorqueLimit(),), not {self.terms!r}")
+        check_known(self.terms, Term, "add_rows")
         object.__setattr__(self, "terms", tuple(self.terms))
-        kinds = [type(t) for t in self.terms]
+        kinds = [kind_of(t, Term) for t in self.terms]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError(f"two terms of kind {kind.__name__}: give one")

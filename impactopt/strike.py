@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.nlp.start import strike_iterate
-from impactopt.nlp.strike import OF_MOTIONS, StrikeTranscription
+from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import block_functions
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
@@ -86,7 +86,7 @@ def optimize_strike(
     """
     check_solver(solver)
     check_starts(starts, seed, given=start is not None)
-    if all(isinstance(o, OF_MOTIONS) for o in problem.objectives):
+    if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
     given = None if start is None else check_array("start", start, (None,))
     began = time.perf_counter()

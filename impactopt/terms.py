@@ -5,8 +5,9 @@ These hold in every problem; those in :mod:`impactopt.extra_terms` only where th
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,10 +17,29 @@ from impactopt.shapes import vector
 
 @dataclass(frozen=True, kw_only=True)
 class Term:
-    """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its rows."""
+    """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its rows.
+
+    One of a user's own has :meth:`add_rows`, and :meth:`blocks` if its rows are not linear.
+
+    whole_motion : it says nothing of a strike alone, which is planned without it.
+    needs_torques : its rows take the torques at the nodes, which are variables then.
+    """
 
     name: ClassVar[str] = ""
     unit: ClassVar[str] = ""
+    whole_motion: ClassVar[bool] = False
+    needs_torques: ClassVar[bool] = False
+
+    def blocks(self, problem: Any, coordinates: Any) -> Mapping[str, Any]:
+        """Nonlinear functions that the rows need, by name: :func:`impactopt.nlp.blocks.make_block`."""
+        return {}
+
+    def add_rows(self, program: Any) -> None:
+        """Add the rows to a program under construction, :class:`impactopt.nlp.at_contact.ContactProgram`.
+
+        The package's own terms have theirs there.
+        """
+        raise NotImplementedError
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -215,3 +235,26 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     SelfCollision(),
     KeepOut(),
 )
+
+
+def kind_of(thing: object, base: type) -> type:
+    """The package's own class that a term or an objective is one of; its class if it is a user's own."""
+    ours = (k for k in type(thing).__mro__ if k is not base and k.__module__.startswith("impactopt."))
+    return next(ours, type(thing))
+
+
+def check_known(things: Iterable[Any], base: type, method: str) -> None:
+    """InputError for terms or objectives of a user's own that a program would know nothing of.
+
+    base : Term or Objective; method : what one of a user's own has to have.
+    """
+    for thing in things:
+        kind = type(thing)
+        ours = kind_of(thing, base).__module__.startswith("impactopt.")
+        if kind is base or not (ours or getattr(kind, method) is not getattr(base, method)):
+            raise InputError(
+                f"{kind.__name__} has no {method}(program), without which a plan would know nothing of it: "
+                'give it one, as "Extending" in the documentation shows (docs/extending.md)'
+            )
+        if not thing.name:
+            raise InputError(f"{kind.__name__}.name is empty; give what reports and messages call it")

@@ -9,19 +9,39 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from small_plans import Planned
+from small_plans import Planned, changed
 
 from impactopt import between, planner
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.errors import InputError
+from impactopt.extra_terms import (
+    Gaze,
+    HandOrientation,
+    HitCone,
+    HitRegion,
+    KeepOut,
+    SelfCollision,
+    TorqueRate,
+)
 from impactopt.motion import CubicSpline
-from impactopt.nlp.start import carried_over
+from impactopt.nlp.start import carried_over, first_iterate
 from impactopt.nlp.transcription import Transcription
+from impactopt.objectives import (
+    AngularMomentum,
+    Effort,
+    Impulse,
+    Objective,
+    PeakForce,
+    Penetration,
+    TargetEnergy,
+)
 from impactopt.plan import Plan
 from impactopt.problem import Phase
 from impactopt.program import Status
+from impactopt.scenario import Scenario
+from impactopt.shapes import Capsule
 from impactopt.sqp import solve_sqp
-from impactopt.terms import ContactWrenchCone, TorqueLimit
+from impactopt.terms import ContactWrenchCone, Term, TorqueLimit
 from impactopt.validation.result import distance_inside
 
 Array = NDArray[np.float64]
@@ -125,6 +145,108 @@ def test_the_old_solution_is_a_warm_start(arm_plan: Planned) -> None:
     assert again.objective == pytest.approx(first.objective, rel=0.02)
 
 
+WRIST, ELBOW = Capsule(frame="wrist", radius=0.02), Capsule(frame="elbow", radius=0.1)
+ON_TOP: dict[str, Objective | Term] = {
+    "peak force": PeakForce(weight=-0.001),
+    "energy": TargetEnergy(),
+    "penetration": Penetration(weight=10.0),
+    "effort": Effort(),
+    "torque rate": TorqueRate(limit=200.0),
+    "self-collision": SelfCollision(pairs=((Capsule(frame="hand", radius=0.1), ELBOW),)),
+    "keep out": KeepOut(shapes=(WRIST,)),
+    "hand orientation": HandOrientation(axis=(0, 0, 1), angle=1.3),
+    "gaze": Gaze(frame="elbow", axis=(0, 0, 1), angle=0.5),
+    "hit region": HitRegion(radius=0.02),
+    "hit cone": HitCone(angle=0.2),
+}
+KINDS = {type(thing) for thing in ON_TOP.values()} | {Impulse, AngularMomentum}
+
+
+def test_all_objectives_and_extra_terms_are_tried_here() -> None:
+    """The biped's test below has the angular momentum."""
+    known = {*Objective.__subclasses__(), *Term.__subclasses__()}
+    ours = {kind for kind in known if kind.__module__ in ("impactopt.objectives", "impactopt.extra_terms")}
+    assert ours == KINDS
+
+
+def with_more(t: Transcription, *things: Objective | Term, **changes: Any) -> Transcription:
+    """Its program with objectives beside the impulse, and with terms."""
+    objectives = tuple(o for o in things if isinstance(o, Objective))
+    terms = tuple(term for term in things if isinstance(term, Term))
+    return changed(t, objectives=(Impulse(), *objectives), terms=terms, **changes)
+
+
+def check_carried_over(old: Transcription) -> None:
+    """Each variable, row and multiplier of a program is in the finer one, and at the same place."""
+    new, rng = finer(old), np.random.default_rng(0)
+    x = old.with_lifted(first_iterate(old) + 0.02 * rng.standard_normal(old.program.n))
+    y, z = rng.standard_normal(old.program.m), rng.standard_normal(old.program.n)
+    x = np.clip(x, old.layout.lower, old.layout.upper)  # as iterates are; what is lifted may be off by then
+    there, of_rows, of_bounds = carried_over(new, old, x, y, z)
+    places = {"swing": (old.swing_nodes, new.swing_nodes)}
+    places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, new.follow_nodes))
+    lifted = {group.name for group, _ in old._lifted}
+    found = 0
+    for name, group in old.layout.groups.items():
+        mine = new.layout.groups[name]
+        assert (
+            (mine.count, mine.size) == (group.count, group.size)
+            or group.size == 0
+            or (name in lifted or name.endswith((" legs", " sole wrench")))
+        )
+        for k in range(group.count):
+            now = k
+            if mine.count != group.count:
+                before, after = places[name.split()[0]]
+                now = int(np.flatnonzero(after == before[k])[0])
+            columns = [mine.labels.index(label) for label in group.labels]
+            at = mine.index(now)[columns]
+            if name not in lifted:
+                np.testing.assert_allclose(there[at], x[group.index(k)], atol=1e-12)
+            np.testing.assert_array_equal(of_bounds[at], z[group.index(k)])
+            found += len(columns)
+    assert found == old.program.n
+    assert np.count_nonzero(of_bounds) == old.program.n, "what is new has none"
+    np.testing.assert_allclose(there, np.clip(new.with_lifted(there), new.layout.lower, new.layout.upper))
+    names = {str(row): i for i, row in enumerate(new.program.origins)}
+    assert len(names) == new.program.m
+    same = {names[str(row)]: i for i, row in enumerate(old.program.origins) if str(row) in names}
+    if TorqueRate not in map(type, old.problem.terms):  # whose rows are from one node to the next
+        assert len(same) == old.program.m
+    np.testing.assert_array_equal(of_rows[list(same)], y[list(same.values())])
+    assert np.count_nonzero(of_rows) == len(same)
+
+
+@pytest.mark.parametrize("name", ON_TOP)
+def test_more_nodes_go_together_with(arm_transcription: Transcription, name: str) -> None:
+    """The finer program has what the old one had where it was, and is solved from there in fewer steps."""
+    old = with_more(arm_transcription, ON_TOP[name])
+    check_carried_over(old)
+    first = solve_sqp(old.program, first_iterate(old))
+    assert first.status is Status.SOLVED
+    new = finer(old)
+    x, y, z = carried_over(new, old, first.x, first.multipliers, first.bound_multipliers)
+    again = solve_sqp(new.program, x, multipliers=y, bound_multipliers=z)
+    assert again.status is Status.SOLVED and again.iterations < first.iterations
+    assert again.objective == pytest.approx(first.objective, rel=0.02)
+    for o, quantity in new.objectives:
+        assert quantity.evaluate(again.x) == pytest.approx(old.achieved(first.x)[o.name], rel=0.05)
+
+
+def test_more_nodes_go_together_with_everything_on_two_legs(biped_transcription: Transcription) -> None:
+    """Also with a second way to rest, which has nodes of its own."""
+    check_carried_over(
+        with_more(
+            biped_transcription,
+            *(thing for name, thing in ON_TOP.items() if name in ("peak force", "energy", "effort")),
+            AngularMomentum(),
+            TorqueRate(limit=500.0),
+            HitRegion(radius=0.1),
+            scenarios=(Scenario(name="gone", missing=True, brake_after=0.02),),
+        )
+    )
+
+
 @pytest.fixture
 def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A problem whose torques are a little over their limit between the nodes, where nothing is given up."""
@@ -158,6 +280,18 @@ def test_solve_adds_nodes_where_they_are_missing(coarse: Any) -> None:
     moved = dataclasses.replace(coarse, point=np.asarray(coarse.point) - np.array([0.0, 0.0, 0.005]))
     again = planner.solve(moved, start=better)
     assert again.status is Status.SOLVED and set(again.nodes.swing) >= set(better.nodes.swing)
+
+
+def test_nodes_are_added_where_effort_counts(
+    coarse: Any, arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each node's effort is a variable, so there are more of them then."""
+    objectives = (Impulse(), Effort(weight=0.1))
+    functions = changed(arm_transcription, objectives=objectives).functions
+    monkeypatch.setattr(planner, "block_functions", lambda *_: functions)
+    solution = planner.solve(dataclasses.replace(coarse, objectives=objectives))
+    assert solution.status is Status.SOLVED and solution.nodes.total > 0
+    assert len(solution.attempts) > 1 and solution.attempts[-1].kept
 
 
 def test_a_solution_that_keeps_its_limits_is_the_plain_one(coarse: Any) -> None:

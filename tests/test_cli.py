@@ -265,6 +265,27 @@ def test_a_best_iterate_is_written_and_exits_1(
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["status"] == status.value
 
 
+def test_a_solve_that_fails_leaves_a_good_result_as_it_is(
+    planner: Planner, file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    run("solve", file, "--out", out)
+    (out / "report.html").write_text("page of the good one", encoding="utf-8")
+    good = {path.name: path.read_bytes() for path in out.iterdir()}
+    planner.solution = {"status": Status.INFEASIBLE}
+    printed, _ = run("solve", file, "--out", out, code=1)
+    assert f"{out} holds a good result, which is left as it is" in printed
+    assert f"{out / 'failed'}: solution.npz" in printed
+    summary = json.loads(run("solve", file, "--out", out, "--json", code=1)[0])
+    assert summary["set_aside"] == {"directory": str(out / "failed"), "kept": str(out)}
+    assert summary == json.loads((out / "failed" / "summary.json").read_text(encoding="utf-8"))
+    assert {path.name for path in (out / "failed").iterdir()} == FILES
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == good
+    planner.solution = {}
+    run("solve", file, "--out", out)
+    assert {path.name for path in out.iterdir()} == FILES, "no page of the old one, no failed one"
+
+
 def test_a_plan_that_misses_when_it_is_replayed_is_kept(planner: Planner, file: Path, tmp_path: Path) -> None:
     planner.solution = {"kind": MissingSolution}
     out, _ = run("solve", file, "--out", tmp_path / "out")

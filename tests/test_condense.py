@@ -105,19 +105,38 @@ def test_a_variable_that_is_held_does_not_move(algebra):
     assert np.abs(step).min(initial=1.0, where=np.arange(step.size) != c.free[1]) > 0.0
 
 
-def test_rows_of_two_systems_are_refused():
-    J = sp.csc_array(np.array([[1.0, 0, 1], [0, 1, 1], [1, 1, 0]]))
-    H = sp.csc_array(np.eye(3))
-    systems = np.array([[0], [1]])
-    with pytest.raises(ValueError, match="row 2 touches two systems"):
-        Condenser(J, H, [Elimination(systems, systems)], np.ones(3, dtype=bool), NONE[:3], Kernels())
-
-
-def test_systems_that_the_hessian_couples_are_refused():
-    J, H = sp.csc_array(np.eye(2)), sp.csc_array(np.ones((2, 2)))
-    systems = np.array([[0], [1]])
-    with pytest.raises(ValueError, match="couples"):
-        Condenser(J, H, [Elimination(systems, systems)], np.ones(2, dtype=bool), NONE[:2], Kernels())
+@pytest.mark.parametrize("tie", ["row", "equality", "hessian", "own row"])
+def test_systems_that_are_tied_to_each_other_go_one_after_the_other(algebra, tie):
+    """By a row that touches both, soft or hard, by the Hessian, or as one's rows touch the other's variables:
+    as torques of neighbouring nodes are by a limit of their rate."""
+    J, H, eliminations, rng = chained(5)
+    (m, n), dense, curved = J.shape, J.toarray(), H.toarray()
+    equal = np.zeros(m, dtype=bool)
+    equal[eliminations[0].rows.ravel()] = True
+    row = m - 1
+    for one, two in ((0, 2), (2, 4), (0, 6)):  # of the first and the second system, and so on
+        if tie == "hessian":
+            curved[one, two] = curved[two, one] = 1.0
+        elif tie == "own row":
+            dense[one, two] = 1.0
+        else:
+            dense[row, [one, two]] = rng.normal(size=2)
+            equal[row] = tie == "equality"
+            row -= 1
+    J, H = sp.csc_array(dense), sp.csc_array(curved)
+    c = Condenser(J, H, eliminations, equal, np.zeros(n, dtype=bool), algebra)
+    newton = NewtonSystem(c, np.zeros(0, dtype=int), algebra)
+    weights = 0.1 + rng.random(c.rows.size)
+    assert newton.factor(J, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
+    gradient, residual = rng.normal(size=n), rng.normal(size=m)
+    step, y = newton.solve(gradient, residual)
+    softness = np.zeros(m)
+    softness[c.rows] = 1.0 / weights
+    softness[equal] = 0.0
+    system = np.block([[curved + newton.shift * np.eye(n), dense.T], [dense, -np.diag(softness)]])
+    exact = np.linalg.solve(system, -np.concatenate([gradient, residual]))
+    np.testing.assert_allclose(step, exact[:n], atol=1e-8 * (1 + np.abs(exact).max()))
+    np.testing.assert_allclose(y, exact[n:], atol=1e-8 * (1 + np.abs(exact).max()))
 
 
 def test_variables_without_rows_of_their_own_stay_free():

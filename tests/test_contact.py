@@ -87,12 +87,18 @@ def cubic(x, rate, stiffness, hardening, damping):
     return stiffness * x + hardening * x**3 + damping * x * rate
 
 
+def rounded_body(x, rate, stiffness, exponent, damping):
+    """The same, as a user would write a power: no number below zero, and no curvature at it."""
+    return stiffness * x**exponent * (1 + damping * rate)
+
+
 LAWS = {
     "spring-damper": SpringDamper(stiffness=1e4, damping=300.0),
     "kelvin-voigt": KelvinVoigt(stiffness=1e4, damping=300.0),
     "hunt-crossley": HuntCrossley(stiffness=1e6, dissipation=0.4, exponent=1.3),
     "hertz": HertzDamped(stiffness=1e6, damping=300.0),
     "custom": CustomLaw(compression=cubic, analytic=True, stiffness=1e4, hardening=4e8, damping=2e4),
+    "power": CustomLaw(compression=rounded_body, stiffness=1e6, exponent=1.5, damping=0.1),
 }
 
 
@@ -354,6 +360,7 @@ def test_a_custom_law_is_its_class_written_out_and_its_numbers_are_inputs():
         ({"compression": lambda x, rate: x, "stiffness": 1.0}, r"function\(penetration, rate, stiffness\)"),
         ({"compression": lambda x, rate: max(x, 0.0)}, "cannot be called with CasADi expressions"),
         ({"compression": lambda x, rate: ca.vertcat(x, rate)}, "gives 2 expressions"),
+        ({"compression": lambda x, rate: x**1.5, "analytic": True}, "CustomLaw: analytic: .*analytic=False"),
         ({"compression": lambda x, rate, k: k * x, "k": np.inf}, "CustomLaw: k: inf"),
         ({"compression": lambda x, rate, k: k * x, "k": "soft"}, "CustomLaw: k: expected numbers"),
     ],
@@ -361,6 +368,47 @@ def test_a_custom_law_is_its_class_written_out_and_its_numbers_are_inputs():
 def test_custom_laws_that_cannot_work_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         CustomLaw(**options)
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda x, rate: 1e6 * x**1.5,
+        lambda x, rate: 1e6 * x**1.1 * (1 + 0.2 * rate),
+        lambda x, rate: 1e5 * x**1.25 + 300.0 * rate,
+        lambda x, rate: 1e6 * ca.fmax(x, 0) ** 1.5,
+        lambda x, rate: 1e6 * x**1.5 + 200.0 * x**0.25 * rate,
+        lambda x, rate: 1e3 * ca.sqrt(x),
+    ],
+)
+def test_a_law_that_is_not_smooth_at_zero_goes_on_along_its_tangent(formula):
+    """It is the formula above 1e-6 m, and below it a line without a kink."""
+    law, rate, edge = CustomLaw(compression=formula), 0.3, 1e-6
+    for x in (2e-6, 1e-4, 0.01):
+        assert law.branch(x, rate, True) == pytest.approx(float(formula(x, rate)), rel=1e-14)
+    x, r = ca.SX.sym("x"), ca.SX.sym("r")
+    branch = law.branch(x, r, True)
+    curvature, slope = ca.hessian(branch, x)
+    numbers = ca.Function("numbers", [x, r], [branch, slope, curvature])
+    plain = ca.Function("plain", [x, r], [ca.gradient(formula(x, r), x)])
+    value, tilt, bend = (float(found) for found in numbers(-2e-3, rate))
+    assert tilt == pytest.approx(float(plain(edge, rate)), rel=1e-4) and bend == 0.0
+    assert value == pytest.approx(float(formula(edge, rate)) + tilt * (-2e-3 - edge), rel=1e-9)
+    assert law.branch(-2e-3, rate, True) == pytest.approx(value, rel=1e-12)
+    below, above = (float(numbers(edge + side, rate)[0]) for side in (-1e-12, 1e-12))
+    assert (above - below) / 2e-12 == pytest.approx(tilt, rel=1e-3)
+    assert law.force(-0.01, rate) == 0.0, "a float, not a complex number"
+
+
+def test_a_smooth_law_is_its_formula_everywhere():
+    """As a line below zero, by which implicit and exact steps know a law that is linear."""
+    for law in (
+        CustomLaw(compression=lambda x, rate, k, d: k * x + d * rate, k=1e4, d=10.0),
+        CustomLaw(compression=lambda x, rate, k, d: k * x**3 + d * rate, k=1e4, d=10.0),
+    ):
+        compression = law._branches[0]
+        for x in (-0.01, -1e-7, 0.0, 1e-7, 0.01):
+            assert law.branch(x, 0.2, True) == compression(x, 0.2, **law.parameters)
 
 
 def test_a_law_written_as_a_class_needs_a_branch():

@@ -200,7 +200,7 @@ def test_a_place_that_cannot_be_a_directory(record: Record, tmp_path: Path) -> N
     with pytest.raises(InputError, match="cannot make the directory"):
         save_record(record, tmp_path / "file")
     (tmp_path / "summary.json").mkdir()
-    with pytest.raises(InputError, match=r"cannot write .*summary\.json"):
+    with pytest.raises(InputError, match=r"cannot write over .*summary\.json"):
         save_record(record, tmp_path)
 
 

@@ -7,7 +7,7 @@ step from event to event, are the independent integration.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from impactopt.collision import SDC, Collision
 from impactopt.contact import (
     Board,
     ContactLaw,
+    CustomLaw,
     FreeMass,
     HertzDamped,
     HuntCrossley,
@@ -27,6 +28,7 @@ from impactopt.contact import (
     RigidWall,
     SpringDamper,
     Target,
+    power,
 )
 from impactopt.errors import InputError
 from impactopt.ipopt import solve_ipopt
@@ -338,3 +340,43 @@ def test_a_rigid_impact_on_a_wall_stops_or_turns_the_hand() -> None:
     plan = solved(problem(SpringDamper(stiffness=1e4, damping=0.0), RigidWall(), **rigid))
     assert plan.impulse == pytest.approx(1.25 * MASS * plan.hand_speed, rel=1e-6)
     assert plan.collision.outcome == {}
+
+
+# ---- laws of a user's own
+
+
+class Rubber(ContactLaw):
+    """A class with a power as one writes it at first."""
+
+    parameters: ClassVar[dict[str, float]] = {}
+
+    def branch(self, penetration: Any, rate: Any, compressing: bool, parameters: Any = None) -> Any:
+        return 3e6 * penetration**1.5 * (1 + 0.15 * rate)
+
+
+class Rounded(Rubber):
+    """The same, as it is to be written."""
+
+    analytic = False
+
+    def branch(self, penetration: Any, rate: Any, compressing: bool, parameters: Any = None) -> Any:
+        return 3e6 * power(penetration, 1.5) * (1 + 0.15 * rate)
+
+    def separation(self, penetration: Any, rate: Any, parameters: Any = None) -> Any:
+        return 3e6 * penetration
+
+
+@pytest.mark.parametrize("target", [FreeMass(mass=1.0), RigidWall()], ids=lambda t: type(t).__name__)
+def test_a_power_as_a_user_writes_it_is_planned_with(target: Target) -> None:
+    """Hunt and Crossley's law as a formula: it was no number where the search passes through zero."""
+    known = solved(problem(HuntCrossley(stiffness=3e6, dissipation=0.1), target))
+    formula = CustomLaw(compression=lambda x, rate, k, d: k * x**1.5 * (1 + 1.5 * d * rate), k=3e6, d=0.1)
+    for law in (formula, Rounded()):
+        plan = solved(problem(law, target))
+        assert plan.impulse == pytest.approx(known.impulse, rel=1e-4)
+        assert plan.collision.force.max() == pytest.approx(known.collision.force.max(), rel=1e-3)
+
+
+def test_a_class_that_is_no_number_below_zero_is_refused() -> None:
+    with pytest.raises(InputError, match=r"the law Rubber has no finite .* 0 mm.*impactopt\.contact\.power"):
+        problem(Rubber(), FreeMass(mass=1.0))

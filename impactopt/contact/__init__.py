@@ -1,5 +1,6 @@
 """What is hit and how contact works: laws (force from penetration) and targets (motion from force)."""
 
+from ._expressions import power
 from .board import Board
 from .custom import CustomLaw
 from .laws import ContactLaw, KelvinVoigt, SpringDamper
@@ -19,4 +20,5 @@ __all__ = [
     "RigidWall",
     "SpringDamper",
     "Target",
+    "power",
 ]

@@ -27,7 +27,10 @@ def choose(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def power(base: Any, exponent: Any) -> Any:
-    """max(base, 0)^exponent; for exponents >= 1 all first derivatives are finite everywhere."""
+    """max(base, 0)^exponent, of floats, arrays and CasADi expressions: what laws write powers with.
+
+    For exponents >= 1 all first derivatives are finite everywhere.
+    """
     inside = base > _TINY
     safe = choose(inside, base, _TINY)
     return choose(inside, safe**exponent, 0.0 * safe)

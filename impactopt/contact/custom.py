@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
+from functools import partial
 from typing import Any, ClassVar
 
 import casadi as ca
 
 from ..errors import InputError, check_array
-from ._expressions import Parameters
-from .laws import ContactLaw
+from ._expressions import Parameters, choose
+from .laws import ContactLaw, rough_at
 
 __all__ = ["CustomLaw"]
 
 Branch = Callable[..., Any]
+
+# [m] below this a law that is not smooth at zero goes on along its tangent, found by a difference of this
+# part of it
+_ROUNDED, _STEP = 1e-6, 1e-3
 
 
 class CustomLaw(ContactLaw):
@@ -24,6 +29,9 @@ class CustomLaw(ContactLaw):
     The functions are called as ``function(penetration, rate, **numbers)``, with CasADi expressions too:
     write ``casadi.fmax`` and ``casadi.if_else`` in the place of ``max`` and ``if``. They have to agree where
     the rate is zero. A force below zero is cut, and so is one while apart.
+
+    A force that is not smooth at zero, as x**1.5, which has no curvature there and is no number below, goes
+    on along its tangent below 1e-6 m: plans search there.
 
     >>> law = CustomLaw(
     ...     compression=lambda x, rate, stiffness, hardening, damping: (
@@ -50,13 +58,14 @@ class CustomLaw(ContactLaw):
     Raises
     ------
     InputError : no function; numbers that are not finite; a function that does not take just these numbers,
-        or gives anything but one expression.
+        or gives anything but one expression; "analytic" for one that has no curvature at zero.
     """
 
     # Each law made here is a class with these functions, so that type(law)(**numbers) is the same law with
     # other numbers, as it is for any law.
     _branches: ClassVar[tuple[Branch, Branch] | None] = None
     _numbers: dict[str, float]
+    _rough: bool  # at or below zero
 
     def __new__(
         cls,
@@ -87,6 +96,7 @@ class CustomLaw(ContactLaw):
     ) -> None:
         checked = {name: float(check_array(f"CustomLaw: {name}", x, ())) for name, x in numbers.items()}
         object.__setattr__(self, "_numbers", checked)
+        object.__setattr__(self, "_rough", False)
         x, rate, symbols = ca.SX.sym("x"), ca.SX.sym("rate"), {name: ca.SX.sym(name) for name in checked}
         for name, compressing in (("compression", True), ("restitution", False)):
             try:
@@ -98,6 +108,13 @@ class CustomLaw(ContactLaw):
                 ) from error
             if size != 1:
                 raise InputError(f"CustomLaw: {name}: gives {size} expressions; one force is wanted")
+        rough = rough_at([partial(function, **checked) for function in self._branches or ()])
+        if self.analytic and rough == 0.0:
+            raise InputError(
+                "CustomLaw: analytic: a function has no finite slope or curvature at penetration 0; say "
+                "analytic=False"
+            )
+        object.__setattr__(self, "_rough", rough is not None and not self.analytic)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -108,7 +125,10 @@ class CustomLaw(ContactLaw):
     ) -> Any:
         assert self._branches is not None
         numbers = self._numbers if parameters is None else parameters
-        return self._branches[0 if compressing else 1](penetration, rate, **numbers)
+        function = self._branches[0 if compressing else 1]
+        if not self._rough:
+            return function(penetration, rate, **numbers)
+        return _rounded(lambda x: function(x, rate, **numbers), penetration)
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise FrozenInstanceError(f"cannot assign to field {name!r}")
@@ -121,6 +141,13 @@ class CustomLaw(ContactLaw):
         assert self._branches is not None
         compression, restitution = self._branches
         return _remake, (compression, restitution, self.analytic, self._numbers)
+
+
+def _rounded(function: Callable[[Any], Any], x: Any) -> Any:
+    """`function` down to `_ROUNDED`, and below it its tangent there: never called with less."""
+    safe = choose(x > _ROUNDED, x, _ROUNDED)
+    less, more = _ROUNDED * (1 - _STEP), _ROUNDED * (1 + _STEP)
+    return function(safe) + (function(more) - function(less)) / (more - less) * (x - safe)
 
 
 def _remake(compression: Branch, restitution: Branch, analytic: bool, numbers: dict[str, float]) -> CustomLaw:

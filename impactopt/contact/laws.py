@@ -8,14 +8,16 @@ n.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
+import numpy as np
 
 from ._expressions import Parameters, choose, numbers_of, positive, text_of
 
-__all__ = ["ContactLaw", "KelvinVoigt", "SpringDamper"]
+__all__ = ["ContactLaw", "KelvinVoigt", "SpringDamper", "rough_at"]
 
 
 class ContactLaw(ABC):
@@ -47,6 +49,8 @@ class ContactLaw(ABC):
     ) -> Any:
         """Force [N] of one phase, smooth in penetration [m] and rate [m/s], whatever their signs.
 
+        A search passes through penetrations below zero, so write powers with `impactopt.contact.power`.
+
         `parameters` replace the law's own numbers, and may be CasADi symbols.
         """
 
@@ -77,6 +81,24 @@ class ContactLaw(ABC):
         force = choose(rate > 0, compression, restitution)
         none = 0.0 * force
         return choose(penetration >= 0, choose(force > 0, force, none), none)
+
+
+def rough_at(branches: Sequence[Callable[[Any, Any], Any]]) -> float | None:
+    """The first penetration [m] of 0 and -1 mm at which a branch has no finite force, slope or curvature.
+
+    branches : functions of penetration and rate.  None: they are smooth at both, as a search needs them.
+    """
+    x, rate = ca.SX.sym("x"), ca.SX.sym("rate")
+    both, found = ca.vertcat(x, rate), []
+    for branch in branches:
+        force = ca.SX(branch(x, rate))
+        curvature, slope = ca.hessian(force, both)
+        found += [force, slope, ca.vec(ca.densify(curvature))]
+    values = ca.Function("law", [x, rate], [ca.densify(ca.vertcat(*found))])
+    for depth in (0.0, -1e-3):
+        if not all(np.isfinite(np.array(values(depth, speed))).all() for speed in (0.1, -0.1)):
+            return depth
+    return None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,10 +13,12 @@ import casadi as ca
 
 from impactopt.coordinates import StanceCoordinates
 from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion
-from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, make_block, striker_kinematics
+from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, builders, make_block, striker_kinematics
 from impactopt.nlp.mesh import contact_mesh
-from impactopt.objectives import Effort, PeakForce, TargetEnergy
+from impactopt.nlp.own_blocks import key_of, own_blocks
+from impactopt.objectives import Effort, Objective, PeakForce, TargetEnergy
 from impactopt.problem import ImpactProblem
+from impactopt.terms import kind_of
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class ExtraBlock:
 
 def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:
     """Block's name -> the block, of what the problem's objectives and terms ask for."""
-    kinds = {type(o) for o in problem.objectives}
+    kinds = {kind_of(o, Objective) for o in problem.objectives}
     out: dict[str, ExtraBlock] = {}
     if PeakForce in kinds:
         stages = len(contact_mesh(problem))
@@ -38,7 +40,13 @@ def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, Extr
         out["energy"] = ExtraBlock(problem.target.formula(), lambda: energy(problem.target))
     if Effort in kinds:
         out["effort"] = ExtraBlock((), lambda: effort(c.robot.n))
-    return out | _of_terms(problem, c)
+    out |= _of_terms(problem, c)
+    own = own_blocks(problem, c, [*out, *builders(c, problem.striker, problem.law, problem.target, 0)])
+    return out | {name: _built(block) for name, block in own.items()}
+
+
+def _built(block: BlockExpression) -> ExtraBlock:
+    return ExtraBlock(key_of(block), lambda: block)
 
 
 def _of_terms(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:

@@ -19,7 +19,7 @@ from impactopt.nlp.layout import Affine, Group
 from impactopt.nlp.objective import start_torque
 from impactopt.nlp.rows import Measure, Place, degrees, millimetres
 from impactopt.shapes import face_axes
-from impactopt.terms import Term
+from impactopt.terms import Term, kind_of
 
 if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
@@ -31,7 +31,9 @@ CONTACT = "contact"
 def add_extra_terms(t: ContactProgram, terms: tuple[Term, ...]) -> None:
     """Blocks and rows of each extra one among these terms."""
     for term in terms:
-        if (add := _ADD.get(type(term))) is not None:
+        if type(term).add_rows is not Term.add_rows:  # a user's own
+            term.add_rows(t)
+        elif (add := _ADD.get(kind_of(term, Term))) is not None:
             add(t, term)
 
 

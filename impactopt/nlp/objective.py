@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.errors import InputError
 from impactopt.nlp.blocks import DEPTH_SCALE, FORCE_SCALE
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.layout import Affine, Array, Group, Layout, stack
@@ -28,6 +29,7 @@ from impactopt.objectives import (
 )
 from impactopt.plan import complete_reference
 from impactopt.statics import static_wrenches
+from impactopt.terms import kind_of
 
 if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
@@ -49,7 +51,20 @@ class Quantity:
 
 def quantities(t: ContactProgram, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
     """Objectives with their quantities; adds what they need to the program."""
-    return [(o, _QUANTITIES[type(o)](t)) for o in objectives]
+    return [(o, _quantity(t, o)) for o in objectives]
+
+
+def _quantity(t: ContactProgram, objective: Objective) -> Quantity:
+    if type(objective).quantity is Objective.quantity:
+        return _QUANTITIES[kind_of(objective, Objective)](t)
+    found = objective.quantity(t)  # a user's own
+    whole = found if isinstance(found, Quantity) else Quantity(found)
+    if not isinstance(whole.affine, Affine) or whole.affine.size != 1:
+        raise InputError(
+            f"{type(objective).__name__}.quantity gave {found!r}; give one affine expression, such as "
+            "program.swing_T[0], or an impactopt.nlp.objective.Quantity"
+        )
+    return whole
 
 
 def _impulse(t: ContactProgram) -> Quantity:
@@ -85,7 +100,9 @@ def _effort(t: Transcription) -> Quantity:
     durations = [t.swing_T] * swing + [t.follow.T] * follow
     slots = [[tau, T[0]] for tau, T in zip(t.torques, durations, strict=False)]
     at = t.add_block("effort", slots, np.zeros(0))
-    of_node = t.lift("effort of a node", at + np.arange(len(slots)))[0]
+    places = [*map(t.swing_place, t.swing_nodes), *map(t.follow.place_at, t.follow_nodes)]
+    labels = [place.name for place in places]  # by which a program with more nodes finds them again
+    of_node = t.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
     first, *of_swing = trapezoid(np.concatenate([[0.0], t.swing_nodes]))
     weights = np.array([*of_swing, *trapezoid(t.follow_nodes)])
     start = first * float(np.sum(start_torque(t) ** 2))

@@ -14,7 +14,7 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError
 from impactopt.motion import CubicSpline, basis, quintic, rate_weights
 from impactopt.nlp.at_contact import ContactProgram
-from impactopt.nlp.layout import Array
+from impactopt.nlp.layout import Array, Group
 from impactopt.nlp.mesh import with_middles
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription
@@ -130,6 +130,9 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
         known = old.layout.groups.get(name)
         if known is None or not group.size:
             continue
+        if known.labels != group.labels:  # of one vector with a part for each node, which its label names
+            _carry_by_label(group, known, (new, x), (bounds, z))
+            continue
         values, own = known.read(x), (z[known.index(k)] for k in range(known.count))
         here = np.arange(group.count)
         if known.count != group.count:
@@ -142,6 +145,18 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
     of_rows = dict(zip(_keys(old), y, strict=True))
     rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
     return _finished(t, new), rows, bounds
+
+
+def _carry_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> None:
+    """Copy what has the same label; ``vectors``: new and old ones. What is new is lifted, so it is found
+    afterwards.
+    """
+    before = {label: j for j, label in enumerate(known.labels)}
+    there = [k for k, label in enumerate(group.labels) if label in before]
+    here = [before[group.labels[k]] for k in there]
+    for k in range(min(group.count, known.count)):
+        for new, old in vectors:
+            new[group.index(k)[there]] = old[known.index(k)[here]]
 
 
 def _keys(t: Transcription) -> Iterator[tuple[str, str, str, int]]:

@@ -12,18 +12,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.coordinates import StanceCoordinates
-from impactopt.extra_terms import TorqueRate
 from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.layout import Affine, Array
 from impactopt.nlp.objective import Prices, wrench_prices
 from impactopt.nlp.rows import Index, Measure, Place, along, by_leg
-from impactopt.objectives import Effort
 from impactopt.plan import total_ground_wrench
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
-
-OF_MOTIONS = (TorqueRate, Effort)  # terms and objectives that say nothing of a strike
 
 
 class StrikeTranscription(ContactProgram):
@@ -53,8 +49,8 @@ class StrikeTranscription(ContactProgram):
         self._collision_rows()
         self._after(fastest)
         self._finish(
-            tuple(term for term in problem.terms if not isinstance(term, OF_MOTIONS)),
-            tuple(o for o in problem.objectives if not isinstance(o, OF_MOTIONS)),
+            tuple(term for term in problem.terms if not term.whole_motion),
+            tuple(o for o in problem.objectives if not o.whole_motion),
         )
 
     def _nodes(self) -> list[list[Index]]:

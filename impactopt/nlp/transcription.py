@@ -17,7 +17,6 @@ import numpy as np
 from impactopt.between import NO_MORE, MoreNodes
 from impactopt.codegen import cached, model_hash
 from impactopt.coordinates import StanceCoordinates
-from impactopt.extra_terms import TorqueRate
 from impactopt.motion import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.apart import apart_functions
@@ -31,7 +30,6 @@ from impactopt.nlp.mesh import percentage, with_middles
 from impactopt.nlp.objective import Prices, motion_prices
 from impactopt.nlp.rows import Index, Measure, Place, Rank, along, by_leg, degrees, percent, rates
 from impactopt.nlp.structured import derivative_functions
-from impactopt.objectives import Effort
 from impactopt.plan import Plan
 from impactopt.problem import ImpactProblem
 from impactopt.statics import static_wrenches
@@ -193,7 +191,7 @@ class Transcription(ContactProgram):
     def torques_lifted(self) -> bool:
         """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
         p = self.problem
-        return p.extra(TorqueRate) is not None or any(isinstance(o, Effort) for o in p.objectives)
+        return any(term.needs_torques for term in p.terms) or any(o.needs_torques for o in p.objectives)
 
     def _torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
         """``outputs``: the torques over limit at each node."""

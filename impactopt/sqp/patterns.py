@@ -16,7 +16,7 @@ from impactopt.sqp.kernels import Index, Places, Products, Stage
 class Elimination(NamedTuple):
     """Systems of one shape: equality rows (k, r), and the variables (k, r) that each system's rows determine.
 
-    No row may touch the variables of two systems of the same elimination.
+    Those that a row or the Hessian ties to each other are eliminated one after the other, all else at once.
     """
 
     rows: Index
@@ -38,36 +38,49 @@ class Touched(NamedTuple):
 
 
 def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> list[list[Touched]]:
-    """Mark what becomes nonzero on the way, and find what each system touches."""
+    """Mark what becomes nonzero on the way, and find what each system touches.
+
+    The systems of each list of those that come out can be eliminated at once, list after list.
+    """
     row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
-    others = np.zeros(touches.shape[1], dtype=bool)
     out = []
-    for q_all, e_all in eliminations:
-        row_left[q_all.ravel()] = False
-        column_left[e_all.ravel()] = False
-        others[e_all.ravel()] = True
-        found, touched = [], np.zeros(touches.shape[0], dtype=np.intp)
-        for q, e in zip(q_all, e_all, strict=True):
-            t = np.flatnonzero(touches[:, e].any(axis=1) & row_left)
-            c = np.flatnonzero(touches[q].any(axis=0) & column_left)
-            coupled = couples[e].any(axis=0)
-            others[e] = False
-            if (coupled & others).any():
-                raise ValueError("the Hessian couples variables of two systems of one elimination")
-            others[e] = True
-            more = coupled & column_left
-            more[c] = False
-            u = np.concatenate([c, np.flatnonzero(more)])
-            touched[t] += 1
-            touches[np.ix_(t, c)] = touches[np.ix_(t, e)] = True
-            touches[np.ix_(q, e)] = couples[np.ix_(e, e)] = True
-            couples[np.ix_(c, u)] = couples[np.ix_(u, c)] = True
-            found.append(Touched(q, e, t, c, u))
-        others[e_all.ravel()] = False
-        if (touched > 1).any():
-            raise ValueError(f"row {int(np.argmax(touched > 1))} touches two systems of one elimination")
-        out.append(found)
+    for elimination in eliminations:
+        waiting = list(zip(*elimination, strict=True))
+        while waiting:
+            systems, waiting = _apart(waiting, touches, couples, row_left)
+            for q, e in systems:
+                row_left[q] = column_left[e] = False
+            found = []
+            for q, e in systems:
+                t = np.flatnonzero(touches[:, e].any(axis=1) & row_left)
+                c = np.flatnonzero(touches[q].any(axis=0) & column_left)
+                more = couples[e].any(axis=0) & column_left
+                more[c] = False
+                u = np.concatenate([c, np.flatnonzero(more)])
+                touches[np.ix_(t, c)] = touches[np.ix_(t, e)] = True
+                touches[np.ix_(q, e)] = couples[np.ix_(e, e)] = True
+                couples[np.ix_(c, u)] = couples[np.ix_(u, c)] = True
+                found.append(Touched(q, e, t, c, u))
+            out.append(found)
     return out
+
+
+_Systems = list[tuple[Index, Index]]  # rows and variables of each
+
+
+def _apart(systems: _Systems, touches: Any, couples: Any, row_left: Any) -> tuple[_Systems, _Systems]:
+    """Those of these systems that nothing ties to one before them, and the others."""
+    rows, variables = np.zeros(touches.shape[0], dtype=bool), np.zeros(touches.shape[1], dtype=bool)
+    now, later = _Systems(), _Systems()
+    for q, e in systems:
+        touched = touches[:, e].any(axis=1) & row_left
+        if (rows & touched).any() or couples[e][:, variables].any():
+            later.append((q, e))
+            continue
+        rows |= touched
+        variables[e] = True
+        now.append((q, e))
+    return now, later
 
 
 _Rows = tuple[Index, Index, Places]

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import MISSED, Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
-from impactopt.nlp.apart import ApartRow
+from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.transcription import Transcription
-from impactopt.plan import Plan
 from impactopt.problem import ImpactProblem
 from impactopt.terms import KeepOut, SelfCollision
 
 Array = NDArray[np.float64]
-Bounds = dict[ApartRow, tuple[float, float]]
+Rows = dict[ApartRow, Held]
+AFTER = 2  # phase after contact
 NEAR = 0.10  # [m] nearer bodies get a row
 STEP = 8e-3  # [s] at which a plan is looked at
 SHARE = 0.5  # of a margin that may be given up between nodes
+BETWEEN = 4  # joints at least between two links that get a row because they are near
+EXACT = 0.05  # [m] nearer bodies get a row that knows their hulls there
+BEAD = 0.02  # [m] radius of its sphere
+CLOSE = 1e-3  # [m] of a margin that rows may leave out
+
 
 
 class Margins:
@@ -32,14 +38,6 @@ class Margins:
             problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp)
         )
         self._least: dict[Pair, float] = {}
-        # spheres stick out of hulls: where they are too near at the start, they may come nearer by as much as the
-        # hulls may
-        near = self.bodies.near(self._start, max(self.own.margin, self.world.margin))
-        self._gap: dict[tuple[int, int], float] = {}
-        for sphere, joint, other, gap in zip(near.sphere, near.joint, near.other, near.gap, strict=True):
-            pair = self.bodies.known(int(joint), int(other))
-            slack = self.bodies.exact(self._start, 0, pair) - self.of(pair)
-            self._gap[int(sphere), int(other)] = min(self.term(pair).margin, float(gap) - slack)
 
     def term(self, pair: Pair) -> SelfCollision | KeepOut:
         """The one that asks for it."""
@@ -52,39 +50,106 @@ class Margins:
             self._least[pair] = min(self.term(pair).margin, max(start, 0.0))
         return self._least[pair]
 
-    def bound(self, sphere: int, other: int) -> float:
-        """Of a sphere's gap to another body."""
-        return self._gap.get((sphere, other), self.term((0, other)).margin)
+    def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
+        """A row that knows what it keeps apart exactly as it is at instant k, where the two are nearest.
+
+        Of the one link it takes a small sphere that touches its surface there, of the other body the plane that does.
+        more [m] : than the margin.
+        """
+        found, travel = self.bodies.closest(at, k, pair), float(at.travel[k])
+        away = -found.normal  # from the other to the one
+        (turn, shift), (facing, place) = (self.bodies.placement(at, k, body) for body in pair)
+        centre = turn.T @ (found.one + BEAD * away - shift)
+        normal, point = facing.T @ away, facing.T @ (found.other - place)
+        plane = (*normal.tolist(), float(normal @ point))
+        return Held(tuple(centre.tolist()), BEAD + self.of(pair) + more, plane, travel)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spots:
-    """The places of a program at solver variables: their names, and where bodies are there."""
+    """The places of a program at solver variables: their names, instants [s] of them, and where bodies are."""
 
     names: tuple[str, ...]
+    time: Array
     at: Places
 
 
-def spots_of(t: Transcription, x: Array) -> Spots:
+def spots_of(t: ContactProgram, x: Array) -> Spots:
     """All places of a program with coordinates and legs."""
-    c, plan = t.coordinates, t.decode(x)
-    found = [(0, *spot) for spot in t.swing_spots()]
-    for missed, follow in enumerate(t.follows):
-        found += [(MISSED if missed else 2, *spot) for spot in follow.spots()]
-    q = np.array([c.join(y.evaluate(x), legs.evaluate(x)) for _, _, (y, legs) in found])
-    phase = np.array([p for p, _, _ in found], dtype=np.intp)
-    time = np.array([place.time.evaluate(x)[0] if place.time is not None else 0.0 for _, place, _ in found])
-    travel = np.where(phase == 2, plan.travel(time + plan.contact_end), 0.0)
-    return Spots(names=tuple(place.name for _, place, _ in found), at=Places.of(t.robot, q, travel, phase))
+    states = t.body_states(x)
+    phase, time = np.array([s.phase for s in states], dtype=np.intp), np.array([s.time for s in states])
+    travel = np.where(phase == AFTER, t.travel(x, time), 0.0)
+    q = np.array([s.q for s in states])
+    return Spots(names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase))
 
 
-def rows_near(t: Transcription, x: Array, margins: Margins, within: float = NEAR) -> Bounds:
-    """Rows between all bodies that come near at solver variables (n,): of each pair the nearest sphere."""
-    spots = spots_of(t, x)
-    near = margins.bodies.near(spots.at, within).least()
-    out: Bounds = {}
-    for k, sphere, other in zip(near.at, near.sphere, near.other, strict=True):
-        if margins.term((0, other)).enabled:
-            bound = margins.bound(int(sphere), int(other))
-            out[ApartRow(spots.names[k], int(sphere), int(other))] = bound, float(spots.at.travel[k])
+def rows_near(t: ContactProgram, x: Array, margins: Margins, within: float = NEAR) -> Rows:
+    """Rows between all bodies that come near at solver variables (n,).
+
+    Links with few joints between them are always near, and can hardly meet: they get rows only where they do.
+    """
+    spots, bodies = spots_of(t, x), margins.bodies
+    near = bodies.near(spots.at, within, BETWEEN).least()
+    out: Rows = {}
+    for k, sphere, joint, other, gap in zip(near.at, near.sphere, near.joint, near.other, near.gap, strict=True):
+        pair = bodies.known(int(joint), int(other))
+        if not margins.term(pair).enabled:
+            continue
+        if gap < EXACT:
+            out[ApartRow(spots.names[k], *pair)] = margins.held(spots.at, int(k), pair)
+        else:
+            links = bodies.links
+            reach = float(links.radius[sphere]) + margins.of(pair)
+            held = Held(tuple(links.centre[sphere].tolist()), reach, None, float(spots.at.travel[k]))
+            out[ApartRow(spots.names[k], int(joint), int(other))] = held
     return out
+
+
+class Violated(NamedTuple):
+    """Rows that a solution needs beside its own, and how deep [m] bodies are in each other without them."""
+
+    rows: Rows
+    depth: float
+
+
+def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
+    """What keeps apart all bodies that are too near, at the nodes of a solution or between them; None: none is.
+
+    Too near is what gives up more than a ``share`` of its margin by exact geometry. Rows that are there and do not
+    keep it, as spheres do not know all of a link, or as the motion leaves them between two nodes, are tightened by
+    what is missing.
+    """
+    plan, bodies = t.decode(x), margins.bodies
+    spots, found, deepest = spots_of(t, x), dict[tuple[int, Pair], float](), -np.inf
+    for missed in (False, True) if plan.brake is not None else (False,):
+        motion = plan.motion(STEP, missed=missed)
+        at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
+        near = bodies.near(at, max(margins.own.margin, margins.world.margin)).least()
+        for k, joint, other, gap in zip(near.at, near.joint, near.other, near.gap, strict=True):
+            pair = bodies.known(int(joint), int(other))
+            asked = margins.of(pair)
+            if not margins.term(pair).enabled or gap > asked or (missed and not motion.phase[k]):
+                continue
+            apart = bodies.exact(at, int(k), pair)
+            if apart < (1 - share) * asked:
+                deepest = max(deepest, -apart)
+                for spot in _beside(spots, float(motion.time[k]), missed):
+                    found[spot, pair] = min(found.get((spot, pair), np.inf), apart)
+    if not found:
+        return None
+    rows: Rows = {}
+    for (spot, pair), apart in found.items():
+        here = bodies.exact(spots.at, spot, pair)
+        # where the place itself keeps its margin, the motion beside it does not
+        more = margins.of(pair) - apart if here >= margins.of(pair) - CLOSE else 0.0
+        number = sum(row[:3] == (spots.names[spot], *pair) for row in t.apart_rows)
+        rows[ApartRow(spots.names[spot], *pair, number)] = margins.held(spots.at, spot, pair, more)
+    return Violated(rows, deepest)
+
+
+def _beside(spots: Spots, time: float, missed: bool) -> list[int]:
+    """The places before and after a time [s] of the motion, or of the one that has met nothing."""
+    on_way = spots.at.phase != (AFTER if missed else MISSED)
+    order = np.flatnonzero(on_way)[np.argsort(spots.time[on_way], kind="stable")]
+    k = int(np.searchsorted(spots.time[order], time))
+    return [int(order[j]) for j in {max(k - 1, 0), min(k, len(order) - 1)}]

@@ -241,7 +241,9 @@ class Plan:
         """
         last, t1, _, _ = self.way(2, missed=missed)
         t0, end = self.contact_start, t1 + last.duration
-        times = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t0, t1), (t1, end))]
+        times = [
+            np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t0, t1), (t1, end))
+        ]
         before, _, _, _ = self.independent(0, times[0], missed=missed)
         after, _, _, _ = self.independent(2, times[2], missed=missed)
         during = self.through_contact((times[1] - t0) / max(t1 - t0, 1e-12), missed=missed)
@@ -271,7 +273,9 @@ class Plan:
         hit, since = self.collision, np.asarray(time) - self.contact_start
         if len(hit.time) < 2:
             return np.zeros(len(since))
-        gone = np.concatenate([[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)])
+        gone = np.concatenate(
+            [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
+        )
         last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
         return np.interp(since, hit.time, gone, left=0.0) + last * np.maximum(since - hit.time[-1], 0.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
@@ -309,7 +309,9 @@ class ImpactProblem:
             tuple(world),
             self.start_posture,
             normal=self.normal,
-            striking=int(model.frames[model.getFrameId(self.robot.striker(self.striker).model_frame)].parentJoint),
+            striking=int(
+                model.frames[model.getFrameId(self.robot.striker(self.striker).model_frame)].parentJoint
+            ),
             standing=tuple(int(model.frames[k].parentJoint) for k in soles),
         )
 

@@ -47,7 +47,9 @@ class TargetBody:
         wanted = 1 if self.shape == "ball" else 3
         size = check_array("TargetBody.size [m]", self.size, (wanted,))
         if self.shape == "none" or not np.all(size > 0):
-            raise InputError(f"TargetBody.size is {size.tolist()} m; give lengths > 0, and none of shape 'none'")
+            raise InputError(
+                f"TargetBody.size is {size.tolist()} m; give lengths > 0, and none of shape 'none'"
+            )
         object.__setattr__(self, "size", tuple(size.tolist()))
 
 
@@ -89,7 +91,9 @@ class Obstacle:
                 raise InputError(f"{where}: a box has a size of three lengths > 0 m, no end and no radius")
             return
         if not 0 < self.radius < np.inf or any(self.rpy) or any(self.position):
-            raise InputError(f"{where}: a capsule has a radius > 0 m, a start and an end, and no position or rpy")
+            raise InputError(
+                f"{where}: a capsule has a radius > 0 m, a start and an end, and no position or rpy"
+            )
         if self.end is None:
             object.__setattr__(self, "end", self.start)
 

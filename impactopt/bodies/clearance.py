@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.fit import Planes
-from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
+from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, transform
 from impactopt.bodies.world import WorldBody
 from impactopt.errors import InputError
 from impactopt.robot import Robot
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 MISSED = 3  # phase in which there is no target
 FAR = 1.0  # [m] no clearance beyond this is asked for
+_REQUEST = coal.DistanceRequest()
 DEEPEST = -1e-6  # [m] what is deeper is a touch
 
 
@@ -86,6 +88,17 @@ class Near:
         keys = np.column_stack([self.at, self.joint, self.other])[order]
         chosen = order[np.unique(keys, axis=0, return_index=True)[1]]
         return Near(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+
+class Closest(NamedTuple):
+    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; and the direction
+    (3,) from the one to the other.
+    """
+
+    distance: float
+    one: Array
+    other: Array
+    normal: Array
 
 
 class Bodies:
@@ -155,17 +168,28 @@ class Bodies:
         """Points (m, 3) of a joint's frame in the world (k, m, 3)."""
         return np.asarray(points @ at.rotation[:, joint].transpose(0, 2, 1) + at.translation[:, joint, None])
 
-    def near(self, at: Places, within: float) -> Near:
-        """All spheres that are nearer than ``within`` [m] to what they are not to touch."""
+    @cached_property
+    def _between(self) -> list[int]:
+        """How many joints there are between the two of each pair."""
+        up = [set(joints) for joints in self.robot.model.supports]
+        return [len(up[a] ^ up[b]) for a, b in self.pairs]
+
+    def near(self, at: Places, within: float, joints: int = 0) -> Near:
+        """All spheres that are nearer than ``within`` [m] to what they are not to touch.
+
+        joints : of two links, so many at least are between them.
+        """
         links, found = self.links, list[tuple[Index, Index, int, int, Array]]()
         close = self._ball_gaps(at) < within
         for n, pair in enumerate(self.pairs):
             when = np.flatnonzero(close[:, n])
-            if not len(when):
+            if not len(when) or self._between[n] < joints:
                 continue
             a, b = self.directed[pair]
             own = self._of_joint[a]
-            points = links.centre[own] @ at.rotation[when, a].transpose(0, 2, 1) + at.translation[when, a, None]
+            points = (
+                links.centre[own] @ at.rotation[when, a].transpose(0, 2, 1) + at.translation[when, a, None]
+            )
             local = np.matmul(points - at.translation[when, b, None], at.rotation[when, b])
             gap = _outside(links.planes[b], local) - links.radius[own]
             i, c = np.nonzero(gap < within)
@@ -176,7 +200,10 @@ class Bodies:
             shift = body.place + np.outer(at.travel[when], self.normal) * body.moves
             for j in joints if len(when) else ():
                 own = self._of_joint[j]
-                points = links.centre[own] @ at.rotation[when, j].transpose(0, 2, 1) + at.translation[when, j, None]
+                points = (
+                    links.centre[own] @ at.rotation[when, j].transpose(0, 2, 1)
+                    + at.translation[when, j, None]
+                )
                 gap = _outside(body.planes, (points - shift[:, None]) @ body.rotation) - links.radius[own]
                 i, c = np.nonzero(gap < within)
                 found.append((when[i], own[c], j, -1 - w, gap[i, c]))
@@ -201,16 +228,39 @@ class Bodies:
 
     # ------------------------------------------------------------------ exactly
     def exact(self, at: Places, k: int, pair: Pair) -> float:
-        """Distance [m] of a pair at instant k, of two joints; or of joint and world's body, as (j, -1 - w)."""
+        """Distance [m] of a pair at instant k, of two joints; or of joint and a body of the world, -1 - its index."""
+        return self.closest(at, k, pair).distance
+
+    def closest(self, at: Places, k: int, pair: Pair) -> Closest:
+        """Where the two of a pair are nearest to each other at instant k, or deepest in each other."""
         a, b = pair
-        here = transform(at.rotation[k, a], at.translation[k, a])
-        if b < 0:
-            body = self.world[-1 - b]
-            moved = body.place + at.travel[k] * self.normal * body.moves
-            there = transform(body.rotation, moved)
-            return min(distance(piece.shape, here, body.shape, there) for piece in self.links.of_joint[a])
-        there = transform(at.rotation[k, b], at.translation[k, b])
-        return min(distance(one.shape, here, two.shape, there) for one, two in self.pairs[a, b])
+        here, there = self._transform(at, k, a), self._transform(at, k, b)
+        pieces = (
+            self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
+        )
+        best: Any = None
+        for one, two in pieces:
+            found = coal.DistanceResult()
+            coal.distance(one.shape, here, two.shape, there, _REQUEST, found)
+            if best is None or found.min_distance < best.min_distance:
+                best = found
+        return Closest(
+            float(best.min_distance),
+            np.array(best.getNearestPoint1()),
+            np.array(best.getNearestPoint2()),
+            np.array(best.normal),
+        )
+
+    def _transform(self, at: Places, k: int, body: int) -> Any:
+        rotation, translation = self.placement(at, k, body)
+        return transform(rotation, translation)
+
+    def placement(self, at: Places, k: int, body: int) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,) [m] of a joint, or of a body of the world as -1 - its index."""
+        if body >= 0:
+            return at.rotation[k, body], at.translation[k, body]
+        solid = self.world[-1 - body]
+        return solid.rotation, solid.place + at.travel[k] * self.normal * solid.moves
 
     def _slack(self) -> float:
         """[m] by how much bodies may be nearer than their spheres and planes say."""

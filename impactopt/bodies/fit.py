@@ -19,7 +19,24 @@ Array = NDArray[np.float64]
 
 PLANES = 32  # about every body
 # how far spheres may stick out of the hull [m]: the least with which so many of them cover it
-STEPS = (0.004, 0.006, 0.008, 0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.15)
+STEPS = (
+    0.004,
+    0.006,
+    0.008,
+    0.01,
+    0.0125,
+    0.015,
+    0.0175,
+    0.02,
+    0.025,
+    0.03,
+    0.04,
+    0.05,
+    0.06,
+    0.08,
+    0.1,
+    0.15,
+)
 SMALL, FEW, MOST = 0.3, 10, 16  # [m] extent of a hull that is covered by few; how many
 INSETS = (0.98, 0.85, 0.7, 0.5, 0.3)  # of the largest sphere's radius: how deep centres may lie
 CENTRES = 40  # at each of these depths
@@ -53,6 +70,15 @@ class Planes:
     normal: Array
     offset: Array
     out: float
+
+    def with_facing(self, plane: tuple[float, ...] | None) -> Array:
+        """Normals and then offsets (4 PLANES,), with a plane (4,) in place of the one most like it."""
+        normal, offset = self.normal, self.offset
+        if plane is not None:
+            k = int((normal @ np.array(plane[:3])).argmax())
+            normal, offset = normal.copy(), offset.copy()
+            normal[k], offset[k] = plane[:3], plane[3]
+        return np.concatenate([normal.ravel(), offset])
 
 
 def fill(hull: ConvexHull, points: Array) -> Spheres:
@@ -112,7 +138,9 @@ def enclose(vertices: Array, normals: Array, radius: float = 0.0) -> Planes:
     best, known = told.max(axis=1), np.full(len(points), -np.inf)
     chosen: list[int] = []
     for _ in range(PLANES):
-        gain = np.minimum(np.maximum(told, known[:, None]) - np.maximum(known, best - 1.0)[:, None], 1.0).sum(axis=0)
+        gain = np.minimum(np.maximum(told, known[:, None]) - np.maximum(known, best - 1.0)[:, None], 1.0).sum(
+            axis=0
+        )
         k = int(gain.argmax())
         chosen.append(k)
         known = np.maximum(known, told[:, k])

@@ -206,19 +206,34 @@ def apart_functions(report: Callable[[str], None] | None = None) -> dict[str, An
 
 
 class ApartRow(NamedTuple):
-    """What one row keeps apart at one place.
+    """What one row keeps apart at one place: its name.
 
-    place : its name in the program.  sphere : of the robot.  other : joint whose link it keeps out of; or -1 - the index
-    of a body of the world.
+    place : of the program.  joint : of the link, a sphere of which is kept out.  other : joint of the other link; or -1 -
+    the index of a body of the world.  number : of rows for the same two there.
     """
 
     place: str
-    sphere: int
+    joint: int
     other: int
+    number: int = 0
 
 
-def add_apart_rows(t: Any, rows: Mapping[ApartRow, tuple[float, float]]) -> None:
-    """Blocks and rows of a program ``t`` for these: bound [m] and the target's travel [m] of each."""
+class Held(NamedTuple):
+    """How a row keeps them apart.
+
+    centre (3) [m] : of the sphere, in the joint's frame.  reach [m] : its radius and the margin.  facing (4) : normal and
+    offset [m] of a plane, in the other's frame, in place of that of its planes that is most like it; None: those.
+    travel [m] : of the target, if the other moves with it.
+    """
+
+    centre: tuple[float, ...]
+    reach: float
+    facing: tuple[float, ...] | None = None
+    travel: float = 0.0
+
+
+def add_apart_rows(t: Any, rows: Mapping[ApartRow, Held]) -> None:
+    """Blocks and rows of a program ``t`` for these."""
     if not rows:
         return
     bodies, links = t.problem.bodies, t.problem.bodies.links
@@ -227,29 +242,25 @@ def add_apart_rows(t: Any, rows: Mapping[ApartRow, tuple[float, float]]) -> None
     width = t.ny + t.nl
     everywhere = stack([part for _, slots in spots for part in slots])
     coordinates, constants = everywhere.matrix(t.layout.n), everywhere.const
-    chains: dict[tuple[int, int], tuple[Chain, Any, Array]] = {}
+    chains: dict[tuple[int, int], tuple[Chain, Any]] = {}
     groups: dict[str, _Group] = {}
-    for row, (bound, travel) in rows.items():
-        joint, other = int(links.joint[row.sphere]), row.other
-        if (joint, other) not in chains:
-            chain = chain_between(t.robot.model, joint, max(other, 0))
-            body = bodies.world[-1 - other] if other < 0 else None
-            planes = links.planes[other] if body is None else body.planes
-            shape = np.concatenate([planes.normal.ravel(), planes.offset])
+    for row, held in rows.items():
+        body = bodies.world[-1 - row.other] if row.other < 0 else None
+        if (row.joint, row.other) not in chains:
+            chain = chain_between(t.robot.model, row.joint, max(row.other, 0))
             pattern = chain.pattern(t.coordinates, None if body is None else body.rotation)
-            chains[joint, other] = chain, pattern, shape
-        chain, pattern, shape = chains[joint, other]
+            chains[row.joint, row.other] = chain, pattern
+        chain, pattern = chains[row.joint, row.other]
         before = None
-        if other < 0:
-            body = bodies.world[-1 - other]
-            before = pin.SE3(body.rotation, body.place + travel * bodies.normal * body.moves).inverse()
+        if body is not None:
+            shift = held.travel * bodies.normal * body.moves
+            before = pin.SE3(body.rotation, body.place + shift).inverse()
+        planes = (links.planes[row.other] if body is None else body.planes).with_facing(held.facing)
         group = groups.setdefault(f"apart{chain.length}", _Group(chain.length + 3))
         group.rows.append(row)
         group.patterns.append(pattern)
         group.spots.append(spot_of[row.place])
-        reach = float(links.radius[row.sphere]) + bound
-        group.numbers.append(np.concatenate([chain.numbers(before), links.centre[row.sphere], shape, [reach]]))
-    names = {j: links.name(j) for j in links.joints}
+        group.numbers.append(np.concatenate([chain.numbers(before), held.centre, planes, [held.reach]]))
     for name, group in groups.items():
         counts = [len(slots) for slots, _, _ in group.patterns]
         slots, columns, factors = (np.concatenate([p[k] for p in group.patterns]) for k in range(3))
@@ -259,20 +270,16 @@ def add_apart_rows(t: Any, rows: Mapping[ApartRow, tuple[float, float]]) -> None
         chosen = sp.csr_array((factors, (instance * group.size + slots, at)), shape=shape)
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
         first = t.add_lifted(name, lift, len(counts), np.array(group.numbers))
-        t.rows.add_each(
-            [
-                Row(
-                    SelfCollision.name if row.other >= 0 else KeepOut.name,
-                    spots[spot][0],
-                    f"{names[int(links.joint[row.sphere])]} and "
-                    f"{names[row.other] if row.other >= 0 else bodies.world[-1 - row.other].name}",
-                    TOO_NEAR,
-                )
-                for row, spot in zip(group.rows, group.spots, strict=True)
-            ],
-            outputs=first + np.arange(len(counts)),
-            lower=0.0,
-        )
+        origins = [
+            Row(
+                (SelfCollision if row.other >= 0 else KeepOut).name,
+                spots[spot][0],
+                " and ".join(bodies.names((row.joint, row.other))),
+                TOO_NEAR,
+            )
+            for row, spot in zip(group.rows, group.spots, strict=True)
+        ]
+        t.rows.add_each(origins, outputs=first + np.arange(len(counts)), lower=0.0)
 
 
 @dataclass(frozen=True)

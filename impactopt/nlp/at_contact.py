@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from impactopt.cone import inward_edges
 from impactopt.extra_terms import HitCone, HitRegion
-from impactopt.nlp.apart import ApartRow, add_apart_rows
+from impactopt.nlp.apart import ApartRow, Held, add_apart_rows
 from impactopt.nlp.builder import Builder
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.extra_terms import add_extra_terms
@@ -26,7 +26,6 @@ from impactopt.plan import PlannedScenario
 from impactopt.support import support_polygon
 from impactopt.terms import Term
 
-
 Program = TypeVar("Program", bound="ContactProgram")
 
 
@@ -35,6 +34,17 @@ def rotation_rows(normal: Array) -> Array:
     _, _, vt = np.linalg.svd(normal.reshape(1, 3))
     rows = np.vstack([normal, vt[1:]])
     return rows
+
+
+class BodyState(NamedTuple):
+    """Where the robot is at a place: phase (0 before contact, 2 after it, 3 after one that met nothing), the place's
+    name, time [s] since the start, and configuration (nq,).
+    """
+
+    phase: int
+    name: str
+    time: float
+    q: Array
 
 
 class ContactProgram(Builder):
@@ -232,7 +242,7 @@ class ContactProgram(Builder):
         add_extra_terms(self, terms)
         self.objectives = quantities(self, objectives)
         self._worth = assemble(self.layout, self.objectives, self._prices())
-        self.apart_rows: Mapping[ApartRow, tuple[float, float]] = {}
+        self.apart_rows: Mapping[ApartRow, Held] = {}
         self._bare = tuple(self.blocks), self.rows
 
     @cached_property
@@ -249,8 +259,8 @@ class ContactProgram(Builder):
             determined=self._determined(),
         )
 
-    def with_apart(self: Program, rows: Mapping[ApartRow, tuple[float, float]]) -> Program:
-        """The same program with just these rows between bodies: bound [m] and the target's travel [m] of each."""
+    def with_apart(self: Program, rows: Mapping[ApartRow, Held]) -> Program:
+        """The same program with just these rows between bodies."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         blocks, bare = self._bare
@@ -293,6 +303,19 @@ class ContactProgram(Builder):
 
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         """Places after contact with coordinates and legs."""
+        raise NotImplementedError
+
+    def body_states(self, x: Array) -> list[BodyState]:
+        """Where bodies are at all places of `swing_spots` and `follow_spots`, for solver variables (n,)."""
+        raise NotImplementedError
+
+    def posture(self, x: Array, slots: list[Affine]) -> Array:
+        """Configuration (nq,) of coordinates and legs."""
+        y, legs = slots
+        return self.coordinates.join(y.evaluate(x), legs.evaluate(x))
+
+    def travel(self, x: Array, time: Array) -> Array:
+        """How far (k,) [m] the target has gone at these times [s] since the start."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ solution

@@ -15,7 +15,6 @@ from impactopt.nlp.batched import Block
 from impactopt.nlp.collision import DIRECTIONS
 from impactopt.nlp.layout import Affine, Array, Group, Layout
 from impactopt.nlp.rows import Index, Measure, Place, Rows, along, percent
-from impactopt.nlp.structured import StructuredProgram
 from impactopt.problem import ImpactProblem
 from impactopt.terms import (
     Balance,

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.coordinates import StanceCoordinates
-from impactopt.nlp.at_contact import ContactProgram
+from impactopt.nlp.at_contact import BodyState, ContactProgram
 from impactopt.nlp.collision import Collision
 from impactopt.nlp.layout import Affine, Array
 from impactopt.nlp.objective import Prices, wrench_prices
@@ -101,6 +101,18 @@ class StrikeTranscription(ContactProgram):
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         y, _, legs, _ = self.expected.state_after
         return [(Place.plain("after contact"), [y, legs])]
+
+    def body_states(self, x: Array) -> list[BodyState]:
+        places = [*self.swing_spots(), *self.follow_spots()]
+        end = sum(self.expected.durations(x))
+        return [
+            BodyState(phase, place.name, time, self.posture(x, slots))
+            for (place, slots), phase, time in zip(places, (0, 2), (0.0, end), strict=True)
+        ]
+
+    def travel(self, x: Array, time: Array) -> Array:
+        gone = np.trapezoid(*[getattr(self.decode(x).collision, k) for k in ("target_speed", "time")])
+        return np.where(np.asarray(time) > 0, float(gone), 0.0)
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:

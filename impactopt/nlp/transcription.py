@@ -20,7 +20,7 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.motion import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.nlp import blocks as symbolic
 from impactopt.nlp.apart import apart_functions
-from impactopt.nlp.at_contact import ContactProgram
+from impactopt.nlp.at_contact import BodyState, ContactProgram
 from impactopt.nlp.clearance import add_clearance
 from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
@@ -151,6 +151,23 @@ class Transcription(ContactProgram):
 
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         return [spot for follow in self.follows for spot in follow.spots()]
+
+    def body_states(self, x: Array) -> list[BodyState]:
+        plan, found = self.decode(x), self.swing_spots()
+        out = [
+            BodyState(0, place.name, s * plan.swing.duration, self.posture(x, slots))
+            for s, (place, slots) in zip(self.swing_nodes, found, strict=True)
+        ]
+        for missed, follow in enumerate(self.follows):
+            curve, begin, nodes, _ = plan.way(2, missed=bool(missed))
+            out += [
+                BodyState(2 + missed, place.name, begin + s * curve.duration, self.posture(x, slots))
+                for s, (place, slots) in zip(nodes, follow.spots(), strict=True)
+            ]
+        return out
+
+    def travel(self, x: Array, time: Array) -> Array:
+        return self.decode(x).travel(time)
 
     # ------------------------------------------------------------------ rows
     def _swing_and_follow(self) -> None:

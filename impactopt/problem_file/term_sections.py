@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from impactopt import extra_terms, terms
 from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import (
@@ -16,7 +14,6 @@ from impactopt.problem_file.values import (
     Positive,
     Restitution,
     UnitVector,
-    Vector,
 )
 
 

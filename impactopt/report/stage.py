@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.bodies.solids import Solid, box, cylinder, joined, simplified
 from impactopt.contact.board import Board
 from impactopt.contact.nail import Nail
 from impactopt.contact.targets import RigidWall, Target
 from impactopt.output import Record
 from impactopt.problem import ImpactProblem
-from impactopt.bodies.solids import Solid, box, cylinder, joined, simplified
 from impactopt.report.tracks import AROUND, Track, tracks_of
 from impactopt.report.visuals import Visual, visuals_of
 from impactopt.shapes import face_axes

@@ -21,10 +21,12 @@ AFTER = 2  # phase after contact
 NEAR = 0.10  # [m] nearer bodies get a row
 STEP = 8e-3  # [s] at which a plan is looked at
 SHARE = 0.5  # of a margin that may be given up between nodes
+OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no more
 BETWEEN = 4  # joints at least between two links that get a row because they are near
 EXACT = 0.05  # [m] nearer bodies get a row that knows their hulls there
 BEAD = 0.02  # [m] radius of its sphere
-CLOSE = 1e-3  # [m] of a margin that rows may leave out
+DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
+FAR = 0.6  # this [m]
 
 
 
@@ -44,10 +46,10 @@ class Margins:
         return self.own if pair[1] >= 0 else self.world
 
     def of(self, pair: Pair) -> float:
-        """Of a pair's hulls: the term's, or less where they are nearer at the start."""
+        """Of a pair's hulls: the term's, or less where they are near at the start already."""
         if pair not in self._least:
             start = self.bodies.exact(self._start, 0, pair)
-            self._least[pair] = min(self.term(pair).margin, max(start, 0.0))
+            self._least[pair] = min(self.term(pair).margin, max(OF_START * start, 0.0))
         return self._least[pair]
 
     def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
@@ -83,14 +85,19 @@ def spots_of(t: ContactProgram, x: Array) -> Spots:
     return Spots(names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase))
 
 
-def rows_near(t: ContactProgram, x: Array, margins: Margins, within: float = NEAR) -> Rows:
+def rows_near(
+    t: ContactProgram, x: Array, margins: Margins, within: float = NEAR, only: set[Pair] | None = None
+) -> Rows:
     """Rows between all bodies that come near at solver variables (n,).
 
     Links with few joints between them are always near, and can hardly meet: they get rows only where they do.
+    only : of these pairs, if given.
     """
-    spots, bodies = spots_of(t, x), margins.bodies
-    near = bodies.near(spots.at, within, BETWEEN).least()
     out: Rows = {}
+    if only is not None and not only:
+        return out
+    spots, bodies = spots_of(t, x), margins.bodies
+    near = bodies.near(spots.at, within, BETWEEN, only).least()
     for k, sphere, joint, other, gap in zip(near.at, near.sphere, near.joint, near.other, near.gap, strict=True):
         pair = bodies.known(int(joint), int(other))
         if not margins.term(pair).enabled:
@@ -139,11 +146,16 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         return None
     rows: Rows = {}
     for (spot, pair), apart in found.items():
-        here = bodies.exact(spots.at, spot, pair)
-        # where the place itself keeps its margin, the motion beside it does not
-        more = margins.of(pair) - apart if here >= margins.of(pair) - CLOSE else 0.0
-        number = sum(row[:3] == (spots.names[spot], *pair) for row in t.apart_rows)
-        rows[ApartRow(spots.names[spot], *pair, number)] = margins.held(spots.at, spot, pair, more)
+        known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair)]
+        # rows that are met, and yet it is too near there or beside: they are to ask for more
+        more = max((t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known[1:]), default=0.0)
+        if known and t.apart_rows[known[-1]].facing is not None:
+            more = max(more, 0.0) + margins.of(pair) - max(apart, -DEEP)
+        rows[ApartRow(spots.names[spot], *pair, len(known))] = margins.held(spots.at, spot, pair, min(more, DEEP))
+    deep = {pair for (_, pair), apart in found.items() if apart < -DEEP}
+    for key, held in rows_near(t, x, margins, FAR, deep).items():
+        if key not in t.apart_rows and key not in rows:
+            rows[key] = held
     return Violated(rows, deepest)
 
 

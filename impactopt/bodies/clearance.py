@@ -174,16 +174,16 @@ class Bodies:
         up = [set(joints) for joints in self.robot.model.supports]
         return [len(up[a] ^ up[b]) for a, b in self.pairs]
 
-    def near(self, at: Places, within: float, joints: int = 0) -> Near:
+    def near(self, at: Places, within: float, between: int = 0, only: set[Pair] | None = None) -> Near:
         """All spheres that are nearer than ``within`` [m] to what they are not to touch.
 
-        joints : of two links, so many at least are between them.
+        between : of two links, so many joints at least are between them.  only : of these pairs, if given.
         """
         links, found = self.links, list[tuple[Index, Index, int, int, Array]]()
         close = self._ball_gaps(at) < within
         for n, pair in enumerate(self.pairs):
             when = np.flatnonzero(close[:, n])
-            if not len(when) or self._between[n] < joints:
+            if not len(when) or self._between[n] < between or (only is not None and pair not in only):
                 continue
             a, b = self.directed[pair]
             own = self._of_joint[a]
@@ -195,7 +195,7 @@ class Bodies:
             i, c = np.nonzero(gap < within)
             found.append((when[i], own[c], a, b, gap[i, c]))
         for w, body in enumerate(self.world):
-            joints = [j for j, k in self.world_pairs if k == w]
+            joints = [j for j, k in self.world_pairs if k == w and (only is None or (j, -1 - w) in only)]
             when = np.flatnonzero(self.present(body, at))
             shift = body.place + np.outer(at.travel[when], self.normal) * body.moves
             for j in joints if len(when) else ():

@@ -27,7 +27,7 @@ from impactopt.nlp.structured import derivative_functions
 from impactopt.terms import KeepOut, SelfCollision
 
 LENGTHS = (4, 8, 12, 16, 20)  # of chains, in joints
-ROUND = 8e-3  # [m] over which two planes pass into each other
+ROUND = 4e-3  # [m] over which two planes pass into each other
 TOO_NEAR = millimetres("too near")
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import MISSED, Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.nlp.apart import ApartRow, Held
+from impactopt.nlp.at_contact import ContactProgram
 from impactopt.nlp.transcription import Transcription
 from impactopt.problem import ImpactProblem
 from impactopt.terms import KeepOut, SelfCollision
@@ -28,6 +29,10 @@ BEAD = 0.02  # [m] radius of its sphere
 DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
 FAR = 0.6  # this [m]
 
+
+def keeps_apart(problem: ImpactProblem) -> bool:
+    """Whether a problem asks for any two bodies to keep apart."""
+    return problem.term(SelfCollision).enabled or problem.term(KeepOut).enabled
 
 
 class Margins:
@@ -98,7 +103,9 @@ def rows_near(
         return out
     spots, bodies = spots_of(t, x), margins.bodies
     near = bodies.near(spots.at, within, BETWEEN, only).least()
-    for k, sphere, joint, other, gap in zip(near.at, near.sphere, near.joint, near.other, near.gap, strict=True):
+    for k, sphere, joint, other, gap in zip(
+        near.at, near.sphere, near.joint, near.other, near.gap, strict=True
+    ):
         pair = bodies.known(int(joint), int(other))
         if not margins.term(pair).enabled:
             continue
@@ -151,12 +158,28 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         more = max((t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known[1:]), default=0.0)
         if known and t.apart_rows[known[-1]].facing is not None:
             more = max(more, 0.0) + margins.of(pair) - max(apart, -DEEP)
-        rows[ApartRow(spots.names[spot], *pair, len(known))] = margins.held(spots.at, spot, pair, min(more, DEEP))
+        rows[ApartRow(spots.names[spot], *pair, len(known))] = margins.held(
+            spots.at, spot, pair, min(more, DEEP)
+        )
     deep = {pair for (_, pair), apart in found.items() if apart < -DEEP}
     for key, held in rows_near(t, x, margins, FAR, deep).items():
         if key not in t.apart_rows and key not in rows:
             rows[key] = held
     return Violated(rows, deepest)
+
+
+def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:
+    """Rows for the bodies that are too near at the places of a program themselves."""
+    spots, bodies = spots_of(t, x), margins.bodies
+    near = bodies.near(spots.at, max(margins.own.margin, margins.world.margin)).least()
+    rows: Rows = {}
+    for k, joint, other in zip(near.at, near.joint, near.other, strict=True):
+        pair = bodies.known(int(joint), int(other))
+        asked = margins.of(pair)
+        if margins.term(pair).enabled and bodies.exact(spots.at, int(k), pair) < (1 - SHARE) * asked:
+            known = sum(row[:3] == (spots.names[k], *pair) for row in t.apart_rows)
+            rows[ApartRow(spots.names[k], *pair, known)] = margins.held(spots.at, int(k), pair)
+    return rows
 
 
 def _beside(spots: Spots, time: float, missed: bool) -> list[int]:

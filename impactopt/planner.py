@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.between import NO_MORE, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.keeping_apart import DEEP, Margins, keeps_apart, rows_near, rows_to_add
+from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
@@ -23,7 +25,8 @@ from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, 
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_ROUNDS = 3  # of more nodes, at most
+_ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 10, 3, 4  # at most: of all, with more nodes, from the start again
+_UNFINISHED = "It leaves limits between its rows, and no solution was found that does not."
 
 
 def solve(
@@ -63,9 +66,9 @@ def solve(
     check_solver(solver)
     check_starts(starts, seed, given=not isinstance(start, str))
     given: str | Array | SolverResult
-    nodes = NO_MORE
+    nodes, given_solution = NO_MORE, isinstance(start, Solution)
     if isinstance(start, Solution):
-        given, nodes = start.result, start.nodes
+        given, nodes, apart = start.result, start.nodes, start.apart
     else:
         given = start if isinstance(start, str) else check_array("start", start, (None,))
     if isinstance(given, str) and given not in STARTS:
@@ -79,46 +82,91 @@ def solve(
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
-    fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began)
-    solution = Solution(plan=t.decode(fields["result"].x), nodes=nodes, **fields)
-    for _ in range(_ROUNDS if between else 0):
-        finer = _with_more_nodes(solution, t, budget, report)
-        if finer is None:
-            break
-        solution, t = finer
-    return solution
+    keep = None if not keeps_apart(problem) else Margins(problem)
+    refining = _Refining(budget, keep, apart if given_solution else {}, between, report)
+    t, fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began, refining.solve)
+    return Solution(plan=t.decode(fields["result"].x), nodes=t.nodes, apart=t.apart_rows, **fields)
 
 
-def _with_more_nodes(
-    solution: Solution, t: Transcription, budget: Budget, report: Callable[[str], None] | None
-) -> tuple[Solution, Transcription] | None:
-    """The same motion with nodes where it leaves its limits between them, and its program; None where it does
-    not, or where they end in none that is usable.
+@dataclass(frozen=True, kw_only=True)
+class _Round:
+    """A program that is to be solved next, and from where."""
+
+    program: Transcription
+    start: Array | SolverResult
+    why: str
+
+
+class _Refining:
+    """One start's way to a motion that is right between its program's rows too.
+
+    A program has rows between the bodies that come near at its start, and nodes where its mesh has them. Where its
+    solution brings other bodies into each other, or leaves its limits between nodes, it gets rows and nodes there
+    and is solved again: from where it is; or, where limbs are deep in each other, from the start, as the way out may
+    lead nowhere.
     """
-    if not solution.status.usable or budget.left == 0:
-        return None
-    nodes = t.nodes
-    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
-        nodes = nodes_to_add(solution.plan, t.nodes)
-    if nodes == t.nodes:
-        return None
-    began, old = time.perf_counter(), solution.result
-    finer = Transcription(t.problem, t.coordinates, t.functions, nodes)
-    x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
-    start = replace(old, x=x, multipliers=y, bound_multipliers=z)
-    name = f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"
-    if report is not None:
-        report(f"the plan leaves its limits between nodes: {name}, and on from there")
-    fields = solve_from(finer, [(name, lambda: start)], budget, began)
-    new = fields["result"]
-    if not new.status.usable:
-        return None
-    fields["result"] = _one_after_the_other(old, new)
-    for key in ("build_seconds", "solve_seconds"):
-        fields[key] += getattr(solution, key)
-    before = tuple(replace(attempt, kept=False) for attempt in solution.attempts)
-    fields["attempts"] = before + fields["attempts"]
-    return Solution(plan=finer.decode(new.x), nodes=nodes, **fields), finer
+
+    def __init__(
+        self,
+        budget: Budget,
+        margins: Margins | None,
+        rows: Mapping[ApartRow, Held],
+        between: bool,
+        report: Callable[[str], None] | None,
+    ) -> None:
+        self.budget, self.margins, self.rows = budget, margins, rows
+        self.between, self.report = between, report
+
+    def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        """The last program, and its result with the effort of all."""
+        x0 = start.x if isinstance(start, SolverResult) else start
+        if self.margins is not None:
+            rows = (
+                self.rows if self.rows and isinstance(start, SolverResult) else rows_near(t, x0, self.margins)
+            )
+            t = t.with_apart(rows)
+        result = self.budget.run(t.program, start)
+        for again in range(_ROUNDS if self.between else 0):
+            if not result.status.usable or self.budget.left == 0:
+                break
+            following = self._next(t, result, x0, again)
+            if following is None:
+                break
+            if self.report is not None:
+                self.report(following.why)
+            new = self.budget.run(following.program.program, following.start)
+            if not new.status.usable:
+                result = replace(result, message=f"{result.message} {_UNFINISHED}")
+                break
+            t, result = following.program, _one_after_the_other(result, new)
+        return t, result
+
+    def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> _Round | None:
+        """What is to be solved next; None if the solution is right."""
+        nodes, violated = t.nodes, None
+        with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+            nodes = nodes_to_add(t.decode(old.x), t.nodes) if again < _NODE_ROUNDS else t.nodes
+            violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
+        if violated is None and nodes == t.nodes:
+            return None
+        rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
+        if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
+            why = f"bodies are {1e3 * violated.depth:.0f} mm in each other: from the start again, with rows between them"
+            return _Round(program=t.with_apart(rows), start=x0, why=why)
+        if nodes == t.nodes:
+            finer = t.with_apart(rows)
+        else:
+            finer = Transcription(t.problem, t.coordinates, t.functions, nodes)
+            finer = finer.with_apart(rows)
+        x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
+        added = len(rows) - len(t.apart_rows)
+        what = [f"{nodes.total - t.nodes.total} more nodes"] * (nodes != t.nodes)
+        what += [f"{added} more rows between bodies"] * (violated is not None)
+        return _Round(
+            program=finer,
+            start=replace(old, x=x, multipliers=y, bound_multipliers=z),
+            why=f"between its rows the plan leaves its limits: {' and '.join(what)}, and on from there",
+        )
 
 
 def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:

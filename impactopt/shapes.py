@@ -100,7 +100,9 @@ class Obstacle:
     @property
     def centre(self) -> NDArray[np.float64]:
         """Its middle (3,) [m]."""
-        return np.array(self.position) if self.size is not None else np.add(self.start, self.end) / 2
+        if self.size is not None or self.start is None or self.end is None:
+            return np.array(self.position)
+        return (np.array(self.start) + np.array(self.end)) / 2
 
     @property
     def half(self) -> NDArray[np.float64]:

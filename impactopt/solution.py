@@ -72,11 +72,13 @@ class Solution(Solved):
 
     plan : the motion; for a status that is not usable, that of the best iterate.
     nodes : what its program had beside the ends and middles of its splines' intervals, as
-        :func:`impactopt.solve` adds them.  The rest: :class:`Solved`.
+        :func:`impactopt.solve` adds them.
+    apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
+    apart: Mapping[Any, Any] = field(default_factory=dict)
 
     @property
     def impulse(self) -> float:

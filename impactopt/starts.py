@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
 
 Array = NDArray[np.float64]
+Program = TypeVar("Program", bound="ContactProgram")
 Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
 SOLVERS = ("sqp", "ipopt")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
@@ -129,24 +130,32 @@ def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
     return [{}, *others]
 
 
-def solve_from(t: ContactProgram, starts: Starts, budget: Budget, began: float) -> dict[str, Any]:
-    """The fields of a :class:`impactopt.solution.Solved` for the best result from these starts.
+def solve_from(
+    t: Program,
+    starts: Starts,
+    budget: Budget,
+    began: float,
+    work: Callable[[Program, Array | SolverResult], tuple[Program, SolverResult]] | None = None,
+) -> tuple[Program, dict[str, Any]]:
+    """The program of the best result from these starts, and the fields of its :class:`impactopt.solution.Solved`.
 
     starts : name, and what makes its x (n,) when its turn comes. An interrupted solve is the last one, and so
     is one after which no time is left.  began [s] : when work on the problem did.
+    work : what is done from a start; None: the program is solved as it is. It may end with another program.
 
     Of those that meet their rows the one of least objective is best, else the one of least violation.
     """
-    program, built = t.program, time.perf_counter()
-    results, attempts = list[SolverResult](), list[Attempt]()
+    built = time.perf_counter()
+    found, attempts = list[tuple[Program, SolverResult]](), list[Attempt]()
     for name, make in starts:
-        result = budget.run(program, make())
-        results.append(result)
+        start = make()
+        program, result = (t, budget.run(t.program, start)) if work is None else work(t, start)
+        found.append((program, result))
         attempts.append(
             Attempt(
                 start=name,
                 status=result.status,
-                impulse=t.impulse(result.x),
+                impulse=program.impulse(result.x),
                 objective=result.objective,
                 max_violation=result.max_violation,
                 iterations=result.iterations,
@@ -155,18 +164,18 @@ def solve_from(t: ContactProgram, starts: Starts, budget: Budget, began: float) 
         )
         if result.status is Status.INTERRUPTED or budget.left == 0:
             break
-    order = [_rank(result) for result in results]
+    order = [_rank(result) for _, result in found]
     best = order.index(min(order))
     attempts[best] = replace(attempts[best], kept=True)
-    result, solved = results[best], time.perf_counter()
-    rows = program.constraints(result.x)
-    return {
+    t, result = found[best]
+    solved, rows = time.perf_counter(), t.program.constraints(result.x)
+    return t, {
         "problem": t.problem,
         "result": result,
         "solver": budget.solver,
         "build_seconds": built - began,
         "solve_seconds": solved - built,
-        "violations": tuple(worst_rows(program, result.x, rows, tolerance=VIOLATED, count=NAMED)),
+        "violations": tuple(worst_rows(t.program, result.x, rows, tolerance=VIOLATED, count=NAMED)),
         "objectives": t.achieved(result.x),
         "attempts": tuple(attempts),
     }

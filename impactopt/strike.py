@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
+from impactopt.keeping_apart import FAR, Margins, keeps_apart, missing_rows, rows_near
 from impactopt.nlp.start import strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import block_functions
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
-from impactopt.program import Callback
+from impactopt.program import Callback, SolverResult
 from impactopt.solution import Solved, blow_numbers, versions
 from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, solve_from
 
 Array = NDArray[np.float64]
+ROUNDS = 5  # of more rows between bodies
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,8 +97,32 @@ def optimize_strike(
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
-    fields = solve_from(t, _starts(t, given, starts, seed), budget, began)
+    margins = Margins(problem) if keeps_apart(problem) else None
+    t, fields = solve_from(
+        t, _starts(t, given, starts, seed), budget, began, partial(_clear, budget, margins)
+    )
     return StrikeSolution(strike=t.decode(fields["result"].x), **fields)
+
+
+def _clear(
+    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
+) -> tuple[StrikeTranscription, SolverResult]:
+    """A strike whose bodies keep apart: with rows between those that come near, more of them where they do not."""
+    x0 = start.x if isinstance(start, SolverResult) else start
+    if margins is None:
+        return t, budget.run(t.program, x0)
+    t = t.with_apart(rows_near(t, x0, margins, FAR))
+    result = budget.run(t.program, x0)
+    for _ in range(ROUNDS):
+        more = missing_rows(t, result.x, margins) if result.status.usable and budget.left != 0 else {}
+        if not more:
+            break
+        t = t.with_apart({**t.apart_rows, **more})
+        new = budget.run(t.program, result.x)
+        if not new.status.usable:
+            break
+        result = new
+    return t, result
 
 
 def _starts(t: StrikeTranscription, given: Array | None, starts: int, seed: int) -> Starts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
@@ -235,9 +235,7 @@ class Bodies:
         """Where the two of a pair are nearest to each other at instant k, or deepest in each other."""
         a, b = pair
         here, there = self._transform(at, k, a), self._transform(at, k, b)
-        pieces = (
-            self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
-        )
+        pieces = self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
         best: Any = None
         for one, two in pieces:
             found = coal.DistanceResult()

@@ -165,7 +165,7 @@ def _sphere(count: int) -> Array:
 
 def _greedy(covers: NDArray[np.bool_], most: int) -> list[int]:
     """Rows that together cover every column; none if it takes more than ``most``."""
-    left, chosen = np.ones(covers.shape[1], dtype=np.float32), []
+    left, chosen = np.ones(covers.shape[1], dtype=np.float32), list[int]()
     table = covers.astype(np.float32)
     while left.any():
         gain = table @ left

@@ -146,7 +146,8 @@ def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
 
     def make() -> bytes:
         file = io.BytesIO()
-        np.savez(file, **_hull_of(solid.vertices))
+        vertices, triangles = _hull_of(solid.vertices)
+        np.savez(file, vertices=vertices, triangles=triangles)
         return file.getvalue()
 
     with np.load(io.BytesIO(kept("hull", digest, make)), allow_pickle=False) as found:
@@ -154,12 +155,12 @@ def _hull(link: str, joint: int, solid: Solid) -> Piece | None:
     return Piece(link=link, joint=joint, vertices=vertices, triangles=triangles) if len(triangles) else None
 
 
-def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
+def _hull_of(points: Array) -> tuple[Array, NDArray[np.intp]]:
     """Vertices and triangles of the hull of points (k, 3), none where it has no volume."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
-        return {"vertices": np.zeros((0, 3)), "triangles": np.zeros((0, 3), dtype=np.intp)}
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.intp)
     place = np.full(len(points), -1)
     place[hull.vertices] = np.arange(len(hull.vertices))
     triangles = place[hull.simplices]
@@ -168,4 +169,4 @@ def _hull_of(points: Array) -> dict[str, NDArray[Any]]:
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
-    return {"vertices": vertices, "triangles": triangles}
+    return vertices, triangles

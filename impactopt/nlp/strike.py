@@ -111,8 +111,9 @@ class StrikeTranscription(ContactProgram):
         ]
 
     def travel(self, x: Array, time: Array) -> Array:
-        gone = np.trapezoid(*[getattr(self.decode(x).collision, k) for k in ("target_speed", "time")])
-        return np.where(np.asarray(time) > 0, float(gone), 0.0)
+        hit = self.decode(x).collision
+        gone = float(np.diff(hit.time) @ (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)
+        return np.where(np.asarray(time) > 0, gone, 0.0)
 
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Reasons = NDArray[np.object_]
 
 _BLOCK = 256  # states a call of a compiled function
-_UNTIL = 2.0  # of a planned contact: how long its reference is known
+_UNTIL = 2.0  # of a planned contact: how long its reference is known, for other targets too
 _LONG = 0.1  # [s] likewise, where a record does not say
 _OFF = 1e-6  # [m/s] at 1 m/s, across what can be moved
 
@@ -134,7 +134,8 @@ class ContactStates:
             raise InputError(
                 f"[at_contact] result: {result} is of a robot with other joints than {self.robot.name}"
             )
-        lasts = max(_UNTIL * float(a["collision_time"][-1]) if "collision_time" in a else 0.0, _LONG)
+        lasts = _UNTIL * float(a["collision_time"][-1]) if "collision_time" in a else _LONG
+        lasts = max(lasts, _LONG / 2)
         if "strike_posture" in a:
             return a["strike_posture"], a["strike_velocity"], a["strike_torque"], lasts
         if not record.completed:

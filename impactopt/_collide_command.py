@@ -13,7 +13,7 @@ from impactopt._command_options import AsJson, Quiet, Settings, Verbose, check_l
 from impactopt.plain_errors import plain_errors
 
 NO_COLLISION = 1  # exit code
-OFTEN = 8  # freezes of a saved result: a plan's contacts are long
+OFTEN = 16  # freezes of a saved result: a plan's contacts are long
 
 
 class Model(str, enum.Enum):

@@ -93,11 +93,10 @@ def situation(name: str, model: Any, *, seed: int = 0, speed: float = 1.5) -> li
 
 def inputs(model: Any, q: Any, v: Any, torque: Any) -> list[Any]:
     values = dict(model.settings)
-    if "reference" in values:  # a servo whose reference bends, by some 0.2 rad/s in 20 ms
-        n, orders = values["reference"].shape
-        values["reference"] = (
-            np.random.default_rng(7).normal(size=(n, orders)) * 0.2 * 50.0 ** np.arange(1, orders + 1)
-        )
+    if "reference" in values:  # a servo whose reference bends, by some rad/s in 20 ms
+        random = np.random.default_rng(7).normal(size=values["reference"].shape)
+        values["reference_until"] = np.array(0.02)
+        values["reference"] = 0.5 * random * 50.0 ** np.arange(1, random.shape[1] + 1)
     return [q, v, *([torque] if model.terms.feedforward else []), *values.values()]
 
 

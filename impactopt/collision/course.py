@@ -13,7 +13,7 @@ then those relative to it: du/dt = A tau - s f + d - phiddot_ref.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -51,19 +51,22 @@ class Stretch:
     q_after: Callable[[], Any]
 
 
-def relative_to(reference: Any, time: Any, data: dict[str, Any]) -> dict[str, Any]:
+def relative_to(settings: Mapping[str, Any], time: Any, data: dict[str, Any]) -> dict[str, Any]:
     """Frozen data with the drift d relative to the servo's reference, whose acceleration is frozen at a time
-    [s] since contact; `reference` (n, k) as of `Settings`, None: it keeps its joint velocities."""
-    if reference is None:
+    [s] since contact; `settings` with `reference` (n, k) and `reference_until`, or without: it keeps its
+    joint velocities."""
+    if "reference" not in settings:
         return data
-    orders = range(1, reference.shape[1])
-    acceleration = sum(((k + 1) * reference[:, k] * time**k for k in orders), reference[:, 0])
+    bend, until = settings["reference"], settings["reference_until"]
+    orders, bends = range(1, bend.shape[1] + 1), until > time
+    acceleration = bends * sum(k * bend[:, k - 1] * time ** (k - 1) for k in orders)
     return data | {"d": data["d"] - acceleration, "reference_acceleration": acceleration}
 
 
-def _gained(reference: Any, time: Any) -> Any:
+def _gained(settings: Mapping[str, Any], time: Any) -> Any:
     """What the reference's joint velocities (n) [rad/s] have gained by a time [s] since contact."""
-    return sum(reference[:, k] * time ** (k + 1) for k in range(reference.shape[1]))
+    bend, time = settings["reference"], ca.fmin(time, settings["reference_until"])
+    return sum(bend[:, k] * time ** (k + 1) for k in range(bend.shape[1]))
 
 
 def cuts(freezes: int) -> list[float]:
@@ -107,8 +110,7 @@ class Course:
         """The stretches, in order; `inputs` are q, v, feedforward and settings by name."""
         q, v = inputs["q"], inputs["v"]
         inputs = inputs | {"joint_velocity": v[-self.frozen.robot.n :]}
-        reference = inputs.get("reference")
-        data = relative_to(reference, 0.0, inputs | self._frozen(q, v, inputs["normal"], target_yield))
+        data = relative_to(inputs, 0.0, inputs | self._frozen(q, v, inputs["normal"], target_yield))
         if not self.freezes:
             return [self._stretch(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0)]
         n = self.model.n
@@ -127,11 +129,11 @@ class Course:
                 q, v = stretches[-1].q_after(), stretches[-1].v_after()
             frozen_at = q_middle
             data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], GIVES_WAY)
-            data = relative_to(reference, duration * (a + b) / 2, data)
+            data = relative_to(inputs, duration * (a + b) / 2, data)
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             data["velocity_before"] = (v - inputs["v"])[-n:]
-            if reference is not None:
-                data["reference_before"] = _gained(reference, duration * a)
+            if "reference" in inputs:
+                data["reference_before"] = _gained(inputs, duration * a)
                 data["velocity_before"] -= data["reference_before"]
             # no stretch begins after separation
             length = self.horizon - duration * a if last else duration * (b - a)

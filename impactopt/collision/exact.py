@@ -91,8 +91,7 @@ class ExactCollision:
         data |= {"q": q, "v": v, "joint_velocity": v[-collision.robot.n :], **values}
         if collision.terms.feedforward:
             data["feedforward"] = torque
-        reference = values.get("reference")
-        data = relative_to(None if reference is None else ca.DM(reference), 0.0, data)
+        data = relative_to({name: ca.DM(x) for name, x in values.items()}, 0.0, data)
         numbers = {name: _array(data[name]) for name in model.data}
         path = exact_path(Pieces(model, numbers), collision.horizon, collision.step_length)
         return self._result({name: ca.DM(x) for name, x in data.items()}, path)

@@ -94,7 +94,7 @@ class JointSpaceModel:
             out["joint_velocity"] = (n, 1)
         if self.terms.feedforward:
             out["feedforward"] = (n, 1)
-        no_data = ("normal", "reference")
+        no_data = ("normal", "reference", "reference_until")
         return out | {name: shape_of(v) for name, v in self.settings.items() if name not in no_data}
 
     def symbols(self, kind: Any = ca.SX) -> dict[str, Any]:

@@ -66,7 +66,7 @@ class ReferenceModel(CollisionModel):
         """One collision, in numbers, as of `CollisionModel.collide`.
 
         `overrides` are normal, contact_<number of the law>, target_<number of the target>, kp, kd,
-        torque_limit, reference, and with friction viscous, coulomb.
+        torque_limit, reference, reference_until, and with friction viscous, coulomb.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class ReferenceModel(CollisionModel):
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:
         terms = Terms(friction=self.friction is not None)
         servo = servo_settings(self.robot, terms, self._friction, kp, kd)
-        servo |= {"reference": no_bend(self.robot.n)}  # with friction too
+        servo |= no_bend(self.robot.n)  # with friction too
         return Settings(self.law, self.target, np.asarray(self.normal), servo)
 
     @property
@@ -170,6 +170,7 @@ class ReferenceModel(CollisionModel):
             feedforward=check_array("torque [N m]", torque, (n,)),
             velocity=v[-n:],
             reference=values["reference"],
+            reference_until=float(values["reference_until"]),
         )
         return forces, values["normal"]
 

@@ -14,23 +14,31 @@ __all__ = ["coasting_reference"]
 Array = NDArray[np.float64]
 _NODES = 3 * REFERENCE_ORDER
 _SHORTEST = 1e-3  # [s]
+_SHORTER = 0.9
+_OFF = 1e-4  # [rad/s] of a fit that is good
 
 
 def coasting_reference(
     coordinates: StanceCoordinates, q: ArrayLike, v: ArrayLike, *, until: float = 0.1
-) -> NDArray[np.float64]:
-    """The setting `reference` (n, 6) [rad/s^(k + 1)] of a collision whose reference keeps the soles in place.
+) -> dict[str, NDArray[np.float64]]:
+    """The settings of a collision whose servo's reference keeps the soles in place.
 
     A plan's reference goes on in contact at the rates ydot of its independent coordinates: the base's pose
     and the joints outside the legs. So the legs' joint velocities change, as the soles stay where they are.
-    What they gain is fitted by t, t^2, ... t^6, exact in the acceleration at contact, and else best at all
-    times up to `until` [s], which should be beyond separation; sooner, where the legs end before.
+    What they gain is fitted by t, t^2, ... t^10, exact in the acceleration at contact, and else best at all
+    times up to one between `until` and half of it: the longest for which the fit is within 1e-4 rad/s, as
+    legs that are all but straight soon ask for velocities without end. What they reach for less, bends less
+    long.
 
     Parameters
     ----------
     coordinates : where the soles are held, such as `ImpactProblem.coordinates`.
     q, v : (nq), (nv) at contact, Pinocchio's, with the soles in place and at rest.
-    until : [s] since contact.
+    until : [s] since contact; twice as long as that lasts is good.
+
+    Returns
+    -------
+    reference (n, 10) [rad/s^(k + 1)], reference_until [s] : by name, as `collide` takes them.
 
     Raises
     ------
@@ -43,22 +51,26 @@ def coasting_reference(
     if not c.legs:
         return no_bend(robot.n)
     y, legs = c.split(q)
-    rates, none = _rates(c, y, v), np.zeros(c.ny)
-    _, start, bend = c.complete_motion(y, rates, none, c.solve_legs(y, legs))
+    rates, shortest = _rates(c, y, v), until / 2
+    _, start, bend = c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))
+    orders = np.arange(2, REFERENCE_ORDER + 1)
     while True:
         # Chebyshev's nodes: a fit at them is nearly the best at all times
         times = until * (1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2
         try:
-            gained = [_at(c, y + rates * t, rates, legs)[-robot.n :] - start[-robot.n :] for t in times]
-            break
+            there = np.array([_at(c, y + rates * t, rates, legs) for t in times])
         except InputError:
             if until < _SHORTEST:
                 raise
-            until *= 0.7
-    share = (times / until)[:, None] ** np.arange(2, REFERENCE_ORDER + 1)
-    left = np.array(gained) - times[:, None] * bend[-robot.n :]
-    fitted = np.linalg.lstsq(share, left, rcond=None)[0].T
-    return np.column_stack([bend[-robot.n :], fitted / until ** np.arange(2, REFERENCE_ORDER + 1)])
+        else:
+            left = (there - start - np.outer(times, bend))[:, -robot.n :]
+            share = (times / until)[:, None] ** orders
+            fitted = np.linalg.lstsq(share, left, rcond=None)[0]
+            if np.abs(share @ fitted - left).max() < _OFF or until * _SHORTER < shortest:
+                break
+        until *= _SHORTER
+    reference = np.column_stack([bend[-robot.n :], fitted.T / until**orders])
+    return {"reference": reference, "reference_until": np.array(until)}
 
 
 def _rates(c: StanceCoordinates, y: Array, v: Array) -> Array:

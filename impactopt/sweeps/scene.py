@@ -116,8 +116,7 @@ class Scene:
         settings = {
             name: x[good] if len(x) == count else x for name, x in self._settings(numbers, count).items()
         }
-        if states.reference is not None:
-            settings["reference"] = states.reference
+        settings |= states.bend
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
         given = {name: x for name, x in settings.items() if name in known}

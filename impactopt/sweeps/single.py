@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,9 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
     InputError : a value that the problem file or [at_contact] refuses.
     """
     section, content = check_at_contact(at_contact, str(file.path)), file.content
+    record = None if section.result is None else load_record(section.result)
+    if record is not None and "horizon" not in section.model_fields_set:
+        section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})
     robot = content.make_robot(file.path.parent)
     stance, striker = content.make_stance(robot), content.problem.striker
     states = ContactStates(
@@ -130,13 +134,18 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
     numbers = {name: float(measure.of(blow)[0]) for name, measure in there.items()}
     target = {_with_unit(name): x for name, x in collision.target_result.items()}
     found = {**told, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
-    return plain(found | (_saved(file, section) if section.result is not None else {}))
+    return plain(found | ({} if record is None else _saved(file, section, record)))
 
 
-def _saved(file: ProblemFile, section: AtContact) -> dict[str, Any]:
+def _horizon(record: Record, usual: float) -> float:
+    """[s] by which a saved contact is over by any model: in steps, as each makes functions of its own."""
+    lasts = float(record.arrays["collision_time"][-1]) if "collision_time" in record.arrays else 0.0
+    return usual * max(1, ceil(1.5 * lasts / usual))
+
+
+def _saved(file: ProblemFile, section: AtContact, record: Record) -> dict[str, Any]:
     """What stands beside a collision that is the saved one."""
     given = section.model_fields_set - {"result", "model", "freezes", "horizon"}
-    record = load_record(str(section.result))
     # of another blow they would mislead
     same = record.problem and parse_problem_file(record.problem, file.path).data == file.data
     saved = planned_numbers(record) if same and not given else {}
@@ -174,8 +183,7 @@ def _collide(model: CollisionModel, rows: States, section: AtContact) -> Collisi
         "kd": robot.kd * section.kd_scale,
         "torque_limit": robot.torque_limit * section.torque_limit_scale,
     }
-    if rows.reference is not None:
-        settings["reference"] = rows.reference[0]
+    settings |= {name: x[0] for name, x in rows.bend.items()}
     # a point mass has no servo, and the paper's SDC no stiffness
     known = getattr(model, "settings", settings)
     given = {name: x for name, x in settings.items() if name in known}

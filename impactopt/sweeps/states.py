@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Reasons = NDArray[np.object_]
 
 _BLOCK = 256  # states a call of a compiled function
-_UNTIL = 2.0  # of a planned contact: how long its reference is known, for other targets too
+_UNTIL = 2.1  # of a planned contact: how long its reference is known, for other targets too
 _LONG = 0.1  # [s] likewise, where a record does not say
 _OFF = 1e-6  # [m/s] at 1 m/s, across what can be moved
 
@@ -38,7 +38,7 @@ _OFF = 1e-6  # [m/s] at 1 m/s, across what can be moved
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
     """Where rows start from: q (nq,); of a saved result also its velocity v (nv,), torque (n,) [N m] and how
-    its servo's reference bends, the setting `reference` (n, k).
+    its servo's reference bends, the settings of `coasting_reference`.
 
     polygon (k, 2) [m] : support polygon; without corners on a fixed base.
     """
@@ -47,14 +47,14 @@ class Posture:
     polygon: Array
     v: Array | None = None
     torque: Array | None = None
-    reference: Array | None = None
+    bend: Mapping[str, Array] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States:
     """Of N rows q (N, nq), v (N, nv), torque (N, n) [N m], the striking point's speed along the normal (N)
     [m/s], the effective mass there (N) [kg], and why a row is impossible, "" where it is not; of a result
-    also the setting `reference` (N, n, k)."""
+    also the settings `reference` (N, n, k) and `reference_until` (N)."""
 
     q: Array
     v: Array
@@ -63,6 +63,14 @@ class States:
     mass: Array
     reason: Reasons
     reference: Array | None = None
+    reference_until: Array | None = None
+
+    @property
+    def bend(self) -> dict[str, Array]:
+        """Settings of the servo's reference, a row each; none of a posture."""
+        if self.reference is None or self.reference_until is None:
+            return {}
+        return {"reference": self.reference, "reference_until": self.reference_until}
 
     def some(self, rows: NDArray[np.intp]) -> States:
         """Of these rows alone."""
@@ -124,7 +132,7 @@ class ContactStates:
         coordinates = StanceCoordinates(robot, self.stance.soles(robot), q)
         bend = None if v is None else coasting_reference(coordinates, q, v, until=lasts)
         polygon = support_polygon(robot, coordinates)
-        return Posture(q=q, v=v, torque=torque, reference=bend, polygon=polygon)
+        return Posture(q=q, v=v, torque=torque, bend=bend, polygon=polygon)
 
     def _of_result(self, result: str) -> tuple[Array, Array, Array, float]:
         """q, v, torque, and for how long [s] the reference is to be known."""
@@ -198,10 +206,12 @@ class ContactStates:
         over = np.abs(v[:, nv - robot.n :]) > robot.velocity_limit * (1 + 1e-9)
         for k in np.flatnonzero(over.any(axis=0)):
             _say(reasons, over[:, k], f"{robot.joint_names[k]} would be faster than its limit")
-        reference = posture.reference
-        if reference is not None:  # the same way, in less time
+        bend: dict[str, Any] = {}
+        if posture.bend is not None:  # the same way, in less time
+            reference = posture.bend["reference"]
             powers = np.arange(2, reference.shape[1] + 2)
-            reference = reference * factor[:, None, None] ** powers
+            bend["reference"] = reference * factor[:, None, None] ** powers
+            bend["reference_until"] = posture.bend["reference_until"] / factor
         return States(
             q=q[back],
             v=v,
@@ -209,7 +219,7 @@ class ContactStates:
             speed=own[back] * factor,
             mass=mass[back],
             reason=reasons,
-            reference=reference,
+            **bend,
         )
 
     def _mobility(self, name: str, q: Array) -> tuple[Array, Array, Array]:

@@ -48,13 +48,15 @@ static void load_data(const double **arg, Data *d) {
    collision/course.py */
 static void follow(const double **arg, double time, double begin, Work *w) {
 #if REFERENCE
-  const double *given = arg[ARG_reference];
+  const double *given = arg[ARG_reference], until = arg[ARG_reference_until] ? *arg[ARG_reference_until] : 0.0;
   double bend[N1], led[N1];
+  const int bends = time < until;
+  begin = fmin(begin, until);
   FOR(j, N) {
     bend[j] = led[j] = 0.0;
     for (int k = REFERENCE - 1; k >= 0; k--) {
       const double x = given ? given[N * k + j] : 0.0;
-      bend[j] = bend[j] * time + (k + 1) * x;
+      bend[j] = bend[j] * time + (bends ? (k + 1) * x : 0.0);
       led[j] = (led[j] + x) * begin;
     }
   }

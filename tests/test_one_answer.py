@@ -29,6 +29,7 @@ from impactopt.output import load_record, record_of, record_of_strike, save_reco
 from impactopt.problem_file import read_problem_file
 from impactopt.reference import FullDynamics, MujocoDynamics
 from impactopt.sweeps.single import collide_once, problem_of_result
+from impactopt.sweeps.states import ContactStates, Posture
 from impactopt.validation import scene_of, simulate_pinocchio
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -319,6 +320,31 @@ def test_what_is_left_is_the_models_own(kind: str, tmp_path: Path, punch: Soluti
     assert np.abs(moved).max() < 2e-3
     force = np.interp(hit.time[1:][at], full.time, full.force)
     assert np.abs(hit.force[1:][at] - force).max() < 5e-3 * full.peak_force
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_a_slower_result_bends_the_same_way(tmp_path: Path, punch: Solution) -> None:
+    problem, ref = punch.problem, punch.trajectory
+    save_record(record_of(punch), tmp_path)
+    states = ContactStates(
+        robot=problem.robot,
+        striker=problem.striker,
+        stance=problem.stance,
+        start=problem.start_posture,
+        folder=tmp_path,
+    )
+    posture = states.posture("reach", str(tmp_path), tuple(problem.point))
+    assert isinstance(posture, Posture) and posture.v is not None
+    whole = states.rows(posture, {}, None, problem.normal, 1)
+    rows = states.rows(posture, {}, 0.8 * whole.speed, problem.normal, 1)
+    c, last = problem.coordinates, int(np.flatnonzero(ref.phase == 0)[-1])
+    anew = coasting_reference(c, ref.q[last], 0.8 * ref.v[last], until=2 * punch.plan.collision.time[-1])
+    time = np.linspace(0, 0.05, 6)[:, None, None]
+    orders = np.arange(1, REFERENCE_ORDER + 1)
+    gained, again = ((x * time**orders).sum(axis=2) for x in (rows.bend["reference"][0], anew["reference"]))
+    np.testing.assert_allclose(gained, again, atol=2e-4)  # of two fits
+    assert np.abs(again).max() > 0.1 and rows.bend["reference_until"][0] > 0.05
+    assert states.posture("half_sitting", None, tuple(problem.point)).bend is None  # type: ignore[union-attr]
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -28,6 +28,10 @@ __all__ = ["collide_once", "planned_numbers", "problem_of_result"]
 Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
+_STAYS = (
+    "by this model the contact of the result does not end: its freezes go by the duration that the first one "
+    "predicts, which is far too short here; take the full dynamics (--model full)"
+)
 # what of a model's difference from the plan is the model's
 _OWN_ERRORS = {
     "sdc": "H, J, the bias and the acceleration of the servo's reference are frozen {}; what it differs by "
@@ -120,7 +124,8 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
         return {**told, "reason": str(rows.reason[0])}
     collision = _collide(model, rows, section)
     if not collision.separated:
-        return {**told, "reason": NOT_ENDED}
+        own = record is not None and section.model == "sdc"
+        return {**told, "reason": _STAYS if own else NOT_ENDED}
     found: dict[str, Any] = {name: _row(getattr(collision, name)) for name in _OUTPUTS}
     limit = robot.torque_limit * section.torque_limit_scale
     blow = Blow(

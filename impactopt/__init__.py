@@ -77,6 +77,7 @@ _EXPORTS = {
     "VirtualMass": "collision",
     "animate": "report",
     "arm7": "presets",
+    "coasting_reference": "reference.coasting",
     "collide_many": "sweeps.collisions",
     "draw_conditions": "robustness",
     "drive_nail": "blows",

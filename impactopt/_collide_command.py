@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from impactopt._command_options import AsJson, Quiet, Settings, Verbose, check_l
 from impactopt.plain_errors import plain_errors
 
 NO_COLLISION = 1  # exit code
+OFTEN = 16  # freezes of a saved result: a plan's contacts are long
 
 
 class Model(str, enum.Enum):
@@ -48,6 +49,12 @@ def collide(
         typer.Option(metavar="NAME", help="Of the robot; left out: a reach to the problem's point."),
     ] = None,
     model: Annotated[Model, typer.Option(help="Of the collision.")] = Model.sdc,
+    freezes: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=0, help=f"Of the sdc, on the way; left out: {OFTEN} of a result, else none."
+        ),
+    ] = None,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -56,8 +63,10 @@ def collide(
     """Let the robot hit at a posture, or as a saved plan or strike does: the collision alone, no motion.
 
     Impulse, peak force, duration, ZMP margin and torques. With a posture, the striking point moves along the
-    normal at --speed with the least kinetic energy, soles at rest. Exit code: 0 done, 1 there is no such
-    collision (out of reach, beyond a limit, no separation), 2 bad input.
+    normal at --speed with the least kinetic energy, soles at rest, and the servo's reference keeps the joint
+    velocities. A result has a reference of its own, whose soles stay in place, and its numbers stand beside
+    the model's. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a limit, no
+    separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.problem_file import parse_settings, read_problem_file
@@ -72,7 +81,10 @@ def collide(
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
         read = problem_of_result(what).changed(changes) if saved else read_problem_file(what, changes)
-        at_contact = {"model": _MODELS[model]}
+        at_contact: dict[str, Any] = {"model": _MODELS[model]}
+        if freezes is None and saved and model is Model.sdc:
+            freezes = OFTEN
+        at_contact |= {} if freezes is None else {"freezes": freezes}
         at_contact |= {"result": str(what.resolve())} if saved else {}
         at_contact |= {} if posture is None else {"posture": posture}
         with Progress(console, quiet=quiet) as progress:

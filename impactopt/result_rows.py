@@ -86,9 +86,10 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
 
 
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
-    """One collision; `found` as in `impactopt collide --json`."""
+    """One collision, and what a saved result says of it; `found` as in `impactopt collide --json`."""
+    sources = [found, *(found.get("saved") or {}).values()]
     rows = [
-        number_row(label, [found.get(key)], digits, scale=scale, least=least, most=most)
+        number_row(label, [x.get(key) for x in sources], digits, scale=scale, least=least, most=most)
         for label, key, digits, scale, least, most in (
             ("hand speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
             ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
@@ -102,7 +103,8 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
             ("joint speed / limit", "velocity_ratio", 2, 1.0, 0.0, 1.0),
         )
     ]
-    return [row for row in (*rows, *_target_rows([found["target"]])) if row is not None]
+    rows += _target_rows([source.get("target") or {} for source in sources])
+    return [row for row in rows if row is not None]
 
 
 def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:

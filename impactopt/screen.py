@@ -108,10 +108,14 @@ def strike_table(summary: Mapping[str, Any]) -> Table:
 
 
 def collision_table(found: Mapping[str, Any]) -> Table:
-    """One collision; `found` as in `impactopt collide --json`."""
-    table = Table(title=escape(f"{found['problem']}: {found['model']}"), title_justify="left")
+    """One collision, beside what a saved result says of it; `found` as in `impactopt collide --json`."""
+    model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
+    table = Table(title=escape(f"{found['problem']}: {model}"), title_justify="left")
+    if "believe" in found:
+        table.caption, table.caption_justify = escape(f"{found['model']}: {found['believe']}"), "left"
     table.add_column("")
-    table.add_column("collision", justify="right")
+    for name in ("collision", *(found.get("saved") or {})):
+        table.add_column(name, justify="right")
     for row in collision_rows(found):
         _add(table, row)
     return table

@@ -92,7 +92,12 @@ def situation(name: str, model: Any, *, seed: int = 0, speed: float = 1.5) -> li
 
 
 def inputs(model: Any, q: Any, v: Any, torque: Any) -> list[Any]:
-    return [q, v, *([torque] if model.terms.feedforward else []), *model.settings.values()]
+    values = dict(model.settings)
+    if "reference" in values:  # a servo whose reference bends, by some rad/s in 20 ms
+        random = np.random.default_rng(7).normal(size=values["reference"].shape)
+        values["reference_until"] = np.array(0.02)
+        values["reference"] = 0.5 * random * 50.0 ** np.arange(1, random.shape[1] + 1)
+    return [q, v, *([torque] if model.terms.feedforward else []), *values.values()]
 
 
 def native(model: Any, outputs: tuple[str, ...], every: int = 1) -> Any:

@@ -198,7 +198,7 @@ def _settings(model: SymbolicModel, settings: Mapping[str, Any], count: int) -> 
         if np.ndim(given) > usual.ndim:
             value = check_array(name, given, (count, *usual.shape), finite=name != "torque_limit")
             # ranges are intervals: if least and largest are in it, all are
-            whole = name == "normal" or usual.ndim == 2
+            whole = name == "normal" or (name in ("kp", "kd") and usual.ndim == 2)
             for one in value if whole else (value.min(axis=0), value.max(axis=0)):
                 model.settings.override({name: one})
             capped = np.minimum(value, NO_LIMIT) if name == "torque_limit" else value

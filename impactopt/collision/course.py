@@ -5,11 +5,15 @@ course is cut into N stretches of T / N (shorter ones first are no better). Each
 *middle*, which the freeze before it predicts. The prediction's error is of second order in the stretch's
 length, and so is that of a coefficient frozen in the middle: the course converges to full dynamics with
 1/N^2.
+
+A servo's reference whose joint velocities are not constant, as legs that stay closed have them, is known
+before the blow. Its acceleration is frozen like all else, and the velocities u of the joint-space model are
+then those relative to it: du/dt = A tau - s f + d - phiddot_ref.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -20,7 +24,7 @@ from .frozen import FrozenDynamics
 from .loop import run
 from .model import JointSpaceModel
 
-__all__ = ["GIVES_WAY", "Course", "Stretch", "cuts"]
+__all__ = ["GIVES_WAY", "Course", "Stretch", "cuts", "relative_to"]
 
 # [1/kg] of a target that takes no impulse: drifts are frozen at the velocity given, see frozen.py
 GIVES_WAY = 1e30
@@ -45,6 +49,24 @@ class Stretch:
     states: Any
     v_after: Callable[[], Any]
     q_after: Callable[[], Any]
+
+
+def relative_to(settings: Mapping[str, Any], time: Any, data: dict[str, Any]) -> dict[str, Any]:
+    """Frozen data with the drift d relative to the servo's reference, whose acceleration is frozen at a time
+    [s] since contact; `settings` with `reference` (n, k) and `reference_until`, or without: it keeps its
+    joint velocities."""
+    if "reference" not in settings:
+        return data
+    bend, until = settings["reference"], settings["reference_until"]
+    orders, bends = range(1, bend.shape[1] + 1), until > time
+    acceleration = bends * sum(k * bend[:, k - 1] * time ** (k - 1) for k in orders)
+    return data | {"d": data["d"] - acceleration, "reference_acceleration": acceleration}
+
+
+def _gained(settings: Mapping[str, Any], time: Any) -> Any:
+    """What the reference's joint velocities (n) [rad/s] have gained by a time [s] since contact."""
+    bend, time = settings["reference"], ca.fmin(time, settings["reference_until"])
+    return sum(bend[:, k] * time ** (k + 1) for k in range(bend.shape[1]))
 
 
 def cuts(freezes: int) -> list[float]:
@@ -88,7 +110,7 @@ class Course:
         """The stretches, in order; `inputs` are q, v, feedforward and settings by name."""
         q, v = inputs["q"], inputs["v"]
         inputs = inputs | {"joint_velocity": v[-self.frozen.robot.n :]}
-        data = inputs | self._frozen(q, v, inputs["normal"], target_yield)
+        data = relative_to(inputs, 0.0, inputs | self._frozen(q, v, inputs["normal"], target_yield))
         if not self.freezes:
             return [self._stretch(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0)]
         n = self.model.n
@@ -107,8 +129,12 @@ class Course:
                 q, v = stretches[-1].q_after(), stretches[-1].v_after()
             frozen_at = q_middle
             data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], GIVES_WAY)
+            data = relative_to(inputs, duration * (a + b) / 2, data)
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             data["velocity_before"] = (v - inputs["v"])[-n:]
+            if "reference" in inputs:
+                data["reference_before"] = _gained(inputs, duration * a)
+                data["velocity_before"] -= data["reference_before"]
             # no stretch begins after separation
             length = self.horizon - duration * a if last else duration * (b - a)
             data["until"] = ca.if_else(contact, length, -1.0)

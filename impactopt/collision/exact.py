@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from .bernstein import bernstein_matrix, first_negative, largest
-from .course import Stretch
+from .course import Stretch, relative_to
 from .graph import frozen_dynamics, joint_space_model, target_yield
 from .linear_contact import force_coefficients, target_pieces
 from .outputs import Outputs, frozen_for
@@ -91,6 +91,7 @@ class ExactCollision:
         data |= {"q": q, "v": v, "joint_velocity": v[-collision.robot.n :], **values}
         if collision.terms.feedforward:
             data["feedforward"] = torque
+        data = relative_to({name: ca.DM(x) for name, x in values.items()}, 0.0, data)
         numbers = {name: _array(data[name]) for name in model.data}
         path = exact_path(Pieces(model, numbers), collision.horizon, collision.step_length)
         return self._result({name: ca.DM(x) for name, x in data.items()}, path)

@@ -20,8 +20,9 @@ __all__ = ["CollisionModel"]
 class CollisionModel(ABC):
     """A robot hits a target: what both do from contact to separation.
 
-    The servo holds on to a reference that coasts at the joint velocity at contact; the collision ends at
-    separation, for good.
+    The servo holds on to a reference that coasts at the joint velocity at contact, unless the setting
+    `reference` bends it. Legs that move would not stay closed; what a plan's reference does, whose soles stay
+    where they are, is `impactopt.coasting_reference`. The collision ends at separation, for good.
 
     Attributes
     ----------

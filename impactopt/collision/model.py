@@ -94,7 +94,8 @@ class JointSpaceModel:
             out["joint_velocity"] = (n, 1)
         if self.terms.feedforward:
             out["feedforward"] = (n, 1)
-        return out | {name: shape_of(v) for name, v in self.settings.items() if name != "normal"}
+        no_data = ("normal", "reference", "reference_until")
+        return out | {name: shape_of(v) for name, v in self.settings.items() if name not in no_data}
 
     def symbols(self, kind: Any = ca.SX) -> dict[str, Any]:
         """A symbol for each of the data."""
@@ -125,7 +126,8 @@ class JointSpaceModel:
 
     # ------------------------------------------------------------ one instant, or several: one a column of y
     def velocity_change(self, y: Any, data: dict[str, Any]) -> Any:
-        """Joint velocities less those at contact (n) [rad/s]: integral of eq. (9)."""
+        """Joint velocities less those of the servo's reference (n) [rad/s]: integral of eq. (9). It keeps
+        those at contact, unless d is relative to another (course.py)."""
         u = self.velocity_from(self.part(y, "torque"), self.part(y, "impulse"), self.part(y, "time"), data)
         return u + _spread(data["velocity_before"], u) if self.refrozen else u
 

@@ -203,7 +203,11 @@ class Instants:
     @cached_property
     def joint_velocity(self) -> Any:
         change = self._joint_change
-        return ca.repmat(self._v[-self._model.n :], 1, change.size2()) + change
+        start = self._v[-self._model.n :] + self._data.get("reference_before", 0.0)
+        velocity = ca.repmat(start, 1, change.size2()) + change
+        if "reference_acceleration" not in self._data:
+            return velocity
+        return velocity + ca.mtimes(self._data["reference_acceleration"], self._row("time"))
 
     @cached_property
     def demand(self) -> Any:

@@ -13,12 +13,18 @@ from ..errors import InputError, check_array, check_direction, did_you_mean
 from ..robot import Robot
 from .terms import JointFriction, Terms
 
-__all__ = ["Settings", "servo_settings"]
+__all__ = ["REFERENCE_ORDER", "Settings", "no_bend", "servo_settings"]
 
 Array = NDArray[np.float64]
 
 # name: whether it has to be positive, or may be zero too
 _SIGN = {"kp": ">= 0", "kd": ">= 0", "torque_limit": "> 0", "viscous": ">= 0", "coulomb": ">= 0"}
+_SIGN |= {"reference_until": "> 0"}
+
+
+_FOR_EVER = 1e6  # [s]
+# the highest power of time in what bends the servo's reference
+REFERENCE_ORDER = 10
 
 
 # infinity would make 0 x infinity out of a limit that is not reached
@@ -30,7 +36,10 @@ class Settings(Mapping[str, Array]):
 
     normal (3); contact_<number of the law>; target_<number of the target>; and with a servo
     (`servo_settings`) kd; kp with servo stiffness; torque_limit (n) with saturation; viscous, coulomb (n)
-    with friction. kp and kd are (n), or (n, n) where the model was given matrices.
+    with friction. kp and kd are (n), or (n, n) where the model was given matrices. With dJ/dt v, and without
+    friction, reference (n, 10) [rad/s^(k + 1)]: what the joint velocities of the servo's reference gain, of
+    t^k in column k - 1, and reference_until [s], after which they gain no more; without them, the
+    reference keeps the joint velocities at contact.
     """
 
     def __init__(
@@ -112,7 +121,14 @@ def servo_settings(
         values["torque_limit"] = robot.torque_limit
     if terms.friction:
         values["viscous"], values["coulomb"] = friction.arrays(robot.n)
+    elif terms.jdot:  # what bends a reference is dJ/dt v; friction goes by velocities that are no differences
+        values |= no_bend(robot.n)
     return values
+
+
+def no_bend(n: int) -> dict[str, Array]:
+    """Settings `reference` (n, 10), `reference_until` of one that keeps the joint velocities at contact."""
+    return {"reference": np.zeros((n, REFERENCE_ORDER)), "reference_until": np.array(_FOR_EVER)}
 
 
 def _gain(name: str, given: ArrayLike | None, own: Array) -> Array:

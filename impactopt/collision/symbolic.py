@@ -160,7 +160,7 @@ class SymbolicModel(CollisionModel):
         """What stands against implicit steps, or nothing."""
         if not is_linear(self.law, self.target):
             return f"{type(self.law).__name__} and {type(self.target).__name__} are not linear between events"
-        if any(value.ndim == 2 for value in self.settings.values()):
+        if any(self.settings[name].ndim == 2 for name in {"kp", "kd"} & {*self.settings}):
             return "kp and kd have to be one number a joint"
         return "" if find_compiler() else "there is no C compiler"
 

@@ -19,7 +19,7 @@ class Terms:
     Attributes
     ----------
     stiffness : servo stiffness Kp (phi_ref - phi) (eq. 10); the reference coasts at the joint velocity at
-        contact.
+        contact, or as the setting `reference` bends it.
     feedforward : a feed-forward torque, an input of the functions, inside the saturation.
     saturation : the torque limits (eq. 12).
     friction : joint friction F (eqs. 5, 6), see `JointFriction`.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..collision.interface import CollisionModel
 from ..collision.result import Collision
-from ..collision.settings import Settings, servo_settings
+from ..collision.settings import Settings, no_bend, servo_settings
 from ..collision.terms import JointFriction, Terms
 from ..errors import InputError, check_array
 from ..robot import Robot
@@ -66,7 +66,7 @@ class ReferenceModel(CollisionModel):
         """One collision, in numbers, as of `CollisionModel.collide`.
 
         `overrides` are normal, contact_<number of the law>, target_<number of the target>, kp, kd,
-        torque_limit, and with friction viscous, coulomb.
+        torque_limit, reference, reference_until, and with friction viscous, coulomb.
 
         Raises
         ------
@@ -134,6 +134,7 @@ class ReferenceModel(CollisionModel):
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:
         terms = Terms(friction=self.friction is not None)
         servo = servo_settings(self.robot, terms, self._friction, kp, kd)
+        servo |= no_bend(self.robot.n)  # with friction too
         return Settings(self.law, self.target, np.asarray(self.normal), servo)
 
     @property
@@ -168,6 +169,8 @@ class ReferenceModel(CollisionModel):
             transition=self._friction.transition,
             feedforward=check_array("torque [N m]", torque, (n,)),
             velocity=v[-n:],
+            reference=values["reference"],
+            reference_until=float(values["reference_until"]),
         )
         return forces, values["normal"]
 

@@ -43,6 +43,7 @@ class Forces:
     limit : (n) [N m].
     viscous, coulomb, transition : joint friction, as of `JointFriction`.
     feedforward, velocity : (n) [N m]; (n) [rad/s] at contact, at which the reference coasts.
+    reference, reference_until : (n, k) [rad/s^(k + 1)]; [s], what its joint velocities gain; see `Settings`.
     """
 
     law: ContactLaw
@@ -57,12 +58,18 @@ class Forces:
     transition: float
     feedforward: Array
     velocity: Array
+    reference: Array
+    reference_until: float
 
     # ------------------------------------------------------------ joints
     def demand(self, time: float, moved: Array, velocity: Array) -> Array:
         """Torque (n) [N m] of the servo before saturation; `moved` are the angles (n) [rad] since contact."""
-        deviation = self.velocity * time - moved
-        return self.feedforward + _times(self.kp, deviation) + _times(self.kd, self.velocity - velocity)
+        t, powers = min(time, self.reference_until), np.arange(1, self.reference.shape[1] + 1)
+        gained = self.reference * t**powers
+        further = gained @ (t / (powers + 1) + (time - t))
+        behind = self.velocity + gained.sum(axis=1) - velocity
+        deviation = self.velocity * time + further - moved
+        return self.feedforward + _times(self.kp, deviation) + _times(self.kd, behind)
 
     def torque(self, demand: Array, phase: Phase) -> Array:
         return np.where(phase.saturated == 0, demand, phase.saturated * self.limit)

@@ -112,10 +112,11 @@ class Scene:
         good = np.flatnonzero(states.reason == "")
         if not good.size:
             return out
-        states = States(**{name: x[good] for name, x in vars(states).items()})
+        states = states.some(good)
         settings = {
             name: x[good] if len(x) == count else x for name, x in self._settings(numbers, count).items()
         }
+        settings |= states.bend
         # a point mass has no servo, and the paper's SDC no stiffness
         known = getattr(model, "settings", settings)
         given = {name: x for name, x in settings.items() if name in known}

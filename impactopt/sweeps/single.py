@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,34 @@ from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact.targets import UNITS
 from impactopt.errors import InputError
-from impactopt.output import load_record, plain
+from impactopt.output import Record, load_record, plain
 from impactopt.problem_file import ProblemFile, parse_problem_file
 from impactopt.robot import Robot
+from impactopt.support import margin, zmp
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
 from impactopt.sweeps.measures import MEASURES, Blow
 from impactopt.sweeps.scene import NOT_ENDED
 from impactopt.sweeps.states import ContactStates, States
 
-__all__ = ["collide_once", "problem_of_result"]
+__all__ = ["collide_once", "planned_numbers", "problem_of_result"]
 
 Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
+_STAYS = (
+    "by this model the contact of the result does not end: its freezes go by the duration that the first one "
+    "predicts, which is far too short here; take the full dynamics (--model full)"
+)
+# what of a model's difference from the plan is the model's
+_OWN_ERRORS = {
+    "sdc": "H, J, the bias and the acceleration of the servo's reference are frozen {}; what it differs by "
+    "from the plan and its replays is its own error",
+    "paper's sdc": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: of ZMP, "
+    "forces on soles and torques believe the plan and its replays",
+    "virtual mass": "a point mass, which no servo pushes on: believe the plan and its replays",
+    "full dynamics": "nothing is frozen; it differs from the replay on held soles by their steps, and from "
+    "the plan by what that has between its collocation points",
+}
 
 
 def problem_of_result(result: Path) -> ProblemFile:
@@ -41,6 +57,34 @@ def problem_of_result(result: Path) -> ProblemFile:
     return parse_problem_file(record.problem, record.problem_path or result / "problem.toml")
 
 
+def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
+    """What a result says of its contact, by who says it: ``planned``, ``simulated`` on held soles, and ``free
+    soles``, as far as there are any; keys as of `collide_once`. The plan's are at its collocation points.
+    """
+    a, told = record.arrays, record.summary
+    if "collision_time" not in a:
+        return {}
+    torque, ground = a["collision_torque"], a["collision_ground"]
+    keys = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
+    planned = {key: told[key] for key in keys if key in told}
+    if len(torque) > 1:  # an impact without duration has neither
+        planned["torque_ratio"] = float(np.abs(torque / a["torque_limit"]).max())
+    if len(ground) and len(a["polygon"]):
+        planned["zmp_margin_m"] = float(margin(a["polygon"], zmp(ground)).min())
+        planned["sole_force_N"] = float(a["collision_sole_wrench"][:, 2::6].min())
+    out = {"planned": planned}
+    names = {"torque_ratio": "torque_ratio_by_phase", "zmp_margin_m": "zmp_margin_by_phase_m"}
+    for name, by_phase in (("simulated", {key: key for key in names}), ("replayed", names)):
+        report = told.get(name) or {}
+        numbers = {key: report[key] for key in keys if key in report}
+        for key, source in by_phase.items():
+            found = report.get(source) or {}
+            numbers |= {key: found["collision"]} if "collision" in found else {}
+        if numbers:
+            out["simulated" if name == "simulated" else "free soles"] = numbers
+    return out
+
+
 def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, Any]:
     """One collision of a problem's robot with its target, as plain numbers with units in their names.
 
@@ -48,19 +92,26 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
 
     Returns the measures of docs/sweeps.md; ``target``, what it says after the blow; ``joints``, the largest
     torque demand [N m] and the limit of each, hardest first; or ``reason``, why there is no such collision.
+    Of a result whose contact is as it was saved also ``saved`` (`planned_numbers`), and ``believe``: which of
+    its numbers and the model's are right where they differ.
 
     Raises
     ------
     InputError : a value that the problem file or [at_contact] refuses.
     """
     section, content = check_at_contact(at_contact, str(file.path)), file.content
+    record = None if section.result is None else load_record(section.result)
+    if record is not None and "horizon" not in section.model_fields_set:
+        section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})
     robot = content.make_robot(file.path.parent)
     stance, striker = content.make_stance(robot), content.problem.striker
     states = ContactStates(
         robot=robot, striker=striker, stance=stance, start=content.make_start(robot), folder=Path()
     )
     model = collision_model(content, robot, stance, section)
-    told = {"problem": content.problem.name or file.path.stem, "robot": robot.name, "model": section.model}
+    told: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
+    told |= {"model": section.model}
+    told |= {"freezes": section.freezes} if section.model == "sdc" else {}
     point = tuple(map(float, content.problem.point))
     posture = states.posture(section.posture, section.result, point)
     if isinstance(posture, str):
@@ -73,7 +124,8 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
         return {**told, "reason": str(rows.reason[0])}
     collision = _collide(model, rows, section)
     if not collision.separated:
-        return {**told, "reason": NOT_ENDED}
+        own = record is not None and section.model == "sdc"
+        return {**told, "reason": _STAYS if own else NOT_ENDED}
     found: dict[str, Any] = {name: _row(getattr(collision, name)) for name in _OUTPUTS}
     limit = robot.torque_limit * section.torque_limit_scale
     blow = Blow(
@@ -86,7 +138,26 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
     there = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
     numbers = {name: float(measure.of(blow)[0]) for name, measure in there.items()}
     target = {_with_unit(name): x for name, x in collision.target_result.items()}
-    return plain({**told, **numbers, "target": target, "joints": _joints(collision, robot, limit)})
+    found = {**told, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
+    return plain(found | ({} if record is None else _saved(file, section, record)))
+
+
+def _horizon(record: Record, usual: float) -> float:
+    """[s] by which a saved contact is over by any model: in steps, as each makes functions of its own."""
+    lasts = float(record.arrays["collision_time"][-1]) if "collision_time" in record.arrays else 0.0
+    return usual * max(1, ceil(1.5 * lasts / usual))
+
+
+def _saved(file: ProblemFile, section: AtContact, record: Record) -> dict[str, Any]:
+    """What stands beside a collision that is the saved one."""
+    given = section.model_fields_set - {"result", "model", "freezes", "horizon"}
+    # of another blow they would mislead
+    same = record.problem and parse_problem_file(record.problem, file.path).data == file.data
+    saved = planned_numbers(record) if same and not given else {}
+    if not saved:
+        return {}
+    often = f"at contact and {section.freezes} times on the way" if section.freezes else "at contact"
+    return {"saved": saved, "believe": _OWN_ERRORS[section.model].format(often)}
 
 
 def _joints(collision: Collision, robot: Robot, limit: Array) -> list[dict[str, Any]]:
@@ -117,6 +188,7 @@ def _collide(model: CollisionModel, rows: States, section: AtContact) -> Collisi
         "kd": robot.kd * section.kd_scale,
         "torque_limit": robot.torque_limit * section.torque_limit_scale,
     }
+    settings |= {name: x[0] for name, x in rows.bend.items()}
     # a point mass has no servo, and the paper's SDC no stiffness
     known = getattr(model, "settings", settings)
     given = {name: x for name, x in settings.items() if name in known}

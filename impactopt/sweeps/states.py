@@ -19,6 +19,7 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.nlp.batched import BatchedFunction
 from impactopt.output import load_record
 from impactopt.reach import reach
+from impactopt.reference import coasting_reference
 from impactopt.robot import Robot
 from impactopt.stance import Stance
 from impactopt.support import support_polygon
@@ -29,12 +30,15 @@ Array = NDArray[np.float64]
 Reasons = NDArray[np.object_]
 
 _BLOCK = 256  # states a call of a compiled function
+_UNTIL = 2.1  # of a planned contact: how long its reference is known, for other targets too
+_LONG = 0.1  # [s] likewise, where a record does not say
 _OFF = 1e-6  # [m/s] at 1 m/s, across what can be moved
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
-    """Where rows start from: q (nq,); of a saved result also its velocity v (nv,) and torque (n,) [N m].
+    """Where rows start from: q (nq,); of a saved result also its velocity v (nv,), torque (n,) [N m] and how
+    its servo's reference bends, the settings of `coasting_reference`.
 
     polygon (k, 2) [m] : support polygon; without corners on a fixed base.
     """
@@ -43,12 +47,14 @@ class Posture:
     polygon: Array
     v: Array | None = None
     torque: Array | None = None
+    bend: Mapping[str, Array] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States:
     """Of N rows q (N, nq), v (N, nv), torque (N, n) [N m], the striking point's speed along the normal (N)
-    [m/s], the effective mass there (N) [kg], and why a row is impossible, "" where it is not."""
+    [m/s], the effective mass there (N) [kg], and why a row is impossible, "" where it is not; of a result
+    also the settings `reference` (N, n, k) and `reference_until` (N)."""
 
     q: Array
     v: Array
@@ -56,6 +62,20 @@ class States:
     speed: Array
     mass: Array
     reason: Reasons
+    reference: Array | None = None
+    reference_until: Array | None = None
+
+    @property
+    def bend(self) -> dict[str, Array]:
+        """Settings of the servo's reference, a row each; none of a posture."""
+        if self.reference is None or self.reference_until is None:
+            return {}
+        return {"reference": self.reference, "reference_until": self.reference_until}
+
+    def some(self, rows: NDArray[np.intp]) -> States:
+        """Of these rows alone."""
+        kept: dict[str, Any] = {name: None if x is None else x[rows] for name, x in vars(self).items()}
+        return States(**kept)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,9 +117,9 @@ class ContactStates:
         return Posture(q=q, polygon=support_polygon(robot, coordinates))
 
     def _named(self, name: str, result: str | None) -> Posture:
-        robot, v, torque = self.robot, None, None
+        robot, v, torque, lasts = self.robot, None, None, _LONG
         if result is not None:
-            q, v, torque = self._of_result(result)
+            q, v, torque, lasts = self._of_result(result)
         elif name in robot.postures:
             q = robot.posture(name)
         else:
@@ -110,21 +130,26 @@ class ContactStates:
             )
         robot.check_stance(q, self.stance.sole_names(robot))
         coordinates = StanceCoordinates(robot, self.stance.soles(robot), q)
-        return Posture(q=q, v=v, torque=torque, polygon=support_polygon(robot, coordinates))
+        bend = None if v is None else coasting_reference(coordinates, q, v, until=lasts)
+        polygon = support_polygon(robot, coordinates)
+        return Posture(q=q, v=v, torque=torque, bend=bend, polygon=polygon)
 
-    def _of_result(self, result: str) -> tuple[Array, Array, Array]:
+    def _of_result(self, result: str) -> tuple[Array, Array, Array, float]:
+        """q, v, torque, and for how long [s] the reference is to be known."""
         record = load_record(self.folder / result)
         a = record.arrays
         if tuple(a["joints"]) != self.robot.joint_names:
             raise InputError(
                 f"[at_contact] result: {result} is of a robot with other joints than {self.robot.name}"
             )
+        lasts = _UNTIL * float(a["collision_time"][-1]) if "collision_time" in a else _LONG
+        lasts = max(lasts, _LONG / 2)
         if "strike_posture" in a:
-            return a["strike_posture"], a["strike_velocity"], a["strike_torque"]
+            return a["strike_posture"], a["strike_velocity"], a["strike_torque"], lasts
         if not record.completed:
             raise InputError(f"[at_contact] result: {result} has no motion; solve it again")
         last = int(np.flatnonzero(a["reference_phase"] == 0)[-1])  # the end of the swing
-        return a["reference_q"][last], a["reference_v"][last], a["reference_torque"][last]
+        return a["reference_q"][last], a["reference_v"][last], a["reference_torque"][last], lasts
 
     # ------------------------------------------------------------ rows
     def check_joint(self, name: str) -> None:
@@ -181,8 +206,20 @@ class ContactStates:
         over = np.abs(v[:, nv - robot.n :]) > robot.velocity_limit * (1 + 1e-9)
         for k in np.flatnonzero(over.any(axis=0)):
             _say(reasons, over[:, k], f"{robot.joint_names[k]} would be faster than its limit")
+        bend: dict[str, Any] = {}
+        if posture.bend is not None:  # the same way, in less time
+            reference = posture.bend["reference"]
+            powers = np.arange(2, reference.shape[1] + 2)
+            bend["reference"] = reference * factor[:, None, None] ** powers
+            bend["reference_until"] = posture.bend["reference_until"] / factor
         return States(
-            q=q[back], v=v, torque=torque, speed=own[back] * factor, mass=mass[back], reason=reasons
+            q=q[back],
+            v=v,
+            torque=torque,
+            speed=own[back] * factor,
+            mass=mass[back],
+            reason=reasons,
+            **bend,
         )
 
     def _mobility(self, name: str, q: Array) -> tuple[Array, Array, Array]:

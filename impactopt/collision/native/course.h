@@ -44,6 +44,28 @@ static void load_data(const double **arg, Data *d) {
   FOR(i, N_TARGET) load(arg[ARG_target + i], d->target + i, 1);
 }
 
+/* the servo's reference: frozen at a time since contact, and what its velocities had gained at the begin; see
+   collision/course.py */
+static void follow(const double **arg, double time, double begin, Work *w) {
+#if REFERENCE
+  const double *given = arg[ARG_reference], until = arg[ARG_reference_until] ? *arg[ARG_reference_until] : 0.0;
+  double bend[N1], led[N1];
+  const int bends = time < until;
+  begin = fmin(begin, until);
+  FOR(j, N) {
+    bend[j] = led[j] = 0.0;
+    for (int k = REFERENCE - 1; k >= 0; k--) {
+      const double x = given ? given[N * k + j] : 0.0;
+      bend[j] = bend[j] * time + (bends ? (k + 1) * x : 0.0);
+      led[j] = (led[j] + x) * begin;
+    }
+  }
+  pad(w->data.bend, V, bend, N, 0.0);
+  pad(w->data.led, V, led, N, 0.0);
+  FOR(i, V) w->frozen.drift[i] -= w->data.bend[i];
+#endif
+}
+
 static const double *filled(const double *given, double *room, int n) {
   if (given) return given;
   load(0, room, n);
@@ -82,6 +104,7 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   const Record *record = HISTORIES ? &recorded : 0;
   load_data(arg, d);
   freeze(q, v, normal, call(target_yield, d->target, 0, 0), F);
+  follow(arg, 0.0, 0.0, w);
   d->frozen = F;
   d->hand_speed = F->hand_speed;
   memset(&c->final, 0, sizeof c->final);
@@ -114,12 +137,16 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
       memcpy(c->v, v_then, sizeof c->v);
     }
     freeze(q_middle, v_middle, normal, GIVES_WAY, F);
+    follow(arg, duration * (ENDS[i] + ENDS[i + 1]) / 2, duration * ENDS[i], w);
     const double *in[] = {c->q, c->v, normal};
     double *out[] = {&d->hand_speed};
     hand_speed_at(in, out, 0, 0, 0);
     double before[NV];
     FOR(k, NV) before[k] = c->v[k] - v[k];
     pad(d->before, V, before + NV - N, N, 0.0);
+#if REFERENCE
+    FOR(k, V) d->before[k] -= d->led[k];
+#endif
     d->until = c->in_contact ? (last ? HORIZON - duration * ENDS[i] : duration * share) : -1.0;
     recorded.since = duration * ENDS[i];
     recorded.columns = N_COLUMNS[i];

@@ -11,6 +11,7 @@ typedef struct {
   const Frozen *frozen;
   double hand_speed, until;
   vec kept[V];          /* 1 at the joints, else 0 */
+  vec bend[V], led[V];  /* the servo's reference: its acceleration, and what its velocities had gained before */
   vec joint_velocity[V], before[V], feedforward[V], limit[V], viscous[V], coulomb[V];
 #if KD_MATRIX
   vec kd[N1][V];
@@ -53,7 +54,7 @@ INLINE void add_columns(const vec (*M)[V], int columns, const double *x, vec *a)
   FOR(i, V) a[i] += b[i];
 }
 
-/* u and the hand's speed, from integrals of torque and force, and time; or from derivatives of them */
+/* u, relative to the servo's reference, and the hand's speed, from integrals of torque and force, and time; or from derivatives of them */
 INLINE double velocity(const Data *d, const vec *torque, double impulse, double time, vec *u) {
   const Frozen *F = d->frozen;
   AFRESH(F);

@@ -39,8 +39,13 @@ static void write_column(const Data *d, const State *y, const Instant *now, cons
   if (out[OUT_target_speed]) *COLUMN_OF(target_speed, 1) = now->target_speed;
 #endif
 #ifdef OUT_joint_velocity
-  if (out[OUT_joint_velocity])
-    FOR(i, N) COLUMN_OF(joint_velocity, N)[i] = record->v[NV - N + i] + ((const double *)now->u)[i];
+  if (out[OUT_joint_velocity]) FOR(i, N) {
+    double *to = COLUMN_OF(joint_velocity, N) + i;
+    *to = record->v[NV - N + i] + ((const double *)now->u)[i];
+#if REFERENCE
+    *to += ((const double *)d->led)[i] + ((const double *)d->bend)[i] * y->time;
+#endif
+  }
 #endif
 #ifdef OUT_torque
   if (out[OUT_torque]) memcpy(COLUMN_OF(torque, N), now->torque, N * sizeof(double));

@@ -47,6 +47,9 @@ static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F
   vec velocity[N1][VD];
   memcpy(velocity, x->speeds, sizeof velocity);
   if (kind == BY_V) FOR(i, N) *lane(velocity[i], NV - N + i) += 1.0;
+#if REFERENCE
+  FOR(i, N) FOR_EACH(k) velocity[i][k] += ((const double *)d->bend)[i] * x->time[k];
+#endif
   PUT(joint_velocity, N, velocity);
 #endif
 #ifdef OUT_demand

@@ -134,6 +134,7 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "FEEDFORWARD": int(terms.feedforward and n > 0),
         "SATURATION": int(terms.saturation and n > 0),
         "FRICTION": int(terms.friction and n > 0),
+        "REFERENCE": settings["reference"].shape[1] if "reference" in settings else 0,
         "BIAS": int(terms.bias),
         "JDOT": int(terms.jdot),
         "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -60,8 +60,8 @@ class Margins:
     def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
         """A row that knows what it keeps apart exactly as it is at instant k, where the two are nearest.
 
-        Of the one link it takes a small sphere that touches its surface there, of the other body the plane that does.
-        more [m] : than the margin.
+        Of the one link it takes a small sphere that touches its surface there, of the other body the plane
+        that does.  more [m] : than the margin.
         """
         found, travel = self.bodies.closest(at, k, pair), float(at.travel[k])
         away = -found.normal  # from the other to the one
@@ -74,7 +74,7 @@ class Margins:
 
 @dataclass(frozen=True, kw_only=True)
 class Spots:
-    """The places of a program at solver variables: their names, instants [s] of them, and where bodies are."""
+    """The places of a program at solver variables: their names, their instants [s], and where bodies are."""
 
     names: tuple[str, ...]
     time: Array
@@ -127,11 +127,11 @@ class Violated(NamedTuple):
 
 
 def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
-    """What keeps apart all bodies that are too near, at the nodes of a solution or between them; None: none is.
+    """What keeps apart bodies that are too near, at the nodes of a solution or between them; None: none is.
 
-    Too near is what gives up more than a ``share`` of its margin by exact geometry. Rows that are there and do not
-    keep it, as spheres do not know all of a link, or as the motion leaves them between two nodes, are tightened by
-    what is missing.
+    Too near is what gives up more than a ``share`` of its margin by exact geometry. Rows that are there and
+    do not keep it, as spheres do not know all of a link, or as the motion leaves them between two nodes, are
+    tightened by what is missing.
     """
     plan, bodies = t.decode(x), margins.bodies
     spots, found, deepest = spots_of(t, x), dict[tuple[int, Pair], float](), -np.inf

@@ -47,8 +47,10 @@ class Trajectory:
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Where bodies are at k instants: time (k,) [s]; phase (k,): 0 before, 1 in, 2 after contact; q (k, nq) pin
-    configurations; travel (k,) [m] of the target along its normal.
+    """Where bodies are at k instants.
+
+    time (k,) [s].  phase (k,) : 0 before, 1 in, 2 after contact.  q (k, nq) : Pinocchio's configurations.
+    travel (k,) [m] : of the target along its normal.
     """
 
     time: Array

@@ -23,8 +23,8 @@ def vector(name: str, value: Sequence[float]) -> Vector:
 class TargetBody:
     """What the target looks like to everything but the striking point: its face's middle is the hit point.
 
-    shape : "box", "ball" or "none"; None: what fits the target, a box of 18 cm for a free mass, a wall of 1.5 x
-        1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x 6 cm.
+    shape : "box", "ball" or "none"; None: what fits the target, a box of 18 cm for a free mass, a wall of 1.5
+        x 1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x 6 cm.
     size [m] : (across, up, deep) of a box, of the board or of the nail's block; (diameter,) of a ball; None:
         those.
 
@@ -39,8 +39,8 @@ class TargetBody:
     def __post_init__(self) -> None:
         if self.shape is not None and self.shape not in TARGET_SHAPES:
             raise InputError(
-                f"TargetBody.shape is {self.shape!r}{did_you_mean(str(self.shape), TARGET_SHAPES)}; give one of "
-                f"{', '.join(TARGET_SHAPES)}"
+                f"TargetBody.shape is {self.shape!r}{did_you_mean(str(self.shape), TARGET_SHAPES)}; "
+                f"give one of {', '.join(TARGET_SHAPES)}"
             )
         if self.size is None:
             return

@@ -22,6 +22,7 @@ __all__ = ["Bodies", "Near", "Places", "Touch"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+GROUND = 0  # its place in the world
 MISSED = 3  # phase in which there is no target
 FAR = 1.0  # [m] no clearance beyond this is asked for
 _REQUEST = coal.DistanceRequest()
@@ -42,8 +43,8 @@ class Touch(NamedTuple):
 class Places:
     """Where the bodies are at k instants.
 
-    rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.  travel (k,) [m] : of the
-    target along its normal.  phase (k,) : 0 before, 1 in, 2 after contact.
+    rotation (k, joints, 3, 3), translation (k, joints, 3) [m] : of the model's joints.  travel (k,) [m] : of
+    the target along its normal.  phase (k,) : 0 before, 1 in, 2 after contact; 3: none.
     """
 
     rotation: Array
@@ -72,8 +73,8 @@ class Places:
 class Near:
     """What comes near: at instant ``at`` (m,), a sphere of the robot to another link or a body of the world.
 
-    sphere (m,) : its number.  joint (m,) : that moves it.  other (m,) : joint of the link; or -1 - the index of the
-    world's body.  gap (m,) [m] : between sphere and planes, < 0 if in each other.
+    sphere (m,) : its number.  joint (m,) : that moves it.  other (m,) : joint of the link; or -1 - the index
+    of the world's body.  gap (m,) [m] : between sphere and planes, < 0 if in each other.
     """
 
     at: Index
@@ -91,8 +92,8 @@ class Near:
 
 
 class Closest(NamedTuple):
-    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; and the direction
-    (3,) from the one to the other.
+    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; and the
+    direction (3,) from the one to the other.
     """
 
     distance: float
@@ -134,8 +135,8 @@ class Bodies:
                     continue
                 if (body.of_target or w) and self.exact(at, 0, (j, -1 - w)) < 0:
                     raise InputError(
-                        f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start from another "
-                        "posture, or move the body or make it smaller"
+                        f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start "
+                        "from another posture, or move the body or make it smaller"
                     )
                 if not w and self.exact(at, 0, (j, -1)) <= 0:
                     self.touching.append((self.links.name(j), body.name))
@@ -149,7 +150,7 @@ class Bodies:
 
     @cached_property
     def directed(self) -> dict[Pair, Pair]:
-        """Of each pair of joints whose spheres are held against whose planes: spheres of the one that they fit."""
+        """Of each pair of joints, whose spheres are held against whose planes: of the one they fit best."""
         out = self.links.out
         return {(a, b): (a, b) if out[a] <= out[b] else (b, a) for a, b in self.pairs}
 
@@ -228,7 +229,7 @@ class Bodies:
 
     # ------------------------------------------------------------------ exactly
     def exact(self, at: Places, k: int, pair: Pair) -> float:
-        """Distance [m] of a pair at instant k, of two joints; or of joint and a body of the world, -1 - its index."""
+        """Distance [m] at instant k of two joints, or of a joint and a body of the world, -1 - its index."""
         return self.closest(at, k, pair).distance
 
     def closest(self, at: Places, k: int, pair: Pair) -> Closest:
@@ -254,7 +255,7 @@ class Bodies:
         return transform(rotation, translation)
 
     def placement(self, at: Places, k: int, body: int) -> tuple[Array, Array]:
-        """Rotation (3, 3) and translation (3,) [m] of a joint, or of a body of the world as -1 - its index."""
+        """Rotation (3, 3) and translation (3,) [m] of a joint, or of a body of the world, -1 - its index."""
         if body >= 0:
             return at.rotation[k, body], at.translation[k, body]
         solid = self.world[-1 - body]
@@ -276,7 +277,7 @@ class Bodies:
         return (joint, other) if other < 0 or (joint, other) in self.pairs else (other, joint)
 
     def nearest(self, at: Places, within: float = 0.1) -> tuple[float, int, Pair | None]:
-        """The least exact distance [m] of any pair at any instant, when, and of which; FAR, 0, None beyond it."""
+        """The least exact distance [m] of any pair at any instant, when, and of which; else FAR, 0, None."""
         least, when, which = FAR, 0, None
         for bound, k, pair in self.lower_bounds(at, within):
             if bound - self._slack() >= least:

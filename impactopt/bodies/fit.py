@@ -1,7 +1,7 @@
 """Spheres that cover a convex hull, and planes that enclose it: what a plan's smooth rows know of bodies.
 
-A point x is at least max_i (n_i . x - h_i) from a body whose support function is h_i in the directions n_i, and a
-sphere that much less its radius. Inside the body that is how deep it is, so that rows show the way out.
+A point x is at least max_i (n_i . x - h_i) from a body whose support function is h_i in the directions n_i,
+and a sphere that much less its radius. Inside the body that is how deep it is, so that rows show the way out.
 """
 
 from __future__ import annotations
@@ -84,8 +84,9 @@ class Planes:
 def fill(hull: ConvexHull, points: Array) -> Spheres:
     """Spheres that cover surface points (m, 3) [m] in a hull, and stick out of it as little as may be.
 
-    A sphere about a point at depth a in a convex hull with the radius a + t sticks out by t. For a bound t a greedy
-    set cover takes those that cover most; the least t of a list that needs few enough of them is taken.
+    A sphere about a point at depth a in a convex hull with the radius a + t sticks out by t. For a bound t a
+    greedy set cover takes those that cover most; the least t of a list that needs few enough of them is
+    taken.
     """
     centres = _centres(hull)
     depth = _depth(hull, centres)
@@ -119,10 +120,10 @@ def fill(hull: ConvexHull, points: Array) -> Spheres:
 
 
 def enclose(vertices: Array, normals: Array, radius: float = 0.0) -> Planes:
-    """The planes about the hull of vertices (k, 3) [m], inflated by ``radius`` [m], that tell best how far it is.
+    """Planes about the hull of vertices (k, 3) [m], inflated by ``radius`` [m], that tell best how far it is.
 
-    normals (m, 3) : of its facets. Directions are taken one by one: that which mends most of what those before
-    it miss, at points about the body, where the least of all candidates misses is nothing.
+    normals (m, 3) : of its facets. Directions are taken one by one: that which mends most of what those
+    before it miss, at points about the body, against all directions together.
     """
     ways = np.concatenate([_rounded(normals), _sphere(SPREAD)])
     support = (ways @ vertices.T).max(axis=1)

@@ -119,7 +119,7 @@ def _without(whole: Any, part: Any) -> Any:
 
 
 def inertia_box(inertia: Any) -> Solid:
-    """The solid box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis, rounded."""
+    """The box of the same mass, centre and inertia, m (b^2 + c^2) / 12 about its first axis; rounded."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     squares = 6.0 / inertia.mass * (moments.sum() - 2 * moments)
     axes = axes if np.linalg.det(axes) > 0 else -axes

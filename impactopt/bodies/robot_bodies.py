@@ -131,7 +131,7 @@ def bodies_of(robot: Robot) -> RobotBodies:
 
 
 def _fitted(pieces: list[Piece]) -> tuple[Spheres, Planes]:
-    """Spheres over the surfaces of pieces, and planes about all of them; from disk if they were fitted before."""
+    """Spheres over the surfaces of pieces, and planes about all of them; from disk if they are there."""
     digest = hashlib.sha256(b"1")
     for piece in pieces:
         digest.update(np.round(piece.vertices, 9).tobytes())

@@ -30,11 +30,12 @@ NAIL_LENGTH, NAIL_RADIUS = 0.07, 0.004
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorldBody:
-    """A box with half sides ``half`` (3,) [m], inflated by ``radius`` [m], at ``place`` with axes ``rotation``.
+    """A box of half sides ``half`` (3,) [m], inflated by ``radius`` [m], at ``place``, axes ``rotation``.
 
     half zero: a sphere; only its last number not zero: a capsule along its z axis.
-    of_target : it comes and goes with the target.  moves : with it, along the normal.  strikable : the link that strikes may touch it.
-    before : it is there until contact only; core: of the target, which the striker is to reach from its face.
+    of_target : it comes and goes with the target.  moves : with it, along the normal.
+    strikable : the link that strikes may touch it.  before : it is there until contact only.
+    core : of the target, which the striker is to reach from its face.
     """
 
     name: str

@@ -35,8 +35,9 @@ TOO_NEAR = millimetres("too near")
 class Chain:
     """How to get from a body's frame to another's, joint by joint.
 
-    columns (n,) : the joints' places among base coordinates and joints (nv), with their ``signs``; turns (n,):
-    1 for a joint that turns, 0 for one that slides.  places : n + 1 placements between them (pin.SE3).
+    columns (n,) : the joints' places among base coordinates and joints (nv), with their ``signs``.
+    turns (n,) : 1 for a joint that turns, 0 for one that slides.  places : n + 1 placements between them
+    (pin.SE3).
     base : whether the base's position comes before all that.
     """
 
@@ -61,7 +62,7 @@ class Chain:
         return [*out, *self.turns, *[1.0] * more]
 
     def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Array, Array, Array]:
-        """z of a row's function is a sum of coordinates: slots, coordinates (y, then legs) and factors, (k,) each.
+        """z of a row's function, sums of coordinates: slots, coordinates (y, then legs), factors, (k,) each.
 
         rotation : axes, as columns, of the box that the chain ends at.
         """
@@ -169,9 +170,9 @@ def _moved(places: Any, k: int, x: Any) -> Any:
 def apart(n: int) -> BlockExpression:
     """A sphere and planes about a body, n joints apart.
 
-    z = shift (3), joints (n);  p = the chain's; the sphere's centre (3) in its frame; normals (3 a plane) and offsets
-    of the planes in theirs; R, radius and margin.  out = max_i (n_i . x - h_i) - R [m], rounded where two planes meet:
-    above it by less than half of `ROUND`.
+    z = shift (3), joints (n);  p = the chain's; the sphere's centre (3) in its frame; normals (3 a plane) and
+    offsets of the planes in theirs; R, radius and margin.  out = max_i (n_i . x - h_i) - R [m], rounded where
+    planes meet: above it by at most `ROUND` / 2 for each time that their number can be halved.
     """
     a, reach = ca.SX.sym("a", 3), ca.SX.sym("R")
     normals, offsets = ca.SX.sym("n", 3 * PLANES), ca.SX.sym("h", PLANES)
@@ -208,8 +209,8 @@ def apart_functions(report: Callable[[str], None] | None = None) -> dict[str, An
 class ApartRow(NamedTuple):
     """What one row keeps apart at one place: its name.
 
-    place : of the program.  joint : of the link, a sphere of which is kept out.  other : joint of the other link; or -1 -
-    the index of a body of the world.  number : of rows for the same two there.
+    place : of the program.  joint : of the link, a sphere of which is kept out.  other : joint of the other
+    link; or -1 - the index of a body of the world.  number : of rows for the same two there.
     """
 
     place: str
@@ -221,9 +222,9 @@ class ApartRow(NamedTuple):
 class Held(NamedTuple):
     """How a row keeps them apart.
 
-    centre (3) [m] : of the sphere, in the joint's frame.  reach [m] : its radius and the margin.  facing (4) : normal and
-    offset [m] of a plane, in the other's frame, in place of that of its planes that is most like it; None: those.
-    travel [m] : of the target, if the other moves with it.
+    centre (3) [m] : of the sphere, in the joint's frame.  reach [m] : its radius and the margin.
+    facing (4) : normal and offset [m] of a plane, in the other's frame, in place of that of its planes that
+    is most like it; None: those.  travel [m] : of the target, if the other moves with it.
     """
 
     centre: tuple[float, ...]

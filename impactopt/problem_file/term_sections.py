@@ -88,8 +88,7 @@ class TorqueRate(Section):
 
 
 class SelfCollision(Section):
-    """Links of the robot keep apart, from start to rest; those that a joint connects or that touch at the start are
-    left out."""
+    """Links of the robot keep apart, but for those that a joint connects or that touch at the start."""
 
     kind = terms.SelfCollision
     margin: NotNegative = optional("between two links [m]", "margin_m")
@@ -97,7 +96,7 @@ class SelfCollision(Section):
 
 
 class KeepOut(Section):
-    """The robot keeps off the target, the ground and obstacles; the link that strikes may touch the target."""
+    """The robot keeps off target, ground and obstacles; the link that strikes may touch the target."""
 
     kind = terms.KeepOut
     margin: NotNegative = optional("from a link to any of them [m]", "margin_m")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.between import NO_MORE, MoreNodes
+from impactopt.bodies.clearance import MISSED, Places
 from impactopt.plan import Plan, Trajectory
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
@@ -145,6 +146,26 @@ class Solution(Solved):
 
         return plot(self, what, simulation=simulation, replay=replay)
 
+    def clearance(self) -> dict[str, Any]:
+        """How far bodies are apart in the plan, and what touches what, by exact geometry at 1 ms: the keys
+        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow are among
+        them, and say so.
+        """
+        problem, bodies = self.problem, self.problem.bodies
+        least, nearest, touches = np.inf, "", list[dict[str, Any]]()
+        for missed in (False, True) if self.plan.brake is not None else (False,):
+            motion = self.plan.motion(missed=missed)
+            at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
+            found, _, pair = bodies.nearest(at)
+            if found < least:
+                least, nearest = found, " and ".join(bodies.names(pair)) if pair is not None else ""
+            for one, other, start, end, depth in bodies.touches(motion.time, at):
+                touches.append(
+                    {"one": one, "other": other, "start_s": start, "end_s": end, "depth_mm": 1e3 * depth}
+                    | ({"missed": True} if missed else {})
+                )
+        return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": touches}
+
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan
@@ -155,6 +176,7 @@ class Solution(Solved):
             "duration_s": plan.duration,
             "nodes_added": self.nodes.total,
             **plan.margins(self.trajectory),
+            **self.clearance(),
             "versions": versions(),
         }
         known: dict[str, Any] = {

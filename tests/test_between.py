@@ -19,8 +19,6 @@ from impactopt.extra_terms import (
     HandOrientation,
     HitCone,
     HitRegion,
-    KeepOut,
-    SelfCollision,
     TorqueRate,
 )
 from impactopt.motion import CubicSpline
@@ -39,7 +37,6 @@ from impactopt.plan import Plan
 from impactopt.problem import Phase
 from impactopt.program import Status
 from impactopt.scenario import Scenario
-from impactopt.shapes import Capsule
 from impactopt.sqp import solve_sqp
 from impactopt.terms import ContactWrenchCone, Term, TorqueLimit
 from impactopt.validation.result import distance_inside
@@ -145,15 +142,12 @@ def test_the_old_solution_is_a_warm_start(arm_plan: Planned) -> None:
     assert again.objective == pytest.approx(first.objective, rel=0.02)
 
 
-WRIST, ELBOW = Capsule(frame="wrist", radius=0.02), Capsule(frame="elbow", radius=0.1)
 ON_TOP: dict[str, Objective | Term] = {
     "peak force": PeakForce(weight=-0.001),
     "energy": TargetEnergy(),
     "penetration": Penetration(weight=10.0),
     "effort": Effort(),
     "torque rate": TorqueRate(limit=200.0),
-    "self-collision": SelfCollision(pairs=((Capsule(frame="hand", radius=0.1), ELBOW),)),
-    "keep out": KeepOut(shapes=(WRIST,)),
     "hand orientation": HandOrientation(axis=(0, 0, 1), angle=1.3),
     "gaze": Gaze(frame="elbow", axis=(0, 0, 1), angle=0.5),
     "hit region": HitRegion(radius=0.02),

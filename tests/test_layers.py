@@ -24,7 +24,7 @@ LAYERS = (
     ("coordinates", "support", "statics", "reach"),
     (
         "shapes",
-        "skeleton",
+        "bodies",
         "terms",
         "extra_terms",
         "objectives",
@@ -40,7 +40,7 @@ LAYERS = (
     ("program", "sqp", "ipopt_functions", "ipopt"),
     ("validation",),
     ("reference", "cases"),
-    ("starts", "solution", "baseline", "strike", "planner", "blows", "robustness"),
+    ("keeping_apart", "starts", "solution", "baseline", "strike", "planner", "blows", "robustness"),
     ("problem_file", "output", "result_folder", "replay", "sweeps"),
     ("plotting", "result_rows", "report", "screen"),
     ("plain_errors", "bench", "reproduce"),
@@ -60,7 +60,9 @@ LAYERS = (
 RANK = {room: rank for rank, room in enumerate(room for layer in LAYERS for room in layer)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.
 NUMERIC = (
+    "bodies",
     "cone",
+    "keeping_apart",
     "motion",
     "plan",
     "planned_strike",

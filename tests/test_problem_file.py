@@ -32,7 +32,7 @@ from impactopt.problem_file.mistakes import key_lines
 from impactopt.problem_file.section import Section, attribute_docs
 from impactopt.robot import Tool
 from impactopt.scenario import Scenario
-from impactopt.shapes import Capsule
+from impactopt.shapes import Obstacle, TargetBody
 from impactopt.sqp import SQPOptions
 from impactopt.stance import FixedBase, OneSole
 
@@ -253,15 +253,8 @@ EXTRA = """
 limit_N_m_s = {arm_right_4_joint = 300}
 [terms.self_collision]
 margin_m = 0.03
-[[terms.self_collision.pairs]]
-first = {frame = "arm_right_7_link", radius_m = 0.05}
-second = {frame = "torso_2_link", radius_m = 0.2, start_m = [0.0, 0.0, 0.0], end_m = [0.0, 0.0, 0.3]}
 [terms.keep_out]
-size_m = [0.3, 0.4, 0.2]
-[[terms.keep_out.shapes]]
-frame = "arm_right_4_link"
-radius_m = 0.06
-start_m = [0.0, 0.0, -0.1]
+enabled = false
 [terms.hand_orientation]
 axis = [0.0, 0.0, 1.0]
 direction = [0.0, 0.0, -1.0]
@@ -280,14 +273,10 @@ angle_rad = 0.15
 
 def test_extra_terms_reach_the_problem(tmp_path: Path) -> None:
     problem = load_problem(write(tmp_path, GOOD + EXTRA))
-    chest = Capsule(frame="torso_2_link", radius=0.2, end=(0.0, 0.0, 0.3))
-    elbow = Capsule(frame="arm_right_4_link", radius=0.06, start=(0.0, 0.0, -0.1))
     assert problem.terms == (
+        terms.SelfCollision(margin=0.03),
+        terms.KeepOut(enabled=False),
         extra_terms.TorqueRate(limit={"arm_right_4_joint": 300}),
-        extra_terms.SelfCollision(
-            pairs=((Capsule(frame="arm_right_7_link", radius=0.05), chest),), margin=0.03
-        ),
-        extra_terms.KeepOut(shapes=(elbow,), size=(0.3, 0.4, 0.2)),
         extra_terms.HandOrientation(axis=(0, 0, 1), direction=(0, 0, -1), angle=0.3),
         extra_terms.Gaze(frame="head_2_link", axis=(1, 0, 0), angle=0.4, since=0.2),
         extra_terms.HitRegion(size=(0.1, 0.2)),
@@ -295,17 +284,87 @@ def test_extra_terms_reach_the_problem(tmp_path: Path) -> None:
     )
     disc = load_problem(write(tmp_path, GOOD + "[terms.hit_region]\nradius_m = 0.05\n"))
     assert disc.terms == (extra_terms.HitRegion(radius=0.05),)
-    (own,) = load_problem(write(tmp_path, GOOD + "[terms.self_collision]\nmargin_m = 0.03\n")).terms
-    assert isinstance(own, extra_terms.SelfCollision) and own.pairs is not None
-    assert (len(own.pairs), own.margin) == (3, 0.03)
+
+
+WORLD = """
+[target.body]
+shape = "box"
+size_m = [0.2, 0.3, 0.1]
+[[obstacles]]
+name = "table"
+size_m = [0.5, 0.6, 0.1]
+position_m = [1.5, 0.0, 0.7]
+rpy_rad = [0.0, 0.0, 0.3]
+[[obstacles]]
+name = "post"
+start_m = [1.5, 1.0, 0.0]
+end_m = [1.5, 1.0, 2.0]
+radius_m = 0.05
+[[obstacles]]
+name = "lamp"
+start_m = [0.0, 0.0, 2.5]
+radius_m = 0.1
+"""
+
+
+def test_the_world_reaches_the_problem(tmp_path: Path) -> None:
+    problem = load_problem(write(tmp_path, GOOD + WORLD))
+    assert problem.body == TargetBody(shape="box", size=(0.2, 0.3, 0.1))
+    lamp = Obstacle(name="lamp", start=(0.0, 0.0, 2.5), radius=0.1)
+    assert lamp.end == lamp.start
+    assert problem.obstacles == (
+        Obstacle(name="table", size=(0.5, 0.6, 0.1), position=(1.5, 0.0, 0.7), rpy=(0.0, 0.0, 0.3)),
+        Obstacle(name="post", start=(1.5, 1.0, 0.0), end=(1.5, 1.0, 2.0), radius=0.05),
+        lamp,
+    )
+    ball = load_problem(write(tmp_path, GOOD + '[target.body]\nshape = "ball"\nsize_m = [0.1]\n'))
+    assert ball.body == TargetBody(shape="ball", size=(0.1,))
+    assert len({ball.hash, problem.hash, load_problem(write(tmp_path, GOOD)).hash}) == 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ('shape = "box"', 'shape = "bx"', ["[target.body]", "shape", "'box'"]),
+        ("size_m = [0.2, 0.3, 0.1]", "size_m = [0.2, 0.3]", ["[target.body]", "TargetBody.size"]),
+        ("size_m = [0.2, 0.3, 0.1]", "size_m = [0.2, 0.3, 0.0]", ["[target.body] size_m", "0"]),
+        ('shape = "box"', 'shape = "none"', ["[target.body]", "lengths > 0, and none of shape 'none'"]),
+        ("size_m = [0.5, 0.6, 0.1]\n", "", ["obstacle 'table'", "either size, of a box"]),
+        ("size_m = [0.5, 0.6, 0.1]", "size_m = [0.5, 0.6, -0.1]", ["obstacle 'table'", "> 0"]),
+        ("radius_m = 0.05\n", "", ["obstacle 'post'", "radius > 0"]),
+        ("radius_m = 0.1", "radius_m = 0.0", ["radius_m", "0"]),
+        ("radius_m = 0.05", "radius_m = 0.05\nrpy_rad = [0.1, 0.0, 0.0]", ["'post'", "no position or rpy"]),
+        ('name = "post"', 'name = "table"', ["two obstacles are called 'table'"]),
+        ('name = "post"', 'name = " "', ["name is ' '"]),
+        ('name = "post"\n', "", ["obstacles", "name", "missing"]),
+    ],
+)
+def test_mistakes_about_the_world_are_named(tmp_path: Path, old: str, new: str, parts: list[str]) -> None:
+    assert old in WORLD
+    text = message(write(tmp_path, GOOD + WORLD.replace(old, new)))
+    assert [part for part in parts if part not in text] == []
+
+
+def test_links_that_may_pass_through_each_other(tmp_path: Path) -> None:
+    pair = ("torso_2_link", "arm_right_7_link")
+    section = f'[robot]\npreset = "talos"\ndisable_collisions = [["{pair[0]}", "{pair[1]}"]]\n'
+    text = GOOD.replace('robot = "talos"', "") + section
+    plain, robot = load_problem(write(tmp_path, GOOD)).robot, load_problem(write(tmp_path, text)).robot
+    assert set(robot.disable_collisions) - set(plain.disable_collisions) == {pair}
+    assert len(plain.disable_collisions) > 10, "the SRDF's"
+    wrong = message(write(tmp_path, text.replace("arm_right_7_link", "arm_right_8_link")))
+    assert "disable_collisions" in wrong and "did you mean 'arm_right_" in wrong
+    for few in ('[["torso_2_link"]]', '["torso_2_link", "arm_right_7_link"]'):
+        wrong = text.replace(f'[["{pair[0]}", "{pair[1]}"]]', few)
+        assert "[robot] disable_collisions" in message(write(tmp_path, wrong))
 
 
 @pytest.mark.parametrize(
     ("old", "new", "parts"),
     [
         ("limit_N_m_s = {arm_right_4_joint = 300}", "limit_N_m_s = 0", ["TorqueRate.limit", "> 0"]),
-        ('"arm_right_7_link", radius_m = 0.05', '"arm_right_7_link"', ["pairs.first", "radius_m", "missing"]),
-        ("end_m = [0.0, 0.0, 0.3]", "end_m = [0.0, 0.0, 0.0]", ["coincide", "sphere"]),
+        ("margin_m = 0.03", "margin_m = -0.03", ["[terms.self_collision] margin_m", "-0.03"]),
+        ("enabled = false", "enabled = 0", ["[terms.keep_out] enabled", "true or false"]),
         ("angle_rad = 0.15", "angle_rad = 1.6", ["[terms.hit_cone]", "between 0 and pi/2"]),
         ("size_m = [0.1, 0.2]", "size_m = [0.1, 0.6]", ["[terms.hit_region]", "0.2 m"]),
         ("size_m = [0.1, 0.2]", "radius_m = 0.1\nsize_m = [0.1, 0.2]", ["either radius", "or size"]),
@@ -348,13 +407,13 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
         assert type(term) in kinds
         assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
     extra = [kind for kind in terms.Term.__subclasses__() if kind.__module__ == extra_terms.__name__]
-    assert len(extra) == 7
-    described = (*objectives.Objective.__subclasses__(), *extra, Capsule, *TARGETS_AND_LAWS)
+    assert len(extra) == 5
+    described = (*objectives.Objective.__subclasses__(), *extra, Obstacle, TargetBody, *TARGETS_AND_LAWS)
     for kind in (Phase, Scenario, Tool, *described):
-        keys = set(kinds[kind].model_fields) - {kinds[kind].choice}
+        keys = set(kinds[kind].model_fields) - {kinds[kind].choice, *kinds[kind].apart}
         assert {f.name for f in dataclasses.fields(kind)} == keys
     keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
-    keys |= {*sections.Collision.model_fields, "law", "collision_elements"}
+    keys |= {*sections.Collision.model_fields, "law", "collision_elements", *kinds[FreeMass].apart}
     assert {f.name for f in dataclasses.fields(ImpactProblem)} <= keys
 
 

@@ -11,6 +11,8 @@ import pytest
 from fake_solution import still_solution
 from scipy.integrate import trapezoid
 
+from impactopt.bodies.meshes import find_mesh, read_mesh
+from impactopt.bodies.solids import Solid, box, cylinder, joined, rounded_box, simplified, sphere
 from impactopt.contact import FreeMass
 from impactopt.contact.nail import Nail
 from impactopt.contact.targets import RigidWall
@@ -18,11 +20,9 @@ from impactopt.output import Record, record_of
 from impactopt.presets import load_robot
 from impactopt.report.charts import charts_of
 from impactopt.report.pack import pack, unpack
-from impactopt.bodies.solids import Solid, box, cylinder, joined, rounded_box, simplified, sphere
 from impactopt.report.stage import target_solids
 from impactopt.report.thinning import thinned
 from impactopt.report.tracks import tracks_of
-from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.report.visuals import visuals_of
 from impactopt.robot import Robot
 from impactopt.solution import Solution

@@ -101,6 +101,9 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
         out["position_limit_rad"] = moved
     if [_sole(sole) for sole in built.soles] != [_sole(sole) for sole in robot.soles]:
         out["soles"] = [_sole(sole) for sole in robot.soles]
+    apart = [list(pair) for pair in robot.disable_collisions if pair not in built.disable_collisions]
+    if apart:
+        out["disable_collisions"] = apart
     made = {tool.name for tool in (robot.source.tools if robot.source else ())}
     strikers = [
         _striker(striker)

@@ -67,9 +67,12 @@ class Conditions:
         of_law, of_target = scaled_numbers(
             "conditions", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
         )
+        way = self.distance * planned.normal
+        solids = planned.solids.without_target() if self.missing else planned.solids.moved(way)
         return replace(
             planned,
-            point=planned.point + self.distance * planned.normal,
+            solids=solids,
+            point=planned.point + way,
             law=type(law)(**of_law),
             target=type(target)(**of_target),
         )

@@ -9,6 +9,7 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
 from impactopt.validation.mujoco_engine import simulate_mujoco
 from impactopt.validation.pinocchio_engine import simulate_pinocchio
+from impactopt.validation.clearing import with_clearance
 from impactopt.validation.result import Simulation
 from impactopt.validation.scene import scene_of
 
@@ -45,4 +46,4 @@ def simulate(
                 f"engine {engine!r} has no option {name!r}{did_you_mean(name, known)}: there are "
                 f"{', '.join(sorted(known))}"
             )
-    return run(problem.robot, reference, scene_of(problem), **options)
+    return with_clearance(problem, run(problem.robot, reference, scene_of(problem), **options))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.robot import Robot
+from impactopt.validation.besides import Besides
 from impactopt.validation.conditions import Conditions
 from impactopt.validation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module, no_log_file
@@ -26,6 +27,7 @@ from impactopt.validation.struck import Struck
 from impactopt.validation.touch import Touches
 
 Array = NDArray[np.float64]
+AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
 
@@ -36,7 +38,10 @@ class _Replay:
     ) -> None:
         self.mujoco = mujoco_module()
         self.robot, self.scene, self.conditions = robot, conditions.scene(scene), conditions
-        self.world = build_world(robot, self.scene, conditions, solver)
+        solids = self.scene.solids
+        near = solids.near(robot.model, reference)
+        self.world = build_world(robot, self.scene, conditions, solver, near)
+        self.besides = Besides(self.world, solids)
         self.data = self.mujoco.MjData(self.world)
         self.follow(reference)
         joints = [self.world.joint(name) for name in robot.joint_names]
@@ -90,6 +95,11 @@ class _Replay:
         """Semi-implicitly, as MuJoCo moves the robot: by the speed that it has after the step."""
         self.target = self.struck.moved(self.target, force, step)
         self.travel += step * self.struck.speed(self.target)
+
+    def place_target(self) -> None:
+        """Its body goes with it; what a blow has broken is put away."""
+        broken = bool(self.scene.target.outcome(self.target).get("broken", False))
+        self.besides.place(self.data, self.travel * self.scene.normal + broken * AWAY)
 
     # ------------------------------------------------------------------ what a record needs
     def base(self) -> tuple[Array, Array, float]:
@@ -244,12 +254,14 @@ def simulate_mujoco(
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             target_speed = replay.struck.speed(replay.target)
             replay.move_target(force, step)
+            replay.place_target()
             impulse += step * force
             left = replay.target if force > 0 else left
             kept = k % record == 0 or force > 0
             state = replay.state() if kept else None
             moves = replay.sole_moves() if kept else None
             mujoco.mj_step2(model, data)
+            replay.besides.look(data, t)
             if kept:
                 ground = replay.sole_ground()
                 assert state is not None and moves is not None
@@ -270,4 +282,6 @@ def simulate_mujoco(
         saturated=saturated,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
         fall=fall or replay.not_standing(ground, weight_of(robot)),
+        touched=replay.besides.touched(),
+        missed=world.missing,
     )

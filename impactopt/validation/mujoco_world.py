@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from impactopt.errors import InputError
 from impactopt.robot import Robot
 from impactopt.validation.conditions import Conditions
 from impactopt.validation.result import Scene
+from impactopt.validation.solids import FLOOR, Solid
 
 Array = NDArray[np.float64]
 FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
@@ -52,12 +53,20 @@ def no_log_file() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solver) -> Any:
+def build_world(
+    robot: Robot,
+    scene: Scene,
+    conditions: Conditions,
+    solver: Solver,
+    near: Sequence[tuple[int, int]] = (),
+) -> Any:
     """The compiled mujoco.MjModel.
 
     Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
     the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
-    anything: the target, and the contact law between it and the striker, are the engine's business.
+    anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid <number>``, and
+    bodies of the world; those that move with the target are on the mocap body ``target``. The contact law between
+    target and striker is the engine's business.
     """
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()
@@ -75,11 +84,50 @@ def build_world(robot: Robot, scene: Scene, conditions: Conditions, solver: Solv
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
     _surface(floor, conditions, sole=False)
-    _robot_bodies(mujoco, spec, robot, scene, conditions)
+    bodies = _robot_bodies(mujoco, spec, robot, scene, conditions)
+    _solids(mujoco, spec, bodies, scene, near)
     return spec.compile()
 
 
-def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions: Conditions) -> None:
+def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Sequence[tuple[int, int]]) -> None:
+    """Geometry of the solids that are in a pair, and the pairs."""
+    solids = scene.solids.solids
+    target = spec.worldbody.add_body(name="target", mocap=True)
+    for k in sorted({k for pair in near for k in pair if k != FLOOR}):
+        solid = solids[k]
+        body = bodies[solid.joint] if solid.joint else (target if solid.moves else spec.worldbody)
+        if solid.vertices is not None:
+            spec.add_mesh(
+                name=f"solid {k}",
+                uservert=solid.vertices.astype(np.float32).ravel(),
+                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
+            )
+            shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"solid {k}"}
+        else:
+            shape = _primitive(mujoco, solid)
+        body.add_geom(name=f"solid {k}", contype=0, conaffinity=0, mass=0.0, **shape)
+    for one, other in near:
+        spec.add_pair(
+            name=f"pair {one} {other}",
+            geomname1=f"solid {one}",
+            geomname2="floor" if other == FLOOR else f"solid {other}",
+            condim=3,
+            friction=[0.5, 0.5, 1e-3, 1e-4, 1e-4],
+            solref=[5e-3, 1.0],
+        )
+
+
+def _primitive(mujoco: Any, solid: Solid) -> dict[str, Any]:
+    half, radius = np.asarray(solid.half), solid.radius
+    place = {"pos": solid.place, "quat": _quaternion(solid.rotation)}
+    if not radius:
+        return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, **place}
+    if half[2] > 0:
+        return {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [radius, half[2], 0.0], **place}
+    return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0.0, 0.0], **place}
+
+
+def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions: Conditions) -> list[Any]:
     model = robot.model
     bodies = robot_bodies(mujoco, spec, robot)
     for sole in robot.soles:
@@ -100,6 +148,7 @@ def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions
     if conditions.payload > 0:
         load = hand.add_body(name="payload", pos=frame.placement.translation)
         _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
+    return bodies
 
 
 def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:

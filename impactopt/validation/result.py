@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
+from impactopt.validation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
 PHASES = ("swing", "collision", "follow")
@@ -35,6 +36,9 @@ REPORT = (
     "hand_speed_m_s",
     "sole_cop_margin_m",
     "target",
+    "clearance_mm",
+    "nearest",
+    "contacts_besides",
 )
 
 
@@ -45,7 +49,8 @@ class Scene:
     point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; law, target:
     the contact's force and the target's motion; striker: frame of the model that hits; soles: frames of the
     model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
-    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise.
+    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what else can
+    touch.
     """
 
     point: Array
@@ -56,6 +61,7 @@ class Scene:
     soles: tuple[str, ...]
     corners: tuple[Array, ...]
     polygon: Array
+    solids: Solids = field(default_factory=Solids)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +79,9 @@ class Simulation:
     name and unit (``speed_m_s``, ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
     than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
     engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
-    that ends farthest from the reference's last posture.
+    that ends farthest from the reference's last posture.  touched: what touched that should not have, where the
+    engine's solids push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
+    geometry, and which two.  missed: there was no target.
     """
 
     engine: str
@@ -97,6 +105,10 @@ class Simulation:
     saturated: float
     posture_error: float
     fall: str | None
+    touched: tuple[Touched, ...] = ()
+    clearance: float = np.nan
+    nearest: tuple[str, ...] = ()
+    missed: bool = False
 
     @property
     def ground(self) -> Array:
@@ -148,6 +160,9 @@ class Simulation:
             "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]),
             "saturated_ms": 1e3 * self.saturated,
             "final_posture_error_rad": self.posture_error,
+            "clearance_mm": 1e3 * self.clearance,
+            "nearest": " and ".join(self.nearest),
+            "contacts_besides": [touched.summary() for touched in self.touched],
         }
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {

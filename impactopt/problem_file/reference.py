@@ -53,8 +53,10 @@ def reference() -> str:
         for kind, section in kinds.items():
             (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
             parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section))
-        if not kinds:
-            parts += [_part(header, section) for header, section in _sections(name, info)]
+        below = _sections(name, info)
+        if kinds:
+            next(below)  # the section itself, which its kinds have said all of
+        parts += [_part(header, section) for header, section in below]
     return "\n".join(parts)
 
 
@@ -104,7 +106,11 @@ def _allowed(info: FieldInfo) -> str:
     if get_origin(info.annotation) is dict:
         return "table by name" if str in get_args(info.annotation) else "table"
     length = next((m.min_length for m in info.metadata if hasattr(m, "min_length")), None)
-    return f"{length} numbers" if length else "list of pairs of numbers"
+    if length:
+        return f"{length} numbers"
+    kind, *_ = get_args(get_args(info.annotation)[0]) or (float,)  # of what it is a list
+    pairs = "pairs of " if get_origin(kind) is list else ""
+    return f"list of {pairs}{'names' if get_args(kind) == (str,) else 'numbers'}"
 
 
 def _sentence(text: str) -> str:

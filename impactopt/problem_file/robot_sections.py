@@ -14,6 +14,7 @@ from impactopt.presets import load_robot
 from impactopt.problem_file.section import Section, optional, required
 from impactopt.problem_file.values import (
     Inertia,
+    Pair,
     PerJoint,
     Point2,
     Positive,
@@ -95,7 +96,7 @@ class RobotSection(Section):
     torque_limit: PerJoint = optional("of all joints or by joint [N m]", "torque_limit_N_m")
     velocity_limit: PerJoint = optional("of all joints or by joint [rad/s]", "velocity_limit_rad_s")
     position_limit: dict[str, Range] = optional("[lower, upper] by joint [rad]", "position_limit_rad")
-    disable_collisions: list[tuple[str, str]] = optional("pairs of links that may pass through each other")
+    disable_collisions: list[Pair] = optional("pairs of links that may pass through each other")
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
     strikers: list[StrikerSection] = optional("points that hit")
     tools: list[ToolSection] = optional("what the robot holds")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.clearance import MISSED, Bodies, Places
+from impactopt.bodies.clearance import MISSED, Bodies, Near, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.at_contact import ContactProgram
@@ -28,6 +28,7 @@ EXACT = 0.05  # [m] nearer bodies get a row that knows their hulls there
 BEAD = 0.02  # [m] radius of its sphere
 DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
 FAR = 0.6  # this [m]
+DEEPEST = 3  # spheres of a pair
 
 
 def keeps_apart(problem: ImpactProblem) -> bool:
@@ -90,32 +91,50 @@ def spots_of(t: ContactProgram, x: Array) -> Spots:
     return Spots(names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase))
 
 
-def rows_near(
-    t: ContactProgram, x: Array, margins: Margins, within: float = NEAR, only: set[Pair] | None = None
-) -> Rows:
+def rows_near(t: ContactProgram, x: Array, margins: Margins, within: float = NEAR) -> Rows:
     """Rows between all bodies that come near at solver variables (n,).
 
     Links with few joints between them are always near, and can hardly meet: they get rows only where they do.
-    only : of these pairs, if given.
     """
-    out: Rows = {}
-    if only is not None and not only:
-        return out
-    spots, bodies = spots_of(t, x), margins.bodies
-    near = bodies.near(spots.at, within, BETWEEN, only).least()
+    spots = spots_of(t, x)
+    return _rows_of(margins, spots, margins.bodies.near(spots.at, within, BETWEEN).least())
+
+
+def _rows_of(margins: Margins, spots: Spots, near: Near) -> Rows:
+    """A row for each that is near: of the hulls where they are, else of the sphere."""
+    out, bodies = dict[ApartRow, Held](), margins.bodies
     for k, sphere, joint, other, gap in zip(
         near.at, near.sphere, near.joint, near.other, near.gap, strict=True
     ):
         pair = bodies.known(int(joint), int(other))
         if not margins.term(pair).enabled:
             continue
-        if gap < EXACT:
+        if -DEEP < gap < EXACT:
             out[ApartRow(spots.names[k], *pair)] = margins.held(spots.at, int(k), pair)
         else:
             links = bodies.links
             reach = float(links.radius[sphere]) + margins.of(pair)
             held = Held(tuple(links.centre[sphere].tolist()), reach, None, float(spots.at.travel[k]))
-            out[ApartRow(spots.names[k], int(joint), int(other))] = held
+            out[ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))] = held
+    return out
+
+
+def _rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
+    """Rows for the spheres that go deepest into other bodies, at all places that are not far from there."""
+    out, bodies = dict[ApartRow, Held](), margins.bodies
+    worst: dict[Pair, set[int]] = {}
+    for n in np.argsort(deep.gap, kind="stable"):
+        chosen = worst.setdefault((int(deep.joint[n]), int(deep.other[n])), set())
+        if len(chosen) < DEEPEST:
+            chosen.add(int(deep.sphere[n]))
+    only = {bodies.known(*pair) for pair in worst}
+    near = bodies.near(spots.at, FAR, BETWEEN, only) if only else deep
+    for k, sphere, joint, other in zip(near.at, near.sphere, near.joint, near.other, strict=True):
+        if int(sphere) in worst.get((int(joint), int(other)), ()):
+            reach = float(bodies.links.radius[sphere]) + margins.of(bodies.known(int(joint), int(other)))
+            centre = tuple(bodies.links.centre[sphere].tolist())
+            row = ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))
+            out[row] = Held(centre, reach, None, float(spots.at.travel[k]))
     return out
 
 
@@ -153,7 +172,7 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         return None
     rows: Rows = {}
     for (spot, pair), apart in found.items():
-        known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair)]
+        known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair) and row.number >= 0]
         # rows that are met, and yet it is too near there or beside: they are to ask for more
         more = max((t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known[1:]), default=0.0)
         if known and t.apart_rows[known[-1]].facing is not None:
@@ -161,11 +180,11 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         rows[ApartRow(spots.names[spot], *pair, len(known))] = margins.held(
             spots.at, spot, pair, min(more, DEEP)
         )
-    deep = {pair for (_, pair), apart in found.items() if apart < -DEEP}
-    for key, held in rows_near(t, x, margins, FAR, deep).items():
-        if key not in t.apart_rows and key not in rows:
-            rows[key] = held
-    return Violated(rows, deepest)
+    if deepest > DEEP:
+        pairs = {pair for (_, pair), apart in found.items() if apart < -DEEP}
+        own = bodies.near(spots.at, -DEEP, BETWEEN, pairs).least()
+        rows = {**_rows_all_along(margins, spots, own), **rows}
+    return Violated({key: held for key, held in rows.items() if key not in t.apart_rows}, deepest)
 
 
 def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:
@@ -177,7 +196,7 @@ def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:
         pair = bodies.known(int(joint), int(other))
         asked = margins.of(pair)
         if margins.term(pair).enabled and bodies.exact(spots.at, int(k), pair) < (1 - SHARE) * asked:
-            known = sum(row[:3] == (spots.names[k], *pair) for row in t.apart_rows)
+            known = sum(row[:3] == (spots.names[k], *pair) and row.number >= 0 for row in t.apart_rows)
             rows[ApartRow(spots.names[k], *pair, known)] = margins.held(spots.at, int(k), pair)
     return rows
 

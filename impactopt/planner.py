@@ -19,14 +19,13 @@ from impactopt.nlp.start import carried_over, first_iterate, iterate_from_strike
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
 from impactopt.problem import ImpactProblem
-from impactopt.program import Callback, SolverResult
+from impactopt.program import Callback, SolverResult, Status
 from impactopt.solution import Solution
 from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, solve_from
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 10, 3, 4  # at most: of all, with more nodes, from the start again
-_UNFINISHED = "It leaves limits between its rows, and no solution was found that does not."
+_ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 12, 3, 7  # at most: of all, with more nodes, from the start again
 
 
 def solve(
@@ -128,18 +127,32 @@ class _Refining:
         result = self.budget.run(t.program, start)
         for again in range(_ROUNDS if self.between else 0):
             if not result.status.usable or self.budget.left == 0:
-                break
+                return t, result
             following = self._next(t, result, x0, again)
             if following is None:
-                break
+                return t, result
             if self.report is not None:
                 self.report(following.why)
             new = self.budget.run(following.program.program, following.start)
             if not new.status.usable:
-                result = replace(result, message=f"{result.message} {_UNFINISHED}")
                 break
             t, result = following.program, _one_after_the_other(result, new)
-        return t, result
+        return t, self._judged(t, result) if self.between else result
+
+    def _judged(self, t: Transcription, result: SolverResult) -> SolverResult:
+        """A result that could not be mended is a solution only if nothing touches anything."""
+        if self.margins is None:
+            return result
+        with contextlib.suppress(InputError):
+            left = rows_to_add(t, result.x, self.margins, share=1.0)
+            if left is not None and left.depth > 0:
+                names = sorted({" and ".join(self.margins.bodies.names(row[1:3])) for row in left.rows})
+                message = (
+                    f"Bodies are {1e3 * left.depth:.0f} mm in each other, and no solution was found where they are not: "
+                    f"{'; '.join(names[:3])}."
+                )
+                return replace(result, status=Status.FAILED, message=message)
+        return result
 
     def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> _Round | None:
         """What is to be solved next; None if the solution is right."""

@@ -7,9 +7,9 @@ from typing import Any
 
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
+from impactopt.validation.clearing import with_clearance
 from impactopt.validation.mujoco_engine import simulate_mujoco
 from impactopt.validation.pinocchio_engine import simulate_pinocchio
-from impactopt.validation.clearing import with_clearance
 from impactopt.validation.result import Simulation
 from impactopt.validation.scene import scene_of
 

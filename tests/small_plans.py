@@ -7,7 +7,8 @@ compiling them would take longer.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from small_robots import arm, biped, striking_point
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.ipopt import solve_ipopt
+from impactopt.nlp.apart import LENGTHS, apart
 from impactopt.nlp.blocks import BlockExpression, builders
 from impactopt.nlp.extra_blocks import extra_blocks
 from impactopt.nlp.start import first_iterate
@@ -70,13 +72,13 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     """The problem's program; all blocks are built, those of every model of the collision."""
     c = problem.coordinates
     edges = len(support_polygon(problem.robot, c))
-    found = {}
+    found: dict[str, Callable[[], BlockExpression]] = {f"apart{n}": partial(apart, n) for n in LENGTHS}
     for instant in (False, True):
         found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant)
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
 
 
-def _functions(builders: dict[str, Callable[[], BlockExpression]]) -> dict[str, Any]:
+def _functions(builders: Mapping[str, Callable[[], BlockExpression]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, build in builders.items():
         block = build()

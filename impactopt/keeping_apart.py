@@ -29,6 +29,7 @@ BEAD = 0.02  # [m] radius of its sphere
 DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
 FAR = 0.6  # this [m]
 DEEPEST = 3  # spheres of a pair
+PATCH, CORNERS = 0.015, 4  # [m] of a side that may come next, and how many of its corners
 
 
 def keeps_apart(problem: ImpactProblem) -> bool:
@@ -71,6 +72,25 @@ class Margins:
         normal, point = facing.T @ away, facing.T @ (found.other - place)
         plane = (*normal.tolist(), float(normal @ point))
         return Held(tuple(centre.tolist()), BEAD + self.of(pair) + more, plane, travel)
+
+    def held_around(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> list[Held]:
+        """As :meth:`held`, and corners of the one link around, which come next where two flat sides slide or turn."""
+        first = self.held(at, k, pair, more)
+        assert first.facing is not None
+        turn, _ = self.bodies.placement(at, k, pair[0])
+        facing, _ = self.bodies.placement(at, k, pair[1])
+        away = turn.T @ (facing @ np.array(first.facing[:3]))
+        corners = np.concatenate([piece.vertices for piece in self.bodies.links.of_joint[pair[0]]])
+        height = corners @ away
+        lowest = corners[height < height.min() + PATCH]
+        chosen: list[Array] = [np.array(first.centre) - BEAD * away]
+        while len(chosen) <= CORNERS:
+            apart = np.min([np.linalg.norm(lowest - c, axis=1) for c in chosen], axis=0)
+            if apart.max() < PATCH:
+                break
+            chosen.append(lowest[int(apart.argmax())])
+        reach = self.of(pair) + more
+        return [first, *(first._replace(centre=tuple(c.tolist()), reach=reach) for c in chosen[1:])]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,12 +194,13 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     for (spot, pair), apart in found.items():
         known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair) and row.number >= 0]
         # rows that are met, and yet it is too near there or beside: they are to ask for more
-        more = max((t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known[1:]), default=0.0)
-        if known and t.apart_rows[known[-1]].facing is not None:
-            more = max(more, 0.0) + margins.of(pair) - max(apart, -DEEP)
-        rows[ApartRow(spots.names[spot], *pair, len(known))] = margins.held(
-            spots.at, spot, pair, min(more, DEEP)
-        )
+        more = 0.0
+        here = bodies.exact(spots.at, spot, pair)
+        if known and here > (1 - SHARE) * margins.of(pair):  # the place is right, and the motion beside it is not
+            asked = [t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known]
+            more = max(0.0, *asked) + margins.of(pair) - max(apart, -DEEP)
+        for k, held in enumerate(margins.held_around(spots.at, spot, pair, min(more, DEEP)), len(known)):
+            rows[ApartRow(spots.names[spot], *pair, k)] = held
     if deepest > DEEP:
         pairs = {pair for (_, pair), apart in found.items() if apart < -DEEP}
         own = bodies.near(spots.at, -DEEP, BETWEEN, pairs).least()

@@ -25,6 +25,7 @@ from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, 
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
+_EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 _ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 12, 3, 7  # at most: of all, with more nodes, from the start again
 
 
@@ -89,10 +90,10 @@ def solve(
 
 @dataclass(frozen=True, kw_only=True)
 class _Round:
-    """A program that is to be solved next, and from where."""
+    """A program that is to be solved next, and from where: from one after the other, until it is."""
 
     program: Transcription
-    start: Array | SolverResult
+    starts: tuple[Array | SolverResult, ...]
     why: str
 
 
@@ -133,10 +134,14 @@ class _Refining:
                 return t, result
             if self.report is not None:
                 self.report(following.why)
-            new = self.budget.run(following.program.program, following.start)
+            for start in following.starts:
+                new = self.budget.run(following.program.program, start)
+                result = _one_after_the_other(result, new) if new.status.usable else _with_effort(result, new)
+                if new.status.usable or self.budget.left == 0:
+                    break
             if not new.status.usable:
                 break
-            t, result = following.program, _one_after_the_other(result, new)
+            t = following.program
         return t, self._judged(t, result) if self.between else result
 
     def _judged(self, t: Transcription, result: SolverResult) -> SolverResult:
@@ -165,7 +170,7 @@ class _Refining:
         rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
         if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
             why = f"bodies are {1e3 * violated.depth:.0f} mm in each other: from the start again, with rows between them"
-            return _Round(program=t.with_apart(rows), start=x0, why=why)
+            return _Round(program=t.with_apart(rows), starts=(x0, old.x), why=why)
         if nodes == t.nodes:
             finer = t.with_apart(rows)
         else:
@@ -173,23 +178,29 @@ class _Refining:
             finer = finer.with_apart(rows)
         x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
         added = len(rows) - len(t.apart_rows)
+        again_from = (x0,) if finer.layout.n == len(x0) else ()
         what = [f"{nodes.total - t.nodes.total} more nodes"] * (nodes != t.nodes)
         what += [f"{added} more rows between bodies"] * (violated is not None)
         return _Round(
             program=finer,
-            start=replace(old, x=x, multipliers=y, bound_multipliers=z),
+            starts=(replace(old, x=x, multipliers=y, bound_multipliers=z), x, *again_from),
             why=f"between its rows the plan leaves its limits: {' and '.join(what)}, and on from there",
         )
 
 
+def _with_effort(old: SolverResult, failed: SolverResult) -> SolverResult:
+    """The old result, with the effort of one that came to nothing too."""
+    effort = {key: getattr(old, key) + getattr(failed, key) for key in _EFFORT}
+    return replace(old, **effort)
+
+
 def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
     """The new result, with the effort of both."""
-    sums = ("iterations", "seconds", "seconds_functions", "seconds_qp")
     later = tuple(
         replace(r, iteration=old.iterations + r.iteration, seconds=old.seconds + r.seconds)
         for r in new.history
     )
-    effort = {key: getattr(old, key) + getattr(new, key) for key in sums}
+    effort = {key: getattr(old, key) + getattr(new, key) for key in _EFFORT}
     return replace(new, history=old.history + later, **effort)
 
 

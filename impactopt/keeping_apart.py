@@ -32,17 +32,12 @@ DEEPEST = 3  # spheres of a pair
 PATCH, CORNERS = 0.015, 4  # [m] of a side that may come next, and how many of its corners
 
 
-def keeps_apart(problem: ImpactProblem) -> bool:
-    """Whether a problem asks for any two bodies to keep apart."""
-    return problem.term(SelfCollision).enabled or problem.term(KeepOut).enabled
-
-
 class Margins:
     """How far each pair of a problem's bodies is to be apart [m]."""
 
     def __init__(self, problem: ImpactProblem) -> None:
         self.bodies: Bodies = problem.bodies
-        self.own, self.world = problem.term(SelfCollision), problem.term(KeepOut)
+        self.own, self.world = problem.self_collision, problem.keep_out
         self._start = Places.of(
             problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp)
         )
@@ -181,7 +176,7 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         for k, joint, other, gap in zip(near.at, near.joint, near.other, near.gap, strict=True):
             pair = bodies.known(int(joint), int(other))
             asked = margins.of(pair)
-            if not margins.term(pair).enabled or gap > asked or (missed and not motion.phase[k]):
+            if not margins.term(pair).enabled or gap > asked:
                 continue
             apart = bodies.exact(at, int(k), pair)
             if apart < (1 - share) * asked:
@@ -196,9 +191,11 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         # rows that are met, and yet it is too near there or beside: they are to ask for more
         more = 0.0
         here = bodies.exact(spots.at, spot, pair)
-        if known and here > (1 - SHARE) * margins.of(pair):  # the place is right, and the motion beside it is not
-            asked = [t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known]
-            more = max(0.0, *asked) + margins.of(pair) - max(apart, -DEEP)
+        if known and here > (1 - SHARE) * margins.of(
+            pair
+        ):  # the place is right, and the motion beside it is not
+            before = [t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known]
+            more = max(0.0, *before) + margins.of(pair) - max(apart, -DEEP)
         for k, held in enumerate(margins.held_around(spots.at, spot, pair, min(more, DEEP)), len(known)):
             rows[ApartRow(spots.names[spot], *pair, k)] = held
     if deepest > DEEP:

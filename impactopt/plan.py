@@ -231,11 +231,16 @@ class Plan:
             end=rest,
         )
 
-    def motion(self, step: float = 1e-3, *, missed: bool = False) -> Motion:
-        """What the robot's bodies are expected to do, every ``step`` [s] from start to rest.
+    def motion(
+        self, step: float = 1e-3, *, missed: bool = False, reference: Trajectory | None = None
+    ) -> Motion:
+        """What the robot's bodies are expected to do, about every ``step`` [s] from start to rest.
 
         In contact the robot is slower than the servo's reference: between the states before and after it goes
         the cubic that has both states' rates.
+
+        missed : after a blow that meets nothing, from the planned contact on; before it all is as planned.
+        reference : :meth:`trajectory`, if it is known: then the postures are its, at its instants.
 
         Raises
         ------
@@ -243,18 +248,27 @@ class Plan:
         """
         last, t1, _, _ = self.way(2, missed=missed)
         t0, end = self.contact_start, t1 + last.duration
-        times = [
-            np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t0, t1), (t1, end))
-        ]
-        before, _, _, _ = self.independent(0, times[0], missed=missed)
-        after, _, _, _ = self.independent(2, times[2], missed=missed)
-        during = self.through_contact((times[1] - t0) / max(t1 - t0, 1e-12), missed=missed)
-        time = np.concatenate(times)
-        phase = np.repeat([0, 1, 2], [len(t) for t in times])
+        within = np.linspace(t0, t1, max(2, round((t1 - t0) / step) + 1))
+        during = self._closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
+        if reference is not None:
+            parts = [
+                (reference.time[k], reference.q[k]) for k in (reference.phase == 0, reference.phase == 2)
+            ]
+        else:
+            spans = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t1, end))]
+            parts = [
+                (times, self._closed(self.independent(phase, times, missed=missed)[0]))
+                for phase, times in zip((0, 2), spans, strict=True)
+                if phase or not missed
+            ]
+        if missed:
+            parts = [(np.zeros(0), np.zeros((0, self.problem.robot.nq))), parts[-1]]
+        (before, q_before), (after, q_after) = parts
+        time = np.concatenate([before, within, after])
         return Motion(
             time=time,
-            phase=phase,
-            q=self._closed(np.concatenate([before, during, after])),
+            phase=np.repeat([0, 1, 2], [len(before), len(within), len(after)]),
+            q=np.concatenate([q_before, during, q_after]),
             travel=np.zeros(len(time)) if missed else self.travel(time),
         )
 

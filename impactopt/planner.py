@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.between import NO_MORE, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.keeping_apart import DEEP, Margins, keeps_apart, rows_near, rows_to_add
+from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add
 from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
@@ -82,7 +82,7 @@ def solve(
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
-    keep = None if not keeps_apart(problem) else Margins(problem)
+    keep = None if not problem.keeps_apart else Margins(problem)
     refining = _Refining(budget, keep, apart if given_solution else {}, between, report)
     t, fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began, refining.solve)
     return Solution(plan=t.decode(fields["result"].x), nodes=t.nodes, apart=t.apart_rows, **fields)

@@ -25,7 +25,7 @@ from impactopt.robot import Robot
 from impactopt.scenario import Scenario
 from impactopt.shapes import Obstacle, TargetBody
 from impactopt.stance import BothSoles, Stance
-from impactopt.terms import DEFAULT_TERMS, Incidence, Term, check_known, kind_of
+from impactopt.terms import DEFAULT_TERMS, Incidence, KeepOut, SelfCollision, Term, check_known, kind_of
 
 Array = NDArray[np.float64]
 __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
@@ -289,6 +289,21 @@ class ImpactProblem:
                 return reach(*given, facing=(np.array(hand.axis), direction))
         return reach(*given)
 
+    @property
+    def self_collision(self) -> SelfCollision:
+        """Its term, or one that lets links pass through each other."""
+        return self.extra(SelfCollision) or SelfCollision(enabled=False)
+
+    @property
+    def keep_out(self) -> KeepOut:
+        """Its term, or one that lets the robot pass through the world."""
+        return self.extra(KeepOut) or KeepOut(enabled=False)
+
+    @property
+    def keeps_apart(self) -> bool:
+        """Whether any two bodies are not to touch."""
+        return self.self_collision.enabled or self.keep_out.enabled
+
     @cached_property
     def bodies(self) -> Bodies:
         """All that can touch something: the robot's links and the world, and which pairs are not to.
@@ -312,6 +327,7 @@ class ImpactProblem:
             striking=int(
                 model.frames[model.getFrameId(self.robot.striker(self.striker).model_frame)].parentJoint
             ),
+            strict=self.keep_out.enabled,
             standing=tuple(int(model.frames[k].parentJoint) for k in soles),
         )
 

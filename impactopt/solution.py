@@ -154,7 +154,7 @@ class Solution(Solved):
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.brake is not None else (False,):
-            motion = self.plan.motion(missed=missed)
+            motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
             at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
             found, _, pair = bodies.nearest(at)
             if found < least:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
-from impactopt.keeping_apart import FAR, Margins, keeps_apart, missing_rows, rows_near
+from impactopt.keeping_apart import FAR, Margins, missing_rows, rows_near
 from impactopt.nlp.start import strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import block_functions
@@ -97,7 +97,7 @@ def optimize_strike(
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
-    margins = Margins(problem) if keeps_apart(problem) else None
+    margins = Margins(problem) if problem.keeps_apart else None
     t, fields = solve_from(
         t, _starts(t, given, starts, seed), budget, began, partial(_clear, budget, margins)
     )

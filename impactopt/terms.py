@@ -232,8 +232,6 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     Balance(),
     Incidence(),
     LegExtension(),
-    SelfCollision(),
-    KeepOut(),
 )
 
 

@@ -114,10 +114,11 @@ class Bodies:
         normal: Array,
         striking: int,
         standing: tuple[int, ...],
+        strict: bool,
     ) -> None:
         """start (nq,) : the posture in which what touches may touch for good.  normal (3,) : the blow's.
 
-        striking, standing : joints of the link that strikes, and of the soles that are held.
+        strict : whether a start in a body of the world is refused.  striking, standing : joints of the link that strikes, and of the soles that are held.
         """
         self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
         self.start, self.standing = start, standing
@@ -133,7 +134,7 @@ class Bodies:
                 mine = j == striking
                 if on_ground or (mine and body.strikable) or (body.core and not mine):
                     continue
-                if (body.of_target or w) and self.exact(at, 0, (j, -1 - w)) < 0:
+                if strict and w and self.exact(at, 0, (j, -1 - w)) < 0:
                     raise InputError(
                         f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start "
                         "from another posture, or move the body or make it smaller"

@@ -13,7 +13,7 @@ def scene_of(problem: ImpactProblem) -> Scene:
     """Target, contact and held soles of ``problem``."""
     p = problem
     return Scene(
-        solids=solids_of(p),
+        solids=solids_of(p) if p.keeps_apart else Solids(),
         point=p.point,
         normal=p.normal,
         law=p.law,

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.between import NO_MORE, nodes_to_add
+from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.nlp.contact_error import contact_error, refined_elements
+from impactopt.nlp.mesh import Elements
 from impactopt.nlp.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
@@ -50,7 +52,9 @@ def solve(
     options : the solver's own.  time_limit [s] : of the solver, for all starts together.
     between : whether a motion that leaves its limits between the nodes of its program gets more of them
         there, and is solved once more from where it is: while it gives up half of a margin somewhere, at most
-        thrice. ``Solution.nodes`` tells where they are.
+        thrice. ``Solution.nodes`` tells where they are. So does one whose contact is too coarse: it gets
+        finer elements while their error is more than half a per cent of the impulse (``Solution.elements``,
+        ``Solution.contact_error``).
     report : told in words what is being built; callback : called with every iteration's record; returning
         True, or Ctrl-C, stops with the best iterate.
 
@@ -63,9 +67,10 @@ def solve(
     check_solver(solver)
     check_starts(starts, seed, given=not isinstance(start, str))
     given: str | Array | SolverResult
-    nodes = NO_MORE
+    nodes: MoreNodes = NO_MORE
+    elements: Elements = ()
     if isinstance(start, Solution):
-        given, nodes = start.result, start.nodes
+        given, nodes, elements = start.result, start.nodes, start.elements
     else:
         given = start if isinstance(start, str) else check_array("start", start, (None,))
     if isinstance(given, str) and given not in STARTS:
@@ -74,19 +79,31 @@ def solve(
             f"unknown start {given!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
         )
     began = time.perf_counter()
-    functions = block_functions(problem, problem.coordinates, report)
-    t = Transcription(problem, problem.coordinates, functions, nodes)
+    functions = block_functions(problem, problem.coordinates, report, elements)
+    t = Transcription(problem, problem.coordinates, functions, nodes, elements)
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began)
-    solution = Solution(plan=t.decode(fields["result"].x), nodes=nodes, **fields)
+    solution = _solution(t, fields)
     for _ in range(_ROUNDS if between else 0):
         finer = _with_more_nodes(solution, t, budget, report)
         if finer is None:
             break
         solution, t = finer
     return solution
+
+
+def _solution(t: Transcription, fields: dict[str, Any]) -> Solution:
+    """What the best result of a program stands for."""
+    x, usable = fields["result"].x, fields["result"].status.usable
+    return Solution(
+        plan=t.decode(x),
+        nodes=t.nodes,
+        elements=t.elements if t.guarded else (),
+        contact_error=contact_error(t, x) if usable else None,
+        **fields,
+    )
 
 
 def _with_more_nodes(
@@ -100,15 +117,22 @@ def _with_more_nodes(
     nodes = t.nodes
     with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
         nodes = nodes_to_add(solution.plan, t.nodes)
-    if nodes == t.nodes:
+    elements = refined_elements(solution.contact_error, t.elements)
+    if nodes == t.nodes and elements is None:
         return None
     began, old = time.perf_counter(), solution.result
-    finer = Transcription(t.problem, t.coordinates, t.functions, nodes)
-    x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
-    start = replace(old, x=x, multipliers=y, bound_multipliers=z)
-    name = f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"
+    finer_elements = elements or solution.elements
+    functions = block_functions(t.problem, t.coordinates, report, finer_elements)
+    finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements)
+    start: Array | SolverResult
+    if solution.contact_error is not None and solution.contact_error.missed:
+        start = first_iterate(finer)  # such an optimum is none of the finer program, nor near one
+    else:
+        x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
+        start = replace(old, x=x, multipliers=y, bound_multipliers=z)
+    name = _more(nodes, elements)
     if report is not None:
-        report(f"the plan leaves its limits between nodes: {name}, and on from there")
+        report(f"the plan is not what it says between nodes: {name}, and on from there")
     fields = solve_from(finer, [(name, lambda: start)], budget, began)
     new = fields["result"]
     if not new.status.usable:
@@ -118,7 +142,14 @@ def _with_more_nodes(
         fields[key] += getattr(solution, key)
     before = tuple(replace(attempt, kept=False) for attempt in solution.attempts)
     fields["attempts"] = before + fields["attempts"]
-    return Solution(plan=finer.decode(new.x), nodes=nodes, **fields), finer
+    return _solution(finer, fields), finer
+
+
+def _more(nodes: MoreNodes, elements: Elements | None) -> str:
+    """What is more in a program, in words."""
+    words = [f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"] if nodes.total else []
+    words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
+    return ", ".join(words)
 
 
 def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:

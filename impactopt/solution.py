@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.between import NO_MORE, MoreNodes
+from impactopt.nlp.contact_error import ContactError
+from impactopt.nlp.mesh import Elements, contact_elements
 from impactopt.plan import Plan, Trajectory
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
@@ -72,16 +74,35 @@ class Solution(Solved):
 
     plan : the motion; for a status that is not usable, that of the best iterate.
     nodes : what its program had beside the ends and middles of its splines' intervals, as
-        :func:`impactopt.solve` adds them.  The rest: :class:`Solved`.
+        :func:`impactopt.solve` adds them.
+    elements : of the contact's phases, fractions of them, where it took finer ones than the problem asks for;
+        () where not.
+    contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
+        without duration, and where nothing usable was found.  The rest: :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
+    elements: Elements = ()
+    contact_error: ContactError | None = None
 
     @property
     def impulse(self) -> float:
         """Planned impulse to the target [N s]."""
         return self.plan.impulse
+
+    @property
+    def contact_elements(self) -> list[int]:
+        """How many each phase of the contact has; none of an impact without duration."""
+        if self.problem.collision != "dynamics":
+            return []
+        return [len(phase) for phase in self.elements or contact_elements(self.problem)]
+
+    @property
+    def contact_error_pct(self) -> float | None:
+        """Estimated error of the impulse [%]; None where there is no estimate, as an event is missed."""
+        error = self.contact_error
+        return error.pct if error is not None and np.isfinite(error.pct) else None
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -152,6 +173,8 @@ class Solution(Solved):
             "objectives": dict(self.objectives),
             "duration_s": plan.duration,
             "nodes_added": self.nodes.total,
+            "collision_elements": self.contact_elements,
+            "collision_error_pct": self.contact_error_pct,
             **plan.margins(self.trajectory),
             "versions": versions(),
         }

@@ -14,7 +14,7 @@ import casadi as ca
 from impactopt.coordinates import StanceCoordinates
 from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion, KeepOut, SelfCollision
 from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, make_block, striker_kinematics
-from impactopt.nlp.mesh import contact_mesh
+from impactopt.nlp.mesh import Elements, contact_mesh
 from impactopt.objectives import Effort, PeakForce, TargetEnergy
 from impactopt.problem import ImpactProblem
 from impactopt.shapes import Capsule
@@ -28,12 +28,17 @@ class ExtraBlock:
     build: Callable[[], BlockExpression]
 
 
-def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:
-    """Block's name -> the block, of what the problem's objectives and terms ask for."""
+def extra_blocks(
+    problem: ImpactProblem, c: StanceCoordinates, elements: Elements = ()
+) -> dict[str, ExtraBlock]:
+    """Block's name -> the block, of what the problem's objectives and terms ask for.
+
+    elements : of the contact, if not those that the problem asks for.
+    """
     kinds = {type(o) for o in problem.objectives}
     out: dict[str, ExtraBlock] = {}
     if PeakForce in kinds:
-        stages = len(contact_mesh(problem))
+        stages = len(contact_mesh(problem, elements))
         out["peak"] = ExtraBlock((stages,), lambda: peak(stages))
     if TargetEnergy in kinds:
         out["energy"] = ExtraBlock(problem.target.formula(), lambda: energy(problem.target))

@@ -254,6 +254,7 @@ def row(name: str, plan: PlanOf) -> dict[str, Any]:
             "iterations": solution.result.iterations,
             "seconds": solution.solve_seconds,
             "impulse_planned_Ns": solution.impulse,
+            "collision_error_pct": solution.contact_error_pct,
         }
         if not solution.status.usable:
             out["reason"] = solution.result.message

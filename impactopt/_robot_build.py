@@ -189,7 +189,8 @@ def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tupl
 def srdf_pairs(srdf: str | PathLike[str] | None) -> list[tuple[str, str]]:
     """Pairs of links that an SRDF excludes from collisions.
 
-    Not those of the reason "Never", which an assistant has sampled: here they are looked at, which costs little.
+    Not those of the reason "Never", which an assistant has sampled: here they are looked at, which costs
+    little.
     """
     if srdf is None:
         return []

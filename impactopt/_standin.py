@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from impactopt._links import Box, Link, add_links, link
 
-__all__ = ["GRIPPER_LENGTH", "LINKS", "PELVIS", "SOLE_CORNERS", "SOLE_HEIGHT", "standin_model"]
+__all__ = ["GRIPPER_LENGTH", "LINKS", "PELVIS", "SOLE_CORNERS", "SOLE_HEIGHT", "TOE", "standin_model"]
 
 # Between the hips, on their axes. With thigh, shank and ankle it stands at 0.705 m.
 PELVIS = Box(mass=9.0, sides=(0.16, 0.24, 0.20), center=(0.0, 0.0, 0.10))
@@ -93,6 +93,8 @@ LINKS = (
 # x and y from the ankle [m], left foot, counter-clockwise; the source has the right one's
 SOLE_CORNERS = np.array([[0.130, 0.075], [-0.100, 0.075], [-0.100, -0.056], [0.130, -0.056]])
 SOLE_HEIGHT = -0.105  # [m] from the ankle
+# [m] from the ankle, left foot: the middle of the front of the foot's box, 25 mm above the sole
+TOE = np.array([0.130, 0.0095, -0.080])
 
 
 def standin_model(*, floating: bool = True) -> Any:

@@ -69,7 +69,9 @@ class Margins:
         return Held(tuple(centre.tolist()), BEAD + self.of(pair) + more, plane, travel)
 
     def held_around(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> list[Held]:
-        """As :meth:`held`, and corners of the one link around, which come next where two flat sides slide or turn."""
+        """As :meth:`held`, and corners of the one link around, which come next where two flat sides slide or
+        turn.
+        """
         first = self.held(at, k, pair, more)
         assert first.facing is not None
         turn, _ = self.bodies.placement(at, k, pair[0])

@@ -11,17 +11,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.between import NO_MORE, nodes_to_add
+from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add
 from impactopt.nlp.apart import ApartRow, Held
+from impactopt.nlp.contact_error import ContactError, contact_error, refined_elements
+from impactopt.nlp.mesh import Elements
 from impactopt.nlp.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.nlp.strike import StrikeTranscription
 from impactopt.nlp.transcription import Transcription, block_functions
 from impactopt.problem import ImpactProblem
 from impactopt.program import Callback, SolverResult, Status
 from impactopt.solution import Solution
-from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, solve_from
+from impactopt.starts import (
+    Budget,
+    Starts,
+    attempt_of,
+    check_solver,
+    check_starts,
+    drawn,
+    solve_from,
+    violations_of,
+)
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
@@ -53,7 +64,9 @@ def solve(
     options : the solver's own.  time_limit [s] : of the solver, for all starts together.
     between : whether a motion that leaves its limits between the nodes of its program gets more of them
         there, and is solved once more from where it is: while it gives up half of a margin somewhere, at most
-        thrice. ``Solution.nodes`` tells where they are.
+        thrice. ``Solution.nodes`` tells where they are. So does one whose contact is too coarse: it gets
+        finer elements while their error is more than half a per cent of the impulse (``Solution.elements``,
+        ``Solution.contact_error``).
     report : told in words what is being built; callback : called with every iteration's record; returning
         True, or Ctrl-C, stops with the best iterate.
 
@@ -66,9 +79,11 @@ def solve(
     check_solver(solver)
     check_starts(starts, seed, given=not isinstance(start, str))
     given: str | Array | SolverResult
-    nodes, given_solution = NO_MORE, isinstance(start, Solution)
+    nodes: MoreNodes = NO_MORE
+    elements: Elements = ()
+    apart: Mapping[ApartRow, Held] = {}
     if isinstance(start, Solution):
-        given, nodes, apart = start.result, start.nodes, start.apart
+        given, nodes, elements, apart = start.result, start.nodes, start.elements, start.apart
     else:
         given = start if isinstance(start, str) else check_array("start", start, (None,))
     if isinstance(given, str) and given not in STARTS:
@@ -77,15 +92,53 @@ def solve(
             f"unknown start {given!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
         )
     began = time.perf_counter()
-    functions = block_functions(problem, problem.coordinates, report)
-    t = Transcription(problem, problem.coordinates, functions, nodes)
+    functions = block_functions(problem, problem.coordinates, report, elements)
+    t = Transcription(problem, problem.coordinates, functions, nodes, elements)
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
-    keep = None if not problem.keeps_apart else Margins(problem)
-    refining = _Refining(budget, keep, apart if given_solution else {}, between, report)
-    t, fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began, refining.solve)
-    return Solution(plan=t.decode(fields["result"].x), nodes=t.nodes, apart=t.apart_rows, **fields)
+    margins = Margins(problem) if problem.keeps_apart else None
+    refining = _Refining(budget, margins, apart, report)
+    # limbs that are in each other say nothing of what a start is worth: each is led to its end before they
+    # compare
+    each = refining.solve if margins is not None and between else refining.first
+    t, fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began, each)
+    if margins is None and between and fields["result"].status.usable:
+        t, fields = _on(refining, t, fields)
+    result = fields["result"]
+    return Solution(
+        plan=t.decode(result.x),
+        nodes=t.nodes,
+        elements=t.elements if t.guarded else (),
+        contact_error=contact_error(t, result.x) if result.status.usable else None,
+        apart=t.apart_rows,
+        **fields,
+    )
+
+
+def _on(
+    refining: _Refining, t: Transcription, fields: dict[str, Any]
+) -> tuple[Transcription, dict[str, Any]]:
+    """The best result's program with what it lacks, and the fields of its solution; a round is an attempt
+    more.
+    """
+    began, old = time.perf_counter(), fields["result"]
+    finer, result, rounds = refining.rounds(t, old, old.x)
+    if not rounds:
+        return t, fields
+    rows = finer.program.constraints(result.x)
+    attempts = [replace(a, kept=False) for a in fields["attempts"]]
+    for name, r in rounds:
+        attempts.append(attempt_of(finer, name, r))
+    attempts[-1] = replace(attempts[-1], kept=True)
+    return finer, {
+        **fields,
+        "result": result,
+        "solve_seconds": fields["solve_seconds"] + time.perf_counter() - began,
+        "violations": violations_of(finer, result.x, rows),
+        "objectives": finer.achieved(result.x),
+        "attempts": tuple(attempts),
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,16 +147,17 @@ class _Round:
 
     program: Transcription
     starts: tuple[Array | SolverResult, ...]
+    name: str
     why: str
 
 
 class _Refining:
-    """One start's way to a motion that is right between its program's rows too.
+    """The way from a program's solution to one that is right between its rows too.
 
-    A program has rows between the bodies that come near at its start, and nodes where its mesh has them. Where its
-    solution brings other bodies into each other, or leaves its limits between nodes, it gets rows and nodes there
-    and is solved again: from where it is; or, where limbs are deep in each other, from the start, as the way out may
-    lead nowhere.
+    A program has rows between the bodies that come near at its start, and nodes and elements where its mesh
+    has them. Where its solution brings other bodies into each other, leaves its limits between nodes, or has
+    a contact that is too coarse, it gets more of them there and is solved again: from where it is; or, where
+    limbs are deep in each other, from the start, as the way out may lead nowhere.
     """
 
     def __init__(
@@ -111,50 +165,58 @@ class _Refining:
         budget: Budget,
         margins: Margins | None,
         rows: Mapping[ApartRow, Held],
-        between: bool,
         report: Callable[[str], None] | None,
     ) -> None:
-        self.budget, self.margins, self.rows = budget, margins, rows
-        self.between, self.report = between, report
+        self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
+
+    def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        """The program with its first rows between bodies, and its result."""
+        if self.margins is not None:
+            warm = isinstance(start, SolverResult)
+            x0 = start.x if isinstance(start, SolverResult) else start
+            t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
+        return t, self.budget.run(t.program, start)
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
-        x0 = start.x if isinstance(start, SolverResult) else start
-        if self.margins is not None:
-            rows = (
-                self.rows if self.rows and isinstance(start, SolverResult) else rows_near(t, x0, self.margins)
-            )
-            t = t.with_apart(rows)
-        result = self.budget.run(t.program, start)
-        for again in range(_ROUNDS if self.between else 0):
-            if not result.status.usable or self.budget.left == 0:
-                return t, result
-            following = self._next(t, result, x0, again)
-            if following is None:
-                return t, result
+        t, result = self.first(t, start)
+        t, result, _ = self.rounds(t, result, start.x if isinstance(start, SolverResult) else start)
+        return t, self._judged(t, result)
+
+    def rounds(
+        self, t: Transcription, result: SolverResult, x0: Array
+    ) -> tuple[Transcription, SolverResult, list[tuple[str, SolverResult]]]:
+        """The last program that was solved, its result with the effort of all, and what came of each
+        round.
+        """
+        found: list[tuple[str, SolverResult]] = []
+        for again in range(_ROUNDS if self.margins is not None else _NODE_ROUNDS):
+            following = self._next(t, result, x0, again) if result.status.usable else None
+            if following is None or self.budget.left == 0:
+                break
             if self.report is not None:
                 self.report(following.why)
             for start in following.starts:
                 new = self.budget.run(following.program.program, start)
-                result = _one_after_the_other(result, new) if new.status.usable else _with_effort(result, new)
                 if new.status.usable or self.budget.left == 0:
                     break
             if not new.status.usable:
                 break
-            t = following.program
-        return t, self._judged(t, result) if self.between else result
+            t, result = following.program, _one_after_the_other(result, new)
+            found.append((following.name, new))
+        return t, result, found
 
     def _judged(self, t: Transcription, result: SolverResult) -> SolverResult:
         """A result that could not be mended is a solution only if nothing touches anything."""
-        if self.margins is None:
+        if self.margins is None or not result.status.usable:
             return result
         with contextlib.suppress(InputError):
             left = rows_to_add(t, result.x, self.margins, share=1.0)
             if left is not None and left.depth > 0:
                 names = sorted({" and ".join(self.margins.bodies.names(row[1:3])) for row in left.rows})
                 message = (
-                    f"Bodies are {1e3 * left.depth:.0f} mm in each other, and no solution was found where they are not: "
-                    f"{'; '.join(names[:3])}."
+                    f"Bodies are {1e3 * left.depth:.1f} mm in each other, and no solution was found where "
+                    f"they are not: {'; '.join(names[:3])}."
                 )
                 return replace(result, status=Status.FAILED, message=message)
         return result
@@ -162,36 +224,53 @@ class _Refining:
     def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> _Round | None:
         """What is to be solved next; None if the solution is right."""
         nodes, violated = t.nodes, None
+        elements: Elements | None = None
+        error: ContactError | None = None
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
-            nodes = nodes_to_add(t.decode(old.x), t.nodes) if again < _NODE_ROUNDS else t.nodes
             violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
-        if violated is None and nodes == t.nodes:
+        if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
+            return _Round(
+                program=t.with_apart({**t.apart_rows, **violated.rows}),
+                starts=(x0, old.x),
+                name="rows between bodies",
+                why=f"bodies are {1e3 * violated.depth:.0f} mm in each other: from the start again, with "
+                "rows between them",
+            )
+        if again < _NODE_ROUNDS:
+            with contextlib.suppress(InputError):
+                nodes = nodes_to_add(t.decode(old.x), t.nodes)
+            error = contact_error(t, old.x)
+            elements = refined_elements(error, t.elements)
+        if violated is None and nodes == t.nodes and elements is None:
             return None
         rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
-        if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
-            why = f"bodies are {1e3 * violated.depth:.0f} mm in each other: from the start again, with rows between them"
-            return _Round(program=t.with_apart(rows), starts=(x0, old.x), why=why)
-        if nodes == t.nodes:
-            finer = t.with_apart(rows)
+        finer = t
+        if nodes != t.nodes or elements is not None:
+            finer_elements = elements or (t.elements if t.guarded else ())
+            functions = block_functions(t.problem, t.coordinates, self.report, finer_elements)
+            finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements)
+        finer = finer.with_apart(rows) if self.margins is not None else finer
+        starts: tuple[Array | SolverResult, ...]
+        if error is not None and error.missed:
+            starts = (first_iterate(finer),)  # such an optimum is none of the finer program, nor near one
         else:
-            finer = Transcription(t.problem, t.coordinates, t.functions, nodes)
-            finer = finer.with_apart(rows)
-        x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
-        added = len(rows) - len(t.apart_rows)
-        again_from = (x0,) if finer.layout.n == len(x0) else ()
-        what = [f"{nodes.total - t.nodes.total} more nodes"] * (nodes != t.nodes)
-        what += [f"{added} more rows between bodies"] * (violated is not None)
+            x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
+            starts = (replace(old, x=x, multipliers=y, bound_multipliers=z),)
+        name = _more(nodes, elements, len(rows) - len(t.apart_rows))
         return _Round(
             program=finer,
-            starts=(replace(old, x=x, multipliers=y, bound_multipliers=z), x, *again_from),
-            why=f"between its rows the plan leaves its limits: {' and '.join(what)}, and on from there",
+            starts=starts,
+            name=name,
+            why=f"the plan is not what it says between nodes: {name}, and on from there",
         )
 
 
-def _with_effort(old: SolverResult, failed: SolverResult) -> SolverResult:
-    """The old result, with the effort of one that came to nothing too."""
-    effort = {key: getattr(old, key) + getattr(failed, key) for key in _EFFORT}
-    return replace(old, **effort)
+def _more(nodes: MoreNodes, elements: Elements | None, rows: int) -> str:
+    """What is more in a program, in words."""
+    words = [f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"] if nodes.total else []
+    words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
+    words += [f"{rows} more rows between bodies"] if rows else []
+    return ", ".join(words)
 
 
 def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:

@@ -19,7 +19,7 @@ import pinocchio as pin
 from impactopt import _arms
 from impactopt._robot_build import joint_names, lock_joints
 from impactopt._robot_parts import Source
-from impactopt._standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, standin_model
+from impactopt._standin import GRIPPER_LENGTH, SOLE_CORNERS, SOLE_HEIGHT, TOE, standin_model
 from impactopt.errors import InputError, did_you_mean
 from impactopt.robot import Robot, Sole, Striker
 
@@ -195,7 +195,8 @@ def standin(
     * Servo: as OpenHRP3's sample controller: Kp 8000 N m/rad in legs and chest, 3000 in the arms, Kd 100 N m
       s/rad in all of them; the neck, which is not in it, has the defaults of `Robot.from_model`.
     * Soles: 0.230 x 0.131 m, 0.105 m below the ankle.
-    * Strikers `right_hand`, `left_hand`: front of the closed gripper, on the forearm's axis.
+    * Strikers `right_hand`, `left_hand`: front of the closed gripper, on the forearm's axis; `right_toe`,
+      `left_toe`: middle of the foot's front, 25 mm above the sole.
     * Postures: `half_sitting`, knees bent by 0.7 rad, soles flat, elbows bent, hands in front;
       `on_left_foot`, the same with the weight on the left sole and the right foot 9 cm up.
 
@@ -229,6 +230,10 @@ def standin(
                 name=f"{side}_hand", frame=f"{side}_wrist_pitch", point=np.array([0.0, 0.0, -GRIPPER_LENGTH])
             )
             for side in ("right", "left")
+        )
+        + tuple(
+            Striker(name=f"{side}_toe", frame=f"{side}_ankle_roll", point=TOE * [1, sign, 1])
+            for side, sign in (("right", -1), ("left", 1))
         ),
         "postures": {
             name: {joint: x for joint, x in angles.items() if joint in joints}

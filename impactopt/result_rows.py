@@ -63,7 +63,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("impulse [N s]", "impulse_Ns", 2),
         ("peak force [N]", "peak_force_N", 0),
         ("contact time [ms]", "contact_ms", 1),
-        ("hand speed at contact [m/s]", "hand_speed_m_s", 3),
+        ("speed at contact [m/s]", "hand_speed_m_s", 3),
     ):
         yield number_row(label, [source.get(key) for source in sources], digits)
     yield from _target_rows([source.get("target") or {} for source in sources])
@@ -91,7 +91,7 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     rows = [
         number_row(label, [x.get(key) for x in sources], digits, scale=scale, least=least, most=most)
         for label, key, digits, scale, least, most in (
-            ("hand speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
+            ("speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
             ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
             ("impulse [N s]", "impulse_Ns", 3, 1.0, -np.inf, np.inf),
             ("peak force [N]", "peak_force_N", 1, 1.0, -np.inf, np.inf),

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.between import NO_MORE, MoreNodes
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.nlp.contact_error import ContactError
+from impactopt.nlp.mesh import Elements, contact_elements
 from impactopt.plan import Plan, Trajectory
 from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
@@ -74,17 +76,36 @@ class Solution(Solved):
     plan : the motion; for a status that is not usable, that of the best iterate.
     nodes : what its program had beside the ends and middles of its splines' intervals, as
         :func:`impactopt.solve` adds them.
+    elements : of the contact's phases, fractions of them, where it took finer ones than the problem asks for;
+        () where not.
+    contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
+        without duration, and where nothing usable was found.
     apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
     apart: Mapping[Any, Any] = field(default_factory=dict)
+    elements: Elements = ()
+    contact_error: ContactError | None = None
 
     @property
     def impulse(self) -> float:
         """Planned impulse to the target [N s]."""
         return self.plan.impulse
+
+    @property
+    def contact_elements(self) -> list[int]:
+        """How many each phase of the contact has; none of an impact without duration."""
+        if self.problem.collision != "dynamics":
+            return []
+        return [len(phase) for phase in self.elements or contact_elements(self.problem)]
+
+    @property
+    def contact_error_pct(self) -> float | None:
+        """Estimated error of the impulse [%]; None where there is no estimate, as an event is missed."""
+        error = self.contact_error
+        return error.pct if error is not None and np.isfinite(error.pct) else None
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -148,8 +169,8 @@ class Solution(Solved):
 
     def clearance(self) -> dict[str, Any]:
         """How far bodies are apart in the plan, and what touches what, by exact geometry at 1 ms: the keys
-        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow are among
-        them, and say so.
+        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow
+        are among them, and say so.
         """
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
@@ -175,6 +196,8 @@ class Solution(Solved):
             "objectives": dict(self.objectives),
             "duration_s": plan.duration,
             "nodes_added": self.nodes.total,
+            "collision_elements": self.contact_elements,
+            "collision_error_pct": self.contact_error_pct,
             **plan.margins(self.trajectory),
             **self.clearance(),
             "versions": versions(),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError, did_you_mean
 from impactopt.ipopt import solve_ipopt
-from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, worst_rows
+from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
 from impactopt.sqp import SQPOptions, solve_sqp
 
 if TYPE_CHECKING:
@@ -137,7 +137,8 @@ def solve_from(
     began: float,
     work: Callable[[Program, Array | SolverResult], tuple[Program, SolverResult]] | None = None,
 ) -> tuple[Program, dict[str, Any]]:
-    """The program of the best result from these starts, and the fields of its :class:`impactopt.solution.Solved`.
+    """The program of the best result from these starts, and the fields of its
+    :class:`impactopt.solution.Solved`.
 
     starts : name, and what makes its x (n,) when its turn comes. An interrupted solve is the last one, and so
     is one after which no time is left.  began [s] : when work on the problem did.
@@ -151,17 +152,7 @@ def solve_from(
         start = make()
         program, result = (t, budget.run(t.program, start)) if work is None else work(t, start)
         found.append((program, result))
-        attempts.append(
-            Attempt(
-                start=name,
-                status=result.status,
-                impulse=program.impulse(result.x),
-                objective=result.objective,
-                max_violation=result.max_violation,
-                iterations=result.iterations,
-                seconds=result.seconds,
-            )
-        )
+        attempts.append(attempt_of(program, name, result))
         if result.status is Status.INTERRUPTED or budget.left == 0:
             break
     order = [_rank(result) for _, result in found]
@@ -175,10 +166,28 @@ def solve_from(
         "solver": budget.solver,
         "build_seconds": built - began,
         "solve_seconds": solved - built,
-        "violations": tuple(worst_rows(t.program, result.x, rows, tolerance=VIOLATED, count=NAMED)),
+        "violations": violations_of(t, result.x, rows),
         "objectives": t.achieved(result.x),
         "attempts": tuple(attempts),
     }
+
+
+def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
+    """What came of a start, or of a round, of that name."""
+    return Attempt(
+        start=name,
+        status=result.status,
+        impulse=t.impulse(result.x),
+        objective=result.objective,
+        max_violation=result.max_violation,
+        iterations=result.iterations,
+        seconds=result.seconds,
+    )
+
+
+def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, ...]:
+    """What is not met at solver variables (n,), whose rows are (m,), worst first."""
+    return tuple(worst_rows(t.program, x, rows, tolerance=VIOLATED, count=NAMED))
 
 
 def _rank(result: SolverResult) -> tuple[bool, float]:

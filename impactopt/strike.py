@@ -107,7 +107,9 @@ def optimize_strike(
 def _clear(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """A strike whose bodies keep apart: with rows between those that come near, more of them where they do not."""
+    """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
+    not.
+    """
     x0 = start.x if isinstance(start, SolverResult) else start
     if margins is None:
         return t, budget.run(t.program, x0)

@@ -197,6 +197,7 @@ SCRIPTS = {
     "place": "(() => { const v = page.clock.view, t = page.header.tracks[0]; "
     "const now = v.instant(t, 0.05); "
     "return Array.from({length: now.joints}, (_, j) => [...v.pose(now, j)]); })()",
+    "seen": "[0, 0.5, 0.75, 1, 2].map((s) => page.clock.view.seen(-s * page.header.far))",
     "switch": f"(document.getElementById('theme').click(), [{THEME}, {PAPER}])",
 }
 
@@ -248,6 +249,10 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
     track = tracks_of(record, solution.problem)[0]
     places = np.array([pin.XYZQUATToSE3(place).homogeneous.T for place in track.places[0]])  # it stands still
     np.testing.assert_allclose(np.reshape(wide["place"], (-1, 4, 4)), places, atol=1e-5)
+
+
+def test_a_target_that_flies_off_fades(seen: list[dict[str, Any]]) -> None:
+    assert seen[0]["seen"] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0]), "over the second half of its way"
 
 
 def test_without_3d_the_plots_still_work(page: Path) -> None:

@@ -115,6 +115,45 @@ def test_the_posture_on_one_foot_is_at_rest_on_it() -> None:
         dataclasses.replace(problem, start="half_sitting")
 
 
+KICKS = sorted(name for name in FILES if name.startswith("kick"))
+BALL = 0.11  # [m] radius
+
+
+@pytest.mark.parametrize("name", KICKS)
+def test_a_kick_meets_the_middle_of_a_ball_with_the_front_of_the_foot(name: str) -> None:
+    problem = load_problem(name)
+    robot, model = problem.robot, problem.robot.model
+    assert problem.stance == OneSole("left") and problem.point[2] == pytest.approx(BALL)
+    assert problem.normal[2] == 0.0, "level: it meets the ball beside its middle"
+    # the toe is in front of the right sole's edge or on it, above the sole and below the middle of the ball
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, problem.start_posture)
+    sole = robot.sole("right")
+    place = data.oMf[model.getFrameId(sole.frame)]
+    toe = place.actInv(data.oMf[model.getFrameId("striker:right_toe")].translation)
+    assert sole.polygon[:, 0].max() <= toe[0] < sole.polygon[:, 0].max() + 0.03
+    assert 0.0 < toe[2] < BALL and sole.polygon[:, 1].min() < toe[1] < sole.polygon[:, 1].max()
+    # at rest the right foot is flat in the air beside the left one, and the ball is ahead of it
+    np.testing.assert_allclose(place.rotation[:, 2], [0, 0, 1], atol=2e-3)
+    assert place.translation[2] > 0.05
+    assert place.translation[1] < data.oMf[model.getFrameId(robot.sole("left").frame)].translation[1] - 0.1
+    assert place.act(toe)[0] < problem.point[0]
+
+
+def test_the_stand_ins_toes_are_at_the_front_of_its_feet() -> None:
+    robot = standin()
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.posture("half_sitting"))
+    # standing, the box of a foot is from the ground to 5 cm above it
+    for side in ("left", "right"):
+        sole = robot.sole(side)
+        ground = data.oMf[robot.model.getFrameId(sole.frame)]
+        toe = ground.actInv(data.oMf[robot.model.getFrameId(f"striker:{side}_toe")].translation)
+        front = sole.polygon[:, 0].max()
+        middle = (sole.polygon[:, 1].max() + sole.polygon[:, 1].min()) / 2
+        np.testing.assert_allclose(toe, [front, middle, 0.025], atol=1e-12)
+
+
 # ---- arms
 
 

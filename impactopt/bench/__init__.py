@@ -4,5 +4,5 @@
 * report.py      what a bench gives: numbers, tables, pictures; how they are kept
 * planning.py    from a problem file to a plan worth replaying
 * command.py     the command line
-* truth.py, robustness.py, replay.py, baselines.py, margins.py    one bench a file, each with a function `run`
+* truth.py, robustness.py, replay.py, zoo.py and the others    one bench a file, each with a function `run`
 """

@@ -28,6 +28,7 @@ Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn conditions.
 Seed = Annotated[int, typer.Option(min=0, help="Of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
 FEW_DRAWS = 10  # of the bench margins among all others, which has a dozen plans to replay
+FEW_PROBLEMS = 9  # of the bench zoo among all others
 
 
 @app.command()
@@ -186,6 +187,28 @@ def solve(
     _run(["solve"], {"solve": options}, as_json, out, quiet)
 
 
+@app.command()
+def zoo(
+    random: Annotated[
+        int | None,
+        typer.Option("--random", min=1, metavar="N", help="Draw N problems (default: those of problems/)."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="NAME", help="Problems of this robot only, as talos.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Take up what results/bench/zoo.jsonl has.")
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Problems that nobody has tuned, drawn at random: solved from one start, do they stand on free soles?"""
+    options = {"random": random, "robot": robot, "resume": resume, "seed": seed}
+    _run(["zoo"], {"zoo": options}, as_json, out, quiet)
+
+
 @app.command("all")
 def run_all(
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
@@ -208,6 +231,7 @@ def run_all(
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},
         "solve": {"quick": True, "seed": seed},
+        "zoo": {"random": FEW_PROBLEMS, "seed": seed},
     }
     _run(list(BENCHES), options, as_json, out, quiet, together=True)
 

@@ -26,6 +26,7 @@ BENCHES = {
     "skip": "skip",
     "stability": "stability",
     "solve": "solve",
+    "zoo": "zoo",
 }
 
 

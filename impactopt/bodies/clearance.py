@@ -118,7 +118,8 @@ class Bodies:
     ) -> None:
         """start (nq,) : the posture in which what touches may touch for good.  normal (3,) : the blow's.
 
-        strict : whether a start in a body of the world is refused.  striking, standing : joints of the link that strikes, and of the soles that are held.
+        strict : whether a start in a body of the world is refused.  striking, standing : joints of the link
+        that strikes, and of the soles that are held.
         """
         self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
         self.start, self.standing = start, standing

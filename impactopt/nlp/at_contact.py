@@ -17,7 +17,7 @@ from impactopt.nlp.collision import Collision
 from impactopt.nlp.extra_terms import add_extra_terms
 from impactopt.nlp.impulse import InstantImpact
 from impactopt.nlp.layout import Affine, Array, Group
-from impactopt.nlp.mesh import contact_mesh
+from impactopt.nlp.mesh import Elements, contact_elements, contact_mesh
 from impactopt.nlp.objective import Prices, assemble, quantities
 from impactopt.nlp.rows import Index, Measure, Place, Rank, millimetres, percent
 from impactopt.nlp.structured import StructuredProgram
@@ -37,8 +37,8 @@ def rotation_rows(normal: Array) -> Array:
 
 
 class BodyState(NamedTuple):
-    """Where the robot is at a place: phase (0 before contact, 2 after it, 3 after one that met nothing), the place's
-    name, time [s] since the start, and configuration (nq,).
+    """Where the robot is at a place: phase (0 before contact, 2 after it, 3 after one that met nothing), the
+    place's name, time [s] since the start, and configuration (nq,).
     """
 
     phase: int
@@ -60,6 +60,7 @@ class ContactProgram(Builder):
     contact_T: Affine
     contact_legs: Affine
     contact_w: Affine
+    elements: Elements = ()  # of the contact; none: those that the problem asks for
 
     def _hit(self, *, after: bool, rates: dict[str, Any] | None = None) -> None:
         """Variables of the hit.
@@ -67,7 +68,10 @@ class ContactProgram(Builder):
         after : the position after the expected one is among them.  rates : bounds of the rates at contact.
         """
         p, labels = self.problem, self.coordinates.labels
-        self.stages = contact_mesh(p)
+        # finer elements are there because a plan was wrong on others: it may have pulled within a phase
+        self.guarded = bool(self.elements)
+        self.elements = self.elements or contact_elements(p)
+        self.stages = contact_mesh(p, self.elements)
         compression, restitution, _ = p.law.formula()
         self.law_switches = compression != restitution
         self.law_pulls = float(p.law.branch(1e-6, -10.0, False)) < 0  # when bodies part fast

@@ -21,6 +21,7 @@ from impactopt.nlp.lanes import LANES
 
 FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
 DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
+RESTITUTING = 6  # which parameter of `force` says so
 
 
 @dataclass(frozen=True)

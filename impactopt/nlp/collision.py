@@ -78,7 +78,7 @@ class Collision:
         self.legs = add("collision legs", t.nl, **t.of_legs)
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
-        least = 0.0 if p.target.events or t.law_pulls else np.where(last, 0.0, -np.inf)
+        least = 0.0 if p.target.events or t.law_pulls or t.guarded else np.where(last, 0.0, -np.inf)
         most = np.where(last, 0.0, np.inf)
         self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))

@@ -14,7 +14,7 @@ import casadi as ca
 from impactopt.coordinates import StanceCoordinates
 from impactopt.extra_terms import Gaze, HandOrientation, HitCone, HitRegion
 from impactopt.nlp.blocks import FORCE_SCALE, BlockExpression, builders, make_block, striker_kinematics
-from impactopt.nlp.mesh import contact_mesh
+from impactopt.nlp.mesh import Elements, contact_mesh
 from impactopt.nlp.own_blocks import key_of, own_blocks
 from impactopt.objectives import Effort, Objective, PeakForce, TargetEnergy
 from impactopt.problem import ImpactProblem
@@ -29,12 +29,17 @@ class ExtraBlock:
     build: Callable[[], BlockExpression]
 
 
-def extra_blocks(problem: ImpactProblem, c: StanceCoordinates) -> dict[str, ExtraBlock]:
-    """Block's name -> the block, of what the problem's objectives and terms ask for."""
+def extra_blocks(
+    problem: ImpactProblem, c: StanceCoordinates, elements: Elements = ()
+) -> dict[str, ExtraBlock]:
+    """Block's name -> the block, of what the problem's objectives and terms ask for.
+
+    elements : of the contact, if not those that the problem asks for.
+    """
     kinds = {kind_of(o, Objective) for o in problem.objectives}
     out: dict[str, ExtraBlock] = {}
     if PeakForce in kinds:
-        stages = len(contact_mesh(problem))
+        stages = len(contact_mesh(problem, elements))
         out["peak"] = ExtraBlock((stages,), lambda: peak(stages))
     if TargetEnergy in kinds:
         out["energy"] = ExtraBlock(problem.target.formula(), lambda: energy(problem.target))

@@ -13,6 +13,7 @@ from impactopt.motion import Radau
 from impactopt.problem import ImpactProblem
 
 Array = NDArray[np.float64]
+Elements = tuple[tuple[float, ...], ...]  # lengths of each phase's, as fractions of it
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Stage:
 
     @property
     def name(self) -> str:
-        return f"{self.phase_name}, {100 * self.place:.0f} %"
+        return f"{self.phase_name}, {100 * self.place:.3g} %"  # short elements: several within one per cent
 
 
 def collision_mesh(
@@ -63,18 +64,29 @@ def collision_mesh(
     return stages
 
 
-def contact_mesh(problem: ImpactProblem) -> list[Stage]:
-    """Stages of the contact of a problem; elements are halved if its target has events.
+def contact_elements(problem: ImpactProblem) -> Elements:
+    """Those that a problem asks for, of each phase of its contact; halved if its target has events.
 
     Where an event may come at once, the phase before it is one element.
     """
     target, (first, last) = problem.target, problem.collision_elements
     if target.events:
-        first, last = (tuple(h / 2 for h in lengths for _ in range(2)) for lengths in (first, last))
+        first, last = halved((first, last))
     before = [first] * (len(target.phases) - 1)
     if target.at_once:
         before[0] = (1.0,)
-    return collision_mesh([*before, last], Radau.of_stages(problem.collision_stages), target.phases)
+    return (*before, last)
+
+
+def halved(elements: Elements) -> Elements:
+    """Each of them in two."""
+    return tuple(tuple(h / 2 for h in lengths for _ in range(2)) for lengths in elements)
+
+
+def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> list[Stage]:
+    """Stages of the contact of a problem; ``elements``: if not those that it asks for."""
+    radau = Radau.of_stages(problem.collision_stages)
+    return collision_mesh(elements or contact_elements(problem), radau, problem.target.phases)
 
 
 def percentage(s: float, more: Collection[float]) -> str:

@@ -14,6 +14,8 @@ from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError
 from impactopt.motion import CubicSpline, basis, quintic, rate_weights
 from impactopt.nlp.at_contact import ContactProgram
+from impactopt.nlp.collision import Collision
+from impactopt.nlp.finer_contact import carry_contact, same_places
 from impactopt.nlp.layout import Array, Group
 from impactopt.nlp.mesh import with_middles
 from impactopt.nlp.strike import StrikeTranscription
@@ -119,10 +121,12 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
 
 
 def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one.
+    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements.
 
-    What is at nodes is between those of the old nodes; multipliers are those of the same rows and variables.
+    What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
+    multipliers are those of the same rows and variables.
     """
+    stages = same_places(t.stages, old.stages)
     places = {"swing": (old.swing_nodes, t.swing_nodes)}
     places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
@@ -133,15 +137,20 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
         if known.labels != group.labels:  # of one vector with a part for each node, which its label names
             _carry_by_label(group, known, (new, x), (bounds, z))
             continue
-        values, own = known.read(x), (z[known.index(k)] for k in range(known.count))
-        here = np.arange(group.count)
-        if known.count != group.count:
+        pairs = [(k, k) for k in range(group.count)]
+        if name.split()[0] in places and known.count != group.count:
             before, now = places[name.split()[0]]
-            here = np.flatnonzero(np.isin(now, before))
-            values = np.column_stack([np.interp(now, before, column) for column in values.T])
-        group.write(new, values)
-        for k, multipliers in zip(here, own, strict=True):
-            bounds[group.index(int(k))] = multipliers
+            pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
+            group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
+        elif known.count == len(old.stages) and known.count != group.count:
+            pairs = stages
+        else:
+            group.write(new, known.read(x))
+        for i, k in pairs:
+            bounds[group.index(i)] = z[known.index(k)]
+    for mine, its in zip(t.collisions, old.collisions, strict=True):
+        if t.elements != old.elements and isinstance(mine, Collision) and isinstance(its, Collision):
+            carry_contact(mine, its, new, x)
     of_rows = dict(zip(_keys(old), y, strict=True))
     rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
     return _finished(t, new), rows, bounds

@@ -26,7 +26,7 @@ from impactopt.nlp.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.nlp.follow import FollowThrough
 from impactopt.nlp.lanes import in_lanes
 from impactopt.nlp.layout import Affine, Array, Group, add, stack
-from impactopt.nlp.mesh import percentage, with_middles
+from impactopt.nlp.mesh import Elements, percentage, with_middles
 from impactopt.nlp.objective import Prices, motion_prices
 from impactopt.nlp.rows import Index, Measure, Place, Rank, along, by_leg, degrees, percent, rates
 from impactopt.nlp.structured import derivative_functions
@@ -37,9 +37,15 @@ from impactopt.support import support_polygon
 
 
 def block_functions(
-    problem: ImpactProblem, coordinates: StanceCoordinates, report: Callable[[str], None] | None = None
+    problem: ImpactProblem,
+    coordinates: StanceCoordinates,
+    report: Callable[[str], None] | None = None,
+    elements: Elements = (),
 ) -> dict[str, Any]:
-    """The compiled blocks (value, Jacobian, Hessian) of a problem, from the cache where they are in it."""
+    """The compiled blocks (value, Jacobian, Hessian) of a problem, from the cache where they are in it.
+
+    elements : of the contact, if not those that the problem asks for; a peak of its forces depends on them.
+    """
     robot = problem.robot
     edges = len(support_polygon(robot, coordinates))
     recipe = (
@@ -58,7 +64,7 @@ def block_functions(
     instant = problem.collision != "dynamics"
     builders = symbolic.builders(coordinates, problem.striker, problem.law, target, edges, instant=instant)
     found = {name: ExtraBlock(contact if name == "force" else (), build) for name, build in builders.items()}
-    for name, block in {**found, **extra_blocks(problem, coordinates)}.items():
+    for name, block in {**found, **extra_blocks(problem, coordinates, elements)}.items():
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
             b = block.build()
@@ -73,6 +79,7 @@ class Transcription(ContactProgram):
     """The program of one problem, with the groups that its solution is read from.
 
     nodes : beside the ends and middles of the splines' intervals.
+    elements : of the contact; none: those that the problem asks for.
     """
 
     def __init__(
@@ -81,9 +88,10 @@ class Transcription(ContactProgram):
         coordinates: StanceCoordinates,
         functions: dict[str, Any],
         nodes: MoreNodes = NO_MORE,
+        elements: Elements = (),
     ) -> None:
         super().__init__(problem, coordinates, functions)
-        self.nodes = nodes
+        self.nodes, self.elements = nodes, elements
         self.swing_breaks = graded_breaks(problem.swing.intervals, problem.swing.grading, fine_end=True)
         self.follow_breaks = graded_breaks(problem.follow.intervals, problem.follow.grading, fine_end=False)
         # the swing's start is given

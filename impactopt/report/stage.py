@@ -13,7 +13,7 @@ from impactopt.contact.nail import Nail
 from impactopt.contact.targets import RigidWall, Target
 from impactopt.output import Record
 from impactopt.problem import ImpactProblem
-from impactopt.report.tracks import AROUND, Track, tracks_of
+from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.report.visuals import Visual, visuals_of
 from impactopt.shapes import face_axes
 
@@ -58,6 +58,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
         "side": _middle(arrays["track0_places"]),
         "weight": 9.81 * float(sum(i.mass for i in problem.robot.model.inertias)),
         "around": AROUND,
+        "far": FAR,
         "legged": len(record.arrays["polygon"]) > 0,
     }
     return header, arrays

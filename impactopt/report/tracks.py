@@ -13,13 +13,13 @@ from impactopt.output import Record
 from impactopt.problem import ImpactProblem
 from impactopt.validation.result import centre_of_pressure
 
-__all__ = ["AROUND", "Track", "planned_hand_speed", "tracks_of"]
+__all__ = ["AROUND", "FAR", "Track", "planned_hand_speed", "tracks_of"]
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
 FRAME, FINE = 1 / 30, 1 / 500  # [s] between instants, and around contact
 AFTER = 1.0  # [s] shown beyond the end of the planned motion
-FAR = 1.0  # [m] that a target that flies off is followed
+FAR = 3.0  # [m] that a target that flies off is followed; it fades on the second half of that
 
 # name of each motion in a record, and the prefix of its arrays
 MOTIONS = (("planned", "reference"), ("simulated", "simulated"), ("free soles", "replayed"))
@@ -31,9 +31,9 @@ class Track:
 
     time (k,) [s]; places (k, joints, 7): each joint of the model in the world, position [m] and quaternion
     x, y, z, w, the universe first; hand, mass (k, 3) [m]: striking point and centre of mass; force (k,) [N]
-    on the target, along its normal; travel (k,) [m] of the target along it; zmp (k, 2) [m] and ground (k, 3)
-    [N], the ground's force on the robot, nan where nothing presses or nothing is known of it. contact_start,
-    contact_end [s], nan without contact.
+    on the target, along its normal; travel (k,) [m] of the target along it, at most FAR; zmp (k, 2) [m] and
+    ground (k, 3) [N], the ground's force on the robot, nan where nothing presses or nothing is known of it.
+    contact_start, contact_end [s], nan without contact.
     """
 
     name: str

@@ -1,5 +1,5 @@
-"""How far the bodies of a replay kept from each other, by exact geometry: apart from the engines, which know of none
-of it or of their own.
+"""How far the bodies of a replay kept from each other, by exact geometry: apart from the engines, which know
+of none of it or of their own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ STEP = 1e-3  # [s] at which a replay is looked at
 
 
 def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation:
-    """The simulation with its least clearance; and what touched what, where the engine has not said so itself."""
+    """The simulation with its least clearance; and what touched what, where the engine has not said so
+    itself.
+    """
     time = simulation.time
     steps = np.diff(time) * (simulation.target_speed[1:] + simulation.target_speed[:-1]) / 2
     travel = np.concatenate([[0.0], np.cumsum(steps)])

@@ -64,9 +64,9 @@ def build_world(
 
     Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
     the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
-    anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid <number>``, and
-    bodies of the world; those that move with the target are on the mocap body ``target``. The contact law between
-    target and striker is the engine's business.
+    anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid
+    <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
+    The contact law between target and striker is the engine's business.
     """
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()

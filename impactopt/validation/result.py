@@ -49,8 +49,8 @@ class Scene:
     point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; law, target:
     the contact's force and the target's motion; striker: frame of the model that hits; soles: frames of the
     model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
-    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what else can
-    touch.
+    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
+    else can touch.
     """
 
     point: Array
@@ -79,9 +79,9 @@ class Simulation:
     name and unit (``speed_m_s``, ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
     than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
     engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
-    that ends farthest from the reference's last posture.  touched: what touched that should not have, where the
-    engine's solids push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
-    geometry, and which two.  missed: there was no target.
+    that ends farthest from the reference's last posture.  touched: what touched that should not have, where
+    the engine's solids push back.  clearance [m], nearest: the least distance of any two bodies that are not
+    to touch, by exact geometry, and which two.  missed: there was no target.
     """
 
     engine: str

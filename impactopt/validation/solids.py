@@ -22,8 +22,8 @@ class Solid:
     """A convex solid: of the link that a joint of the model moves, or of the world.
 
     name : of the link, or of the body.  joint : index in the model; 0: of the world.
-    vertices (k, 3) [m] : of a hull, in the joint's frame; None: a box with half sides ``half`` (3,) [m], inflated by
-    ``radius`` [m], at ``place`` (3,) with axes ``rotation`` (3, 3).
+    vertices (k, 3) [m] : of a hull, in the joint's frame; None: a box with half sides ``half`` (3,) [m],
+    inflated by ``radius`` [m], at ``place`` (3,) with axes ``rotation`` (3, 3).
     of_target : it is there only if the target is.  moves : with it.  before : it is gone after contact.
     """
 
@@ -94,8 +94,8 @@ class Solids:
 
 @dataclass(frozen=True, kw_only=True)
 class Touched:
-    """Two that touched what they should not: names, from when till when [s], how deep [m] and with which force [N] at
-    most; no force where nothing pushes back.
+    """Two that touched what they should not: names, from when till when [s], how deep [m] and with which
+    force [N] at most; no force where nothing pushes back.
     """
 
     one: str

@@ -223,11 +223,14 @@ class View {
     const poses = this.bodies.map((body) => this.pose(now, body.joint));
     const [travel] = now.mix("travel", 1);
     const pushed = scaled(header.normal.map((x) => x * travel), 1);
-    if (header.legged) this.shadow(poses, pushed);
+    const seen = this.seen(travel);
+    if (header.legged) this.shadow(poses, pushed, seen);
     gl.depthMask(true);
 
     this.bodies.forEach((body, b) => this.put(body.buffer, poses[b], body.colour));
-    for (const part of this.target) this.put(part.buffer, part.moves ? pushed : still, part.moves ? themeColour("target") : themeColour("wood"));
+    for (const part of this.target)
+      if (!part.moves) this.put(part.buffer, still, themeColour("wood"));
+      else if (seen > 0) this.put(part.buffer, pushed, themeColour("target"), 0, seen);
     if (shown.paths) this.put(this.paths[k].hand, still, themeColour("path"), 1, 0.8);
 
     gl.clear(gl.DEPTH_BUFFER_BIT); // what follows is seen through the robot
@@ -236,13 +239,20 @@ class View {
     return numbers;
   }
 
-  shadow(poses, pushed) {
+  // a target that flies off moves on at its speed, and fades: it is no longer part of what is shown
+  seen(travel) {
+    return Math.min(1, Math.max(0, 2 - (2 * Math.abs(travel)) / this.header.far));
+  }
+
+  shadow(poses, pushed, seen) {
     const gl = this.gl, flat = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, -0.25, 0.3, 0, 0, 0, 0, 0.0005, 1]);
     gl.enable(gl.STENCIL_TEST);
     gl.stencilFunc(gl.EQUAL, 0, 255);
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
     this.bodies.forEach((body, b) => this.put(body.buffer, times(flat, poses[b]), [0, 0, 0], 1, 0.2));
-    for (const part of this.target) this.put(part.buffer, times(flat, part.moves ? pushed : scaled([0, 0, 0], 1)), [0, 0, 0], 1, 0.2);
+    for (const part of this.target)
+      if (!part.moves) this.put(part.buffer, flat, [0, 0, 0], 1, 0.2);
+      else if (seen > 0) this.put(part.buffer, times(flat, pushed), [0, 0, 0], 1, 0.2 * seen);
     gl.disable(gl.STENCIL_TEST);
   }
 

@@ -28,6 +28,7 @@ from impactopt.terms import (
     KeepOut,
     LegExtension,
     PositionLimit,
+    SelfCollision,
     Term,
     TorqueLimit,
     VelocityLimit,

@@ -19,7 +19,7 @@ from impactopt.bodies.clearance import Places
 from impactopt.bodies.fit import PLANES, Planes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.coordinates import StanceCoordinates
-from impactopt.keeping_apart import BEAD, Margins, keeps_apart, missing_rows, rows_near, rows_to_add, spots_of
+from impactopt.keeping_apart import BEAD, Margins, missing_rows, rows_near, rows_to_add, spots_of
 from impactopt.nlp.apart import LENGTHS, ROUND, ApartRow, Chain, Held, apart, chain_between
 from impactopt.nlp.start import first_iterate
 from impactopt.nlp.structured import derivative_functions
@@ -30,8 +30,10 @@ from impactopt.problem import ImpactProblem
 from impactopt.program import Status
 from impactopt.robot import Robot
 from impactopt.solution import Solution
+from impactopt.terms import Term
 
 Array = NDArray[np.float64]
+APART = (SelfCollision(), KeepOut())
 LEVELS = int(np.log2(PLANES))  # at which two of what is left of the planes pass into each other
 ROUNDED = LEVELS * ROUND / 2  # [m] at most
 BY_LENGTH: dict[int, Any] = {}
@@ -158,6 +160,10 @@ def test_a_row_says_what_planes_and_sphere_do(name: str) -> None:
 # ---- programs
 
 
+def margins_of(t: Transcription, terms: tuple[Term, ...] = APART) -> Margins:
+    return Margins(dataclasses.replace(t.problem, terms=terms))
+
+
 @pytest.fixture(scope="module")
 def programs(
     arm_transcription: Transcription, biped_transcription: Transcription
@@ -166,7 +172,7 @@ def programs(
     out = {}
     for name, bare in (("arm", arm_transcription), ("biped", biped_transcription)):
         x, rng = first_iterate(bare), np.random.default_rng(0)
-        rows = rows_near(bare, x, Margins(bare.problem), 0.2)
+        rows = rows_near(bare, x, margins_of(bare), 0.2)
         t = bare.with_apart(rows)
         out[name] = t, x + 0.02 * rng.standard_normal(t.program.n)
     return out
@@ -226,7 +232,7 @@ def test_a_row_that_knows_the_hulls_is_their_distance_where_it_was_made(
 ) -> None:
     """Less the margin; not where the two are in each other, of which other planes tell too."""
     t: Transcription = request.getfixturevalue(f"{name}_transcription")
-    x, margins = first_iterate(t), Margins(t.problem)
+    x, margins = first_iterate(t), margins_of(t)
     spots, looked = spots_of(t, x), 0
     for row, held in rows_near(t, x, margins, 0.2).items():
         pair, k = margins.bodies.known(row.joint, row.other), spots.names.index(row.place)
@@ -242,8 +248,8 @@ def test_a_row_that_knows_the_hulls_is_their_distance_where_it_was_made(
 
 
 def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: Transcription) -> None:
-    problem = dataclasses.replace(arm_transcription.problem, terms=(SelfCollision(margin=0.5),))
-    margins, bodies = Margins(problem), problem.bodies
+    problem = arm_transcription.problem
+    margins, bodies = margins_of(arm_transcription, (SelfCollision(margin=0.5), KeepOut())), problem.bodies
     start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
     for pair in bodies.pairs:
         apart = bodies.exact(start, 0, pair)
@@ -252,17 +258,18 @@ def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: 
         assert margins.of((j, -1 - w)) <= KeepOut().margin
 
 
-def test_terms_can_be_left_out(arm_transcription: Transcription) -> None:
+def test_only_who_asks_is_kept_apart(arm_transcription: Transcription) -> None:
     x = first_iterate(arm_transcription)
     free = (SelfCollision(enabled=False), KeepOut(enabled=False))
     for terms, own, world in (
-        ((), True, True),
-        (free[:1], False, True),
-        (free[1:], True, False),
+        ((), False, False),
+        (APART[:1], True, False),
+        (APART[1:], False, True),
+        (APART, True, True),
         (free, False, False),
     ):
         problem = dataclasses.replace(arm_transcription.problem, terms=terms)
-        assert keeps_apart(problem) == (own or world)
+        assert problem.keeps_apart == (own or world)
         rows = rows_near(arm_transcription, x, Margins(problem), 1.0)
         assert any(row.other < 0 for row in rows) == world
         assert own or not any(row.other >= 0 for row in rows)
@@ -301,7 +308,8 @@ BAR = Obstacle(name="bar", start=(0.6, -0.2, 1.04), end=(0.6, 0.2, 1.04), radius
 
 @pytest.fixture(scope="module")
 def free() -> Solution:
-    return solve(load_problem("arm_planar"))
+    problem = load_problem("arm_planar")
+    return solve(dataclasses.replace(problem, terms=(*problem.terms, *APART)))
 
 
 @pytest.fixture(scope="module")
@@ -316,10 +324,10 @@ def test_a_plan_goes_around_what_is_in_its_way(free: Solution, barred: Solution)
     assert passing(barred.problem, free.plan) < -0.02
     assert passing(barred.problem, barred.plan) > 0
     assert barred.apart and barred.problem.hash != free.problem.hash
-    terms = (*barred.problem.terms, KeepOut(enabled=False))
+    terms = tuple(term for term in barred.problem.terms if term not in APART)
     ignoring = solve(dataclasses.replace(barred.problem, terms=terms))
     assert ignoring.status is Status.SOLVED
-    assert not any(row.other < 0 for row in ignoring.apart)
+    assert not ignoring.apart
     assert passing(barred.problem, ignoring.plan) < -0.02
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from small_plans import arm_problem, biped_problem
 
-from impactopt import TargetBody, load_problem
+from impactopt import KeepOut, TargetBody, load_problem
 from impactopt.bodies.clearance import FAR, MISSED, Bodies, Places
 from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface_points
 from impactopt.bodies.pieces import convex, inertia_box, pieces_of
@@ -585,10 +585,13 @@ def test_a_start_in_something_is_refused() -> None:
     model, data = problem.robot.model, problem.robot.model.createData()
     pin.forwardKinematics(model, data, problem.start_posture)
     elbow = tuple(data.oMi[3].translation.tolist())
-    inside = dataclasses.replace(problem, obstacles=(Obstacle(name="post", start=elbow, radius=0.05),))
+    post = Obstacle(name="post", start=elbow, radius=0.05)
+    inside = dataclasses.replace(problem, obstacles=(post,), terms=(KeepOut(),))
     with pytest.raises(InputError, match=r"at the start the link '\w+' is in the body 'post'"):
         _ = inside.bodies
-    large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)))
+    free = dataclasses.replace(inside, terms=())
+    assert len(free.bodies.world) == len(inside.obstacles) + 3, "who does not ask is not told"
+    large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)), terms=(KeepOut(),))
     moved = dataclasses.replace(large, point=np.array(problem.point) - np.array([0.0, 0.4, 0.0]))
     with pytest.raises(InputError, match="is in the body 'target"):
         _ = moved.bodies

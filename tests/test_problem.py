@@ -25,10 +25,8 @@ from impactopt.terms import (
     Balance,
     ContactWrenchCone,
     Incidence,
-    KeepOut,
     LegExtension,
     PositionLimit,
-    SelfCollision,
     Term,
     TorqueLimit,
     VelocityLimit,
@@ -308,7 +306,6 @@ def test_terms_of_a_problem_come_before_the_defaults(robot: Robot) -> None:
 
 def test_every_term_has_a_name_and_a_unit() -> None:
     kinds = {TorqueLimit, VelocityLimit, PositionLimit, ContactWrenchCone, Balance, Incidence, LegExtension}
-    kinds |= {SelfCollision, KeepOut}
     assert {type(t) for t in DEFAULT_TERMS} == kinds
     assert len({t.name for t in DEFAULT_TERMS}) == len(DEFAULT_TERMS)
     assert all(t.name and t.unit for t in DEFAULT_TERMS)

@@ -212,7 +212,8 @@ def test_impacts_without_duration_and_one_foot_come_back() -> None:
     for changes in (
         {"collision": "rigid", "coefficient_of_restitution": 0.3, "scenarios": ()},
         {"collision": "virtual mass", "scenarios": ()},
-        {"terms": (terms.SelfCollision(margin=0.02), terms.KeepOut(enabled=False))},
+        {"terms": (terms.SelfCollision(margin=0.02), terms.KeepOut())},
+        {"terms": (terms.SelfCollision(), terms.KeepOut(enabled=False))},
         {"stance": OneSole("left")},
     ):
         problem = dataclasses.replace(punch, **changes)

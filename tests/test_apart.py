@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 from derivative_checks import check_derivatives
 from numpy.typing import NDArray
+from small_plans import changed
 from small_robots import arm, biped, table
 
 from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
@@ -170,7 +171,8 @@ def programs(
 ) -> dict[str, tuple[Transcription, Array]]:
     """Those of the small robots with rows between all that is nearer than 20 cm, and a point a little off."""
     out = {}
-    for name, bare in (("arm", arm_transcription), ("biped", biped_transcription)):
+    for name, shared in (("arm", arm_transcription), ("biped", biped_transcription)):
+        bare = changed(shared)
         x, rng = first_iterate(bare), np.random.default_rng(0)
         rows = rows_near(bare, x, margins_of(bare), 0.2)
         t = bare.with_apart(rows)
@@ -205,6 +207,19 @@ def test_rows_say_how_far_spheres_and_planes_are_apart_at_their_places(programs:
         told, by = t.program.describe_violation(i, x, 0.012)
         assert told.startswith(term) and told.endswith(what) and by == "12 mm too near"
     assert looked == len(t.apart_rows) == t.program.m - len(without(t).program.origins)
+
+
+def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
+    arm_transcription: Transcription,
+) -> None:
+    t = changed(arm_transcription)
+    x = first_iterate(t)
+    y = np.ones(t.program.m)
+    jacobian, hessian = t.program.jacobian(x).toarray(), t.program.hessian(x, 1.0, y).toarray()
+    more = t.with_apart(rows_near(t, x, margins_of(t), 0.2))
+    assert more.program.m > t.program.m
+    np.testing.assert_array_equal(t.program.jacobian(x).toarray(), jacobian)
+    np.testing.assert_array_equal(t.program.hessian(x, 1.0, y).toarray(), hessian)
 
 
 def without(t: Transcription) -> Transcription:

@@ -19,7 +19,7 @@ from impactopt.terms import KeepOut, SelfCollision
 Array = NDArray[np.float64]
 Rows = dict[ApartRow, Held]
 AFTER = 2  # phase after contact
-NEAR = 0.10  # [m] nearer bodies get a row
+NEAR = 0.15  # [m] nearer bodies get a row
 STEP = 8e-3  # [s] at which a plan is looked at
 SHARE = 0.5  # of a margin that may be given up between nodes
 OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no more
@@ -198,7 +198,8 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         ):  # the place is right, and the motion beside it is not
             before = [t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known]
             more = max(0.0, *before) + margins.of(pair) - max(apart, -DEEP)
-        for k, held in enumerate(margins.held_around(spots.at, spot, pair, min(more, DEEP)), len(known)):
+        found_here = margins.held_around(spots.at, spot, pair, min(more, DEEP))
+        for k, held in enumerate(found_here if known else found_here[:1], len(known)):
             rows[ApartRow(spots.names[spot], *pair, k)] = held
     if deepest > DEEP:
         pairs = {pair for (_, pair), apart in found.items() if apart < -DEEP}

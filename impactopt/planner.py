@@ -37,6 +37,7 @@ from impactopt.starts import (
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
 _EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
+_BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
 _ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 12, 3, 7  # at most: of all, with more nodes, from the start again
 
 
@@ -149,6 +150,7 @@ class _Round:
     starts: tuple[Array | SolverResult, ...]
     name: str
     why: str
+    barrier: float | None = None
 
 
 class _Refining:
@@ -197,7 +199,7 @@ class _Refining:
             if self.report is not None:
                 self.report(following.why)
             for start in following.starts:
-                new = self.budget.run(following.program.program, start)
+                new = self.budget.run(following.program.program, start, following.barrier)
                 if new.status.usable or self.budget.left == 0:
                     break
             if not new.status.usable:
@@ -259,7 +261,12 @@ class _Refining:
         name = _more(nodes, elements, len(rows) - len(t.apart_rows))
         return _Round(
             program=finer,
-            starts=starts,
+            starts=starts
+            if violated is None
+            else (*starts, old.x)
+            if finer.layout.n == len(old.x)
+            else starts,
+            barrier=None if violated is None else _BARRIER,
             name=name,
             why=f"the plan is not what it says between nodes: {name}, and on from there",
         )

@@ -177,10 +177,10 @@ class Solution(Solved):
         for missed in (False, True) if self.plan.brake is not None else (False,):
             motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
             at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
-            found, _, pair = bodies.nearest(at)
-            if found < least:
-                least, nearest = found, " and ".join(bodies.names(pair)) if pair is not None else ""
-            for one, other, start, end, depth in bodies.touches(motion.time, at):
+            found = bodies.survey(motion.time, at)
+            if found.clearance < least:
+                least, nearest = found.clearance, " and ".join(found.nearest)
+            for one, other, start, end, depth in found.touches:
                 touches.append(
                     {"one": one, "other": other, "start_s": start, "end_s": end, "depth_mm": 1e3 * depth}
                     | ({"missed": True} if missed else {})

@@ -74,8 +74,12 @@ class Budget:
             return None
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
 
-    def run(self, program: NonlinearProgram, start: Array | SolverResult) -> SolverResult:
+    def run(
+        self, program: NonlinearProgram, start: Array | SolverResult, barrier: float | None = None
+    ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
+
+        barrier : the first of "sqp" from a result, where that is not as near as it looks.
 
         start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
         """
@@ -87,6 +91,8 @@ class Budget:
         if self.solver == "ipopt":
             return solve_ipopt(program, x0, options=self.options, callback=self.callback, time_limit=left)
         settings = dict(self.options or {})
+        if barrier is not None and z is not None:
+            settings.setdefault("barrier_warm", barrier)
         if left is not None:
             settings["time_limit"] = max(left, 1e-9)
         return solve_sqp(

@@ -18,7 +18,7 @@ from impactopt.bodies.world import WorldBody
 from impactopt.errors import InputError
 from impactopt.robot import Robot
 
-__all__ = ["Bodies", "Near", "Places", "Touch"]
+__all__ = ["Bodies", "Near", "Places", "Survey", "Touch"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -26,6 +26,7 @@ GROUND = 0  # its place in the world
 MISSED = 3  # phase in which there is no target
 FAR = 1.0  # [m] no clearance beyond this is asked for
 _REQUEST = coal.DistanceRequest()
+SHALLOW, STRIDE = 2e-3, 5  # [m] deeper bodies are looked at once in so many instants
 DEEPEST = -1e-6  # [m] what is deeper is a touch
 
 
@@ -37,6 +38,17 @@ class Touch(NamedTuple):
     start: float
     end: float
     depth: float
+
+
+class Survey(NamedTuple):
+    """What a motion's bodies come to: the least distance [m] and when [s], the names of the two, and what
+    touches, deepest first.
+    """
+
+    clearance: float
+    time: float
+    nearest: tuple[str, ...]
+    touches: tuple[Touch, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -278,30 +290,36 @@ class Bodies:
         """A pair as it stands in ``pairs``, if it is one of two joints."""
         return (joint, other) if other < 0 or (joint, other) in self.pairs else (other, joint)
 
-    def nearest(self, at: Places, within: float = 0.1) -> tuple[float, int, Pair | None]:
-        """The least exact distance [m] of any pair at any instant, when, and of which; else FAR, 0, None."""
-        least, when, which = FAR, 0, None
-        for bound, k, pair in self.lower_bounds(at, within):
-            if bound - self._slack() >= least:
-                break
-            found = self.exact(at, k, pair)
-            if found < least:
-                least, when, which = found, k, pair
-        return least, when, which
+    def survey(self, time: Array, at: Places, within: float = 0.1) -> Survey:
+        """The least distance of any pair at any instant, and all that touches.
 
-    def touches(self, time: Array, at: Places) -> list[Touch]:
-        """All that touches what it should not, deepest first."""
+        time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
+        Of two that are deep in each other every few instants are looked at, so that begin and end are that
+        fine.
+        """
+        least, when, which = FAR, 0, None
         found: dict[Pair, list[tuple[int, float]]] = {}
-        for _, k, pair in self.lower_bounds(at, self._slack()):
-            depth = self.exact(at, k, pair)
-            if depth < DEEPEST:
-                found.setdefault(pair, []).append((k, depth))
-        out = []
+        seen: set[tuple[Pair, int]] = set()
+        for bound, k, pair in self.lower_bounds(at, within):
+            if bound - self._slack() >= max(least, 0.0):
+                break
+            if (pair, k // STRIDE) in seen:
+                continue
+            distance = self.exact(at, k, pair)
+            if distance < least:
+                least, when, which = distance, k, pair
+            if distance < DEEPEST:
+                found.setdefault(pair, []).append((k, distance))
+            if distance < -SHALLOW:
+                seen.add((pair, k // STRIDE))
+        touches = []
         for pair, hits in found.items():
             instants = time[[k for k, _ in hits]]
             depth = -min(d for _, d in hits)
-            out.append(Touch(*self.names(pair), float(instants.min()), float(instants.max()), depth))
-        return sorted(out, key=lambda t: -t.depth)
+            touches.append(Touch(*self.names(pair), float(instants.min()), float(instants.max()), depth))
+        touches.sort(key=lambda t: -t.depth)
+        names = () if which is None else self.names(which)
+        return Survey(least, float(time[when]), names, tuple(touches))
 
     def names(self, pair: Pair) -> tuple[str, str]:
         """What messages call the two."""

@@ -29,16 +29,15 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
     bodies = problem.bodies
     at = Places.of(problem.robot, simulation.q[chosen], travel[chosen], phase[chosen])
-    nearest, _, pair = bodies.nearest(at)
+    found = bodies.survey(time[chosen], at)
     touched = simulation.touched
     if simulation.fall is None:  # this engine's robot has no solids
         touched = tuple(
-            Touched(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth)
-            for t in bodies.touches(time[chosen], at)
+            Touched(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth) for t in found.touches
         )
     return replace(
         simulation,
-        clearance=nearest,
-        nearest=bodies.names(pair) if pair is not None else (),
+        clearance=found.clearance,
+        nearest=found.nearest,
         touched=touched,
     )

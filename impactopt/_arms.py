@@ -40,10 +40,9 @@ _DEG = np.pi / 180
 def _turn(k: int, axis: str, rise: float, torque: float, speed: float, mass: float, long: float) -> Link:
     """Joint k of the seven: `rise` [m] above the one before, its link `long` [m]; speed [degrees/s]."""
     limit = (175.0 if k == 7 else 170.0 if axis == "z" else 120.0) * _DEG
-    wide = 0.08 if k == 7 else 0.12  # the flange turns beside the forearm
     rotor = {176.0: 2.0e-5, 110.0: 1.2e-5, 40.0: 4e-6}[torque]
     return link(f"joint_{k}", f"joint_{k - 1}" if k > 1 else "base", axis, (0.0, 0.0, rise), (-limit, limit),
-                (torque, speed * _DEG, 160.0, rotor), mass, (wide, wide, long), (0.0, 0.0, long / 2))
+                (torque, speed * _DEG, 160.0, rotor), mass, (0.12, 0.12, long), (0.0, 0.0, long / 2))
 
 
 ARM7 = (

@@ -32,6 +32,13 @@ DEEPEST = 3  # spheres of a pair
 PATCH, CORNERS = 0.015, 4  # [m] of a side that may come next, and how many of its corners
 
 
+def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
+    """Whether rows between bodies mean the same in two problems."""
+    if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
+        return False
+    return [body.name for body in one.bodies.world] == [body.name for body in other.bodies.world]
+
+
 class Margins:
     """How far each pair of a problem's bodies is to be apart [m]."""
 

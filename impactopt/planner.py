@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add
+from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add, same_bodies
 from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.contact_error import ContactError, contact_error, refined_elements
 from impactopt.nlp.mesh import Elements
@@ -84,7 +84,9 @@ def solve(
     elements: Elements = ()
     apart: Mapping[ApartRow, Held] = {}
     if isinstance(start, Solution):
-        given, nodes, elements, apart = start.result, start.nodes, start.elements, start.apart
+        given, nodes, elements = start.result, start.nodes, start.elements
+        if start.problem.keeps_apart and same_bodies(problem, start.problem):
+            apart = start.apart
     else:
         given = start if isinstance(start, str) else check_array("start", start, (None,))
     if isinstance(given, str) and given not in STARTS:
@@ -177,6 +179,8 @@ class _Refining:
             warm = isinstance(start, SolverResult)
             x0 = start.x if isinstance(start, SolverResult) else start
             t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
+        if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
+            start = start.x  # of a program with other rows
         return t, self.budget.run(t.program, start)
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:

@@ -46,6 +46,7 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
         **{name: getattr(robot, name) for name in numbers},
         "soles": [(sole.name, sole.frame, sole.polygon) for sole in robot.soles],
         "striker": (hits.frame, hits.point),
+        "disable_collisions": sorted(map(sorted, robot.disable_collisions)),
     }
 
 

@@ -43,6 +43,7 @@ class Robot:
     postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
         the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
     disable_collisions : pairs of links that may pass through each other: an SRDF's, and one's own.
+    tools : what it holds.
     source : what it was made from, None where that was a model in Python.
     urdf : file whose visual shapes a picture shows, None for simple ones.
 
@@ -65,6 +66,7 @@ class Robot:
     strikers: Mapping[str, Striker] = field(default_factory=dict)
     postures: Mapping[str, Array] = field(default_factory=dict)
     disable_collisions: tuple[tuple[str, str], ...] = ()
+    tools: tuple[Tool, ...] = ()
     source: Source | None = None
     urdf: str | None = None
 
@@ -255,7 +257,8 @@ class Robot:
         build.add_tool(model, tool)
         source = self.source and dataclasses.replace(self.source, tools=(*self.source.tools, tool))
         strikers = {**self.strikers, tool.name: tool.striker}
-        return dataclasses.replace(self, model=model, strikers=strikers, source=source)
+        tools = (*self.tools, tool)
+        return dataclasses.replace(self, model=model, strikers=strikers, source=source, tools=tools)
 
     def joint_positions(self, q: ArrayLike) -> Array:
         """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""

@@ -64,12 +64,8 @@ def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
     found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
     if not found:
         found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
-    found += [_rod(robot, tool) for tool in _tools(robot)]
+    found += [_rod(robot, tool) for tool in robot.tools]
     return tuple(found), source
-
-
-def _tools(robot: Robot) -> tuple[Tool, ...]:
-    return robot.source.tools if robot.source is not None else ()
 
 
 def _from_urdf(robot: Robot) -> Iterator[Piece]:
@@ -88,7 +84,7 @@ def _from_urdf(robot: Robot) -> Iterator[Piece]:
 def _from_inertia(robot: Robot) -> Iterator[Piece]:
     model = robot.model
     held = [pin.Inertia.Zero() for _ in range(model.njoints)]
-    for tool in _tools(robot):
+    for tool in robot.tools:
         frame = model.frames[model.getFrameId(tool.frame)]
         own = pin.Inertia(tool.mass, tool.center, tool.inertia)
         held[frame.parentJoint] += frame.placement.act(own)

@@ -268,7 +268,7 @@ class ContactProgram(Builder):
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         blocks, bare = self._bare
-        other.blocks, other.rows = list(blocks), bare.copy()
+        other.blocks, other.rows = [block.copy() for block in blocks], bare.copy()
         other.apart_rows = dict(rows)
         add_apart_rows(other, other.apart_rows)
         return other

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ class BatchedFunction:
     """
 
     def __init__(self, function: Any, count: int, parameters: Array) -> None:
+        self._function = function
         self.columns = columns = function.size2_in(0)
         calls = -(-count // columns)
         threads = ("thread", THREADS) if columns == 1 else ()
@@ -36,6 +37,10 @@ class BatchedFunction:
             if a.size:
                 self._buffer.set_arg(i, a.data)
         self.write_to(np.zeros(self.size))
+
+    def copy(self) -> BatchedFunction:
+        """The same, with numbers of its own."""
+        return BatchedFunction(self._function, self.count, self.inputs[1][: self.count])
 
     @property
     def size(self) -> int:
@@ -89,6 +94,11 @@ class Block:
     lift: Affine  # (count * n_in)
     jac_pattern: tuple[Index, Index]
     hess_pattern: tuple[Index, Index]
+
+    def copy(self) -> Block:
+        """The same for another program: a program tells its functions where to write."""
+        parts = {name: getattr(self, name).copy() for name in ("value", "jacobian", "hessian")}
+        return replace(self, **parts)
 
     @classmethod
     def make(

@@ -131,8 +131,7 @@ def _on(
         return t, fields
     rows = finer.program.constraints(result.x)
     attempts = [replace(a, kept=False) for a in fields["attempts"]]
-    for name, r in rounds:
-        attempts.append(attempt_of(finer, name, r))
+    attempts += [attempt_of(program, name, r) for program, name, r in rounds]
     attempts[-1] = replace(attempts[-1], kept=True)
     return finer, {
         **fields,
@@ -191,11 +190,11 @@ class _Refining:
 
     def rounds(
         self, t: Transcription, result: SolverResult, x0: Array
-    ) -> tuple[Transcription, SolverResult, list[tuple[str, SolverResult]]]:
+    ) -> tuple[Transcription, SolverResult, list[tuple[Transcription, str, SolverResult]]]:
         """The last program that was solved, its result with the effort of all, and what came of each
         round.
         """
-        found: list[tuple[str, SolverResult]] = []
+        found: list[tuple[Transcription, str, SolverResult]] = []
         for again in range(_ROUNDS if self.margins is not None else _NODE_ROUNDS):
             following = self._next(t, result, x0, again) if result.status.usable else None
             if following is None or self.budget.left == 0:
@@ -209,7 +208,7 @@ class _Refining:
             if not new.status.usable:
                 break
             t, result = following.program, _one_after_the_other(result, new)
-            found.append((following.name, new))
+            found.append((t, following.name, new))
         return t, result, found
 
     def _judged(self, t: Transcription, result: SolverResult) -> SolverResult:

@@ -31,7 +31,7 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
     at = Places.of(problem.robot, simulation.q[chosen], travel[chosen], phase[chosen])
     found = bodies.survey(time[chosen], at)
     touched = simulation.touched
-    if simulation.fall is None:  # this engine's robot has no solids
+    if simulation.fall is None or not problem.keeps_apart:  # this replay's robot has no solids
         touched = tuple(
             Touched(one=t.one, other=t.other, start=t.start, end=t.end, depth=t.depth) for t in found.touches
         )

@@ -68,7 +68,8 @@ class Conditions:
             "conditions", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
         )
         way = self.distance * planned.normal
-        solids = planned.solids.without_target() if self.missing else planned.solids.moved(way)
+        solids = planned.solids.moved(way) if self.distance else planned.solids
+        solids = solids.without_target() if self.missing else solids
         return replace(
             planned,
             solids=solids,

@@ -144,7 +144,7 @@ class Simulation:
         hit = bool(np.isfinite(self.contact_start))
         if not hit and self.fall is None:
             raise InputError("the simulated motion never touched the target")
-        phase = self.phase()
+        phase, known = self.phase(), bool(np.isfinite(self.clearance))
         out: dict[str, Any] = {
             "engine": self.engine,
             "standing": self.standing,
@@ -160,9 +160,9 @@ class Simulation:
             "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]),
             "saturated_ms": 1e3 * self.saturated,
             "final_posture_error_rad": self.posture_error,
-            "clearance_mm": 1e3 * self.clearance,
+            "clearance_mm": 1e3 * self.clearance if known else None,
             "nearest": " and ".join(self.nearest),
-            "contacts_besides": [touched.summary() for touched in self.touched],
+            "contacts_besides": [touched.summary() for touched in self.touched] if known else None,
         }
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {

@@ -355,16 +355,18 @@ def all_pairs(bodies: Bodies, places: Places, k: int) -> list[tuple[int, int]]:
 def test_the_nearest_of_all_is_the_nearest(name: str) -> None:
     problem = scenes()[name]()
     bodies, places = problem.bodies, random_places(problem, 5)
-    least, when, which = bodies.nearest(places, within=0.3)
+    found = bodies.survey(np.arange(len(places), dtype=float), places, within=0.3)
+    least, when = found.clearance, int(found.time)
     exact = {
         (k, pair): bodies.exact(places, k, pair)
         for k in range(len(places))
         for pair in all_pairs(bodies, places, k)
     }
-    assert which is not None and least == pytest.approx(min(exact.values()), abs=1e-9)
+    (which,) = {pair for (k, pair) in exact if k == when and bodies.names(pair) == found.nearest}
+    assert least == pytest.approx(min(exact.values()), abs=1e-9)
     assert exact[when, which] == pytest.approx(least, abs=1e-9)
     deep = {key for key, apart in exact.items() if apart < -1e-5}
-    touches = bodies.touches(np.arange(len(places), dtype=float), places)
+    touches = found.touches
     assert len(touches) == len({pair for _, pair in deep})
     assert [t.depth for t in touches] == sorted((t.depth for t in touches), reverse=True)
     if touches:
@@ -375,15 +377,14 @@ def test_far_from_all_nothing_is_near() -> None:
     problem = dataclasses.replace(arm_problem(), body=TargetBody(shape="none"))
     bodies = problem.bodies
     start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
-    assert bodies.nearest(start, within=1e-3) == (FAR, 0, None)
-    assert bodies.touches(np.zeros(1), start) == []
+    assert bodies.survey(np.zeros(1), start, within=1e-3) == (FAR, 0.0, (), ())
 
 
 def test_what_touches_in_the_start_posture_may_touch() -> None:
     problem = load_problem("punch")
     bodies = problem.bodies
     start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
-    assert bodies.touches(np.zeros(1), start) == []
+    assert bodies.survey(np.zeros(1), start).touches == ()
     assert min(bodies.exact(start, 0, pair) for pair in all_pairs(bodies, start, 0)) > 0
     model = problem.robot.model
     for a, b in bodies.pairs:

@@ -26,7 +26,7 @@ GROUND = 0  # its place in the world
 MISSED = 3  # phase in which there is no target
 FAR = 1.0  # [m] no clearance beyond this is asked for
 _REQUEST = coal.DistanceRequest()
-SHALLOW, STRIDE = 2e-3, 5  # [m] deeper bodies are looked at once in so many instants
+SHALLOW, EVERY = 2e-3, 5e-3  # [m] deeper bodies are looked at once in so long [s]
 DEEPEST = -1e-6  # [m] what is deeper is a touch
 
 
@@ -294,8 +294,7 @@ class Bodies:
         """The least distance of any pair at any instant, and all that touches.
 
         time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
-        Of two that are deep in each other every few instants are looked at, so that begin and end are that
-        fine.
+        Two that are deep in each other are looked at every `EVERY`, so that begin and end are that fine.
         """
         least, when, which = FAR, 0, None
         found: dict[Pair, list[tuple[int, float]]] = {}
@@ -303,7 +302,8 @@ class Bodies:
         for bound, k, pair in self.lower_bounds(at, within):
             if bound - self._slack() >= max(least, 0.0):
                 break
-            if (pair, k // STRIDE) in seen:
+            moment = pair, int(time[k] / EVERY)
+            if moment in seen:
                 continue
             distance = self.exact(at, k, pair)
             if distance < least:
@@ -311,7 +311,7 @@ class Bodies:
             if distance < DEEPEST:
                 found.setdefault(pair, []).append((k, distance))
             if distance < -SHALLOW:
-                seen.add((pair, k // STRIDE))
+                seen.add(moment)
         touches = []
         for pair, hits in found.items():
             instants = time[[k for k, _ in hits]]

@@ -252,7 +252,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     from rich.console import Console
 
     from impactopt.result_folder import set_aside
-    from impactopt.screen import result_table, starts_table, violation_table
+    from impactopt.screen import result_table, starts_table, told_touches, violation_table
 
     console, summary = Console(), record.summary
     if record.completed:
@@ -264,7 +264,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
             f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
             highlight=False,
         )
-    for text in (summary.get("note"), summary.get("simulated", {}).get("error"), reach.get("error")):
+    error = summary.get("simulated", {}).get("error")
+    for text in (summary.get("note"), error, reach.get("error"), told_touches(summary)):
         if text:
             console.print(text, markup=False, highlight=False)
     if len(summary["starts"]) > 1:

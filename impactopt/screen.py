@@ -31,6 +31,7 @@ __all__ = [
     "result_table",
     "starts_table",
     "strike_table",
+    "told_touches",
     "torques_table",
     "violation_table",
 ]
@@ -159,6 +160,20 @@ def _table(
 def _add(table: Table, row: Row) -> None:
     cells = (cell.text if cell.good else f"[bold red]! {cell.text}[/]" for cell in row.cells)
     table.add_row(escape(row.label), *cells)
+
+
+def told_touches(summary: Mapping[str, Any]) -> str:
+    """What a plan's bodies do to each other, in a sentence; "" where nothing touches anything."""
+    touches = summary.get("contacts_besides") or ()
+    if not touches:
+        return ""
+    pairs = {(touch["one"], touch["other"]) for touch in touches}
+    worst = max(touches, key=lambda touch: float(touch["depth_mm"]))
+    count = f"{len(pairs)} pairs of bodies are" if len(pairs) > 1 else "two bodies are"
+    return (
+        f"{count} in each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
+        "[terms.self_collision] and [terms.keep_out] keep them apart"
+    )
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:

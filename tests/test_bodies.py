@@ -323,7 +323,7 @@ def test_lower_bounds_are_no_more_than_exact_distances(name: str) -> None:
     """But for what spheres leave out of a surface, between the points too where that was looked at."""
     problem = scenes()[name]()
     bodies = problem.bodies
-    places, within = random_places(problem, 8), 0.15
+    places, within = random_places(problem, 16), 0.15
     found: dict[tuple[int, Any], float] = {}
     slack = bodies._slack() + 1e-3
     assert slack <= 3e-3

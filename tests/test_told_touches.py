@@ -1,0 +1,31 @@
+"""What is said of bodies that are in each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from impactopt.screen import told_touches
+
+
+def touch(one: str, other: str, depth: float, **more: Any) -> dict[str, Any]:
+    return {"one": one, "other": other, "start_s": 0.1, "end_s": 0.2, "depth_mm": depth, **more}
+
+
+def test_nothing_is_said_where_nothing_touches() -> None:
+    assert (
+        told_touches({"contacts_besides": []})
+        == told_touches({"contacts_besides": None})
+        == told_touches({})
+        == ""
+    )
+
+
+def test_the_deepest_is_named_and_pairs_are_counted_once() -> None:
+    both = [
+        touch("hand", "thigh", 3.2),
+        touch("arm", "torso", 41.6),
+        touch("hand", "thigh", 5.0, missed=True),
+    ]
+    said = told_touches({"contacts_besides": both})
+    assert said.startswith("2 pairs of bodies are in each other, arm and torso by 42 mm")
+    assert "two bodies are" in told_touches({"contacts_besides": both[:1]})

@@ -113,7 +113,7 @@ def solve(
         plan=t.decode(result.x),
         nodes=t.nodes,
         elements=t.elements if t.guarded else (),
-        contact_error=contact_error(t, result.x) if result.status.usable else None,
+        contact_error=refining.error(t, result.x) if result.status.usable else None,
         apart=t.apart_rows,
         **fields,
     )
@@ -171,6 +171,13 @@ class _Refining:
         report: Callable[[str], None] | None,
     ) -> None:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
+        self._known: tuple[Transcription, Array, ContactError | None] | None = None
+
+    def error(self, t: Transcription, x: Array) -> ContactError | None:
+        """Of a program's contact at its solution; the last one that was asked for is known."""
+        if self._known is None or self._known[0] is not t or self._known[1] is not x:
+            self._known = t, x, contact_error(t, x)
+        return self._known[2]
 
     def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The program with its first rows between bodies, and its result."""
@@ -196,8 +203,10 @@ class _Refining:
         """
         found: list[tuple[Transcription, str, SolverResult]] = []
         for again in range(_ROUNDS if self.margins is not None else _NODE_ROUNDS):
-            following = self._next(t, result, x0, again) if result.status.usable else None
-            if following is None or self.budget.left == 0:
+            if not result.status.usable or self.budget.left == 0:
+                break
+            following = self._next(t, result, x0, again)
+            if following is None:
                 break
             if self.report is not None:
                 self.report(following.why)
@@ -244,7 +253,7 @@ class _Refining:
         if again < _NODE_ROUNDS:
             with contextlib.suppress(InputError):
                 nodes = nodes_to_add(t.decode(old.x), t.nodes)
-            error = contact_error(t, old.x)
+            error = self.error(t, old.x)
             elements = refined_elements(error, t.elements)
         if violated is None and nodes == t.nodes and elements is None:
             return None
@@ -261,14 +270,12 @@ class _Refining:
         else:
             x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
             starts = (replace(old, x=x, multipliers=y, bound_multipliers=z),)
+        if violated is not None and finer.layout.n == len(old.x):
+            starts = (*starts, old.x)
         name = _more(nodes, elements, len(rows) - len(t.apart_rows))
         return _Round(
             program=finer,
-            starts=starts
-            if violated is None
-            else (*starts, old.x)
-            if finer.layout.n == len(old.x)
-            else starts,
+            starts=starts,
             barrier=None if violated is None else _BARRIER,
             name=name,
             why=f"the plan is not what it says between nodes: {name}, and on from there",

@@ -78,10 +78,14 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     rows = face_axes(normal)  # normal, across, up
     axes = np.column_stack([rows[1], rows[2], rows[0]])  # of boxes: across, up, deep
 
+    def solid(name: str, half: Array, deep: float, across: float = 0.0, **how: Any) -> WorldBody:
+        """Its middle is so deep behind the face [m]."""
+        place = point + axes @ np.array([across, 0.0, deep])
+        return WorldBody(name=name, half=half, place=place, rotation=axes, of_target=True, **how)
+
     def box(name: str, size: Any, start: float = 0.0, across: float = 0.0, **how: Any) -> WorldBody:
         half = np.asarray(size, dtype=float) / 2
-        place = point + axes @ np.array([across, 0.0, start + half[2]])
-        return WorldBody(name=name, half=half, place=place, rotation=axes, of_target=True, **how)
+        return solid(name, half, start + half[2], across, **how)
 
     if body.shape == "none":
         return []
@@ -89,36 +93,14 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     size = body.size
     if body.shape == "ball":
         radius = (size or BOX)[0] / 2
-        place = point + radius * normal
-        still = np.zeros(3)
-        main = WorldBody(
-            name="target",
-            half=still,
-            place=place,
-            rotation=axes,
-            radius=radius,
-            of_target=True,
-            moves=moves,
-            strikable=True,
-        )
-        return [main]
+        return [solid("target", np.zeros(3), radius, radius=radius, moves=moves, strikable=True)]
     if isinstance(target, Nail):
         out = max(NAIL_LENGTH - target.depth, 0.0)
         block = box("target's block", size or BLOCK, out, strikable=True)
         if out < 2 * NAIL_RADIUS:
             return [block]
         half = np.array([0.0, 0.0, out / 2 - NAIL_RADIUS])
-        place = point + normal * out / 2
-        shank = WorldBody(
-            name="target",
-            half=half,
-            place=place,
-            rotation=axes,
-            radius=NAIL_RADIUS,
-            of_target=True,
-            moves=True,
-            strikable=True,
-        )
+        shank = solid("target", half, out / 2, radius=NAIL_RADIUS, moves=True, strikable=True)
         return [shank, block]
     if isinstance(target, Board):
         size = size or BOARD
@@ -136,9 +118,7 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
 
 def _core(box: Any, size: tuple[float, ...]) -> WorldBody:
     """What is behind the face: a link that strikes is not to come from there."""
-    body: WorldBody = box(
-        "target from behind", (size[0], size[1], DEEP), BEHIND, strikable=False, before=True, core=True
-    )
+    body: WorldBody = box("target from behind", (size[0], size[1], DEEP), BEHIND, before=True, core=True)
     return body
 
 

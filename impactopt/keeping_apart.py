@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.clearance import MISSED, Bodies, Near, Places
+from impactopt.bodies.clearance import MISSED, Bodies, Closest, Near, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.at_contact import ContactProgram
@@ -29,6 +29,7 @@ BEAD = 0.02  # [m] radius of its sphere
 DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
 FAR = 0.6  # this [m]
 DEEPEST = 3  # spheres of a pair
+SLIP = 2e-3  # [m] that a sphere may come nearer where it is too near at the start
 PATCH, CORNERS = 0.015, 4  # [m] of a side that may come next, and how many of its corners
 
 
@@ -49,6 +50,7 @@ class Margins:
             problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp)
         )
         self._least: dict[Pair, float] = {}
+        self._reach: dict[tuple[int, Pair], float] = {}
 
     def term(self, pair: Pair) -> SelfCollision | KeepOut:
         """The one that asks for it."""
@@ -61,14 +63,27 @@ class Margins:
             self._least[pair] = min(self.term(pair).margin, max(OF_START * start, 0.0))
         return self._least[pair]
 
+    def reach(self, sphere: int, pair: Pair) -> float:
+        """Radius and margin [m] of a sphere of a link: less where it would be too near at the start, as
+        spheres and planes are about bodies that are nearer to each other than their hulls.
+        """
+        if (sphere, pair) not in self._reach:
+            near = self.bodies.near(self._start, FAR, only={pair})
+            gap = float(near.gap[near.sphere == sphere].min(initial=FAR))
+            radius = float(self.bodies.links.radius[sphere])
+            self._reach[sphere, pair] = radius + min(self.of(pair), OF_START * gap if gap > 0 else gap - SLIP)
+        return self._reach[sphere, pair]
+
     def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
         """A row that knows what it keeps apart exactly as it is at instant k, where the two are nearest.
 
         Of the one link it takes a small sphere that touches its surface there, of the other body the plane
         that does.  more [m] : than the margin.
         """
-        found, travel = self.bodies.closest(at, k, pair), float(at.travel[k])
-        away = -found.normal  # from the other to the one
+        return self._held(at, k, pair, self.bodies.closest(at, k, pair), more)
+
+    def _held(self, at: Places, k: int, pair: Pair, found: Closest, more: float) -> Held:
+        travel, away = float(at.travel[k]), -found.normal  # from the other to the one
         (turn, shift), (facing, place) = (self.bodies.placement(at, k, body) for body in pair)
         centre = turn.T @ (found.one + BEAD * away - shift)
         normal, point = facing.T @ away, facing.T @ (found.other - place)
@@ -79,12 +94,13 @@ class Margins:
         """As :meth:`held`, and corners of the one link around, which come next where two flat sides slide or
         turn.
         """
-        first = self.held(at, k, pair, more)
+        found = self.bodies.closest(at, k, pair)
+        first = self._held(at, k, pair, found, more)
         assert first.facing is not None
         turn, _ = self.bodies.placement(at, k, pair[0])
         facing, _ = self.bodies.placement(at, k, pair[1])
         away = turn.T @ (facing @ np.array(first.facing[:3]))
-        corners = np.concatenate([piece.vertices for piece in self.bodies.links.of_joint[pair[0]]])
+        corners = np.concatenate([piece.vertices for piece in found.pieces])
         height = corners @ away
         lowest = corners[height < height.min() + PATCH]
         chosen: list[Array] = [np.array(first.centre) - BEAD * away]
@@ -155,11 +171,21 @@ def _rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
     near = bodies.near(spots.at, FAR, BETWEEN, only) if only else deep
     for k, sphere, joint, other in zip(near.at, near.sphere, near.joint, near.other, strict=True):
         if int(sphere) in worst.get((int(joint), int(other)), ()):
-            reach = float(bodies.links.radius[sphere]) + margins.of(bodies.known(int(joint), int(other)))
+            reach = margins.reach(int(sphere), bodies.known(int(joint), int(other)))
             centre = tuple(bodies.links.centre[sphere].tolist())
             row = ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))
             out[row] = Held(centre, reach, None, float(spots.at.travel[k]))
     return out
+
+
+def rows_where_deep(t: ContactProgram, x: Array, margins: Margins) -> Rows:
+    """More rows all along, where spheres are deep in other bodies at the places of a program themselves."""
+    spots = spots_of(t, x)
+    deep = margins.bodies.near(spots.at, -DEEP, BETWEEN).least()
+    pairs = zip(deep.joint, deep.other, strict=True)
+    of_term = [margins.term(margins.bodies.known(int(a), int(b))).enabled for a, b in pairs]
+    rows = _rows_all_along(margins, spots, deep.only(np.array(of_term, dtype=bool)))
+    return {key: held for key, held in rows.items() if key not in t.apart_rows}
 
 
 class Violated(NamedTuple):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add, same_bodies
+from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add, rows_where_deep, same_bodies
 from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.contact_error import ContactError, contact_error, refined_elements
 from impactopt.nlp.mesh import Elements
@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
 _EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 _BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
+_FORMED, _FINE = 5e-3, 1e-4  # barriers: below the one a motion is formed, above the other it is not yet fine
+import os; VAR = os.environ.get("VAR","1") == "1"; _LOOKS = int(os.environ.get("LOOKS","4"))
 _ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 12, 3, 7  # at most: of all, with more nodes, from the start again
 
 
@@ -154,6 +156,28 @@ class _Round:
     barrier: float | None = None
 
 
+class _Look:
+    """Looks at a motion on its way, before a barrier falls: where it is formed, and not yet fine.
+
+    rows : that it needs, if bodies are deep in each other then.  centre (n,) : variables before it was
+    formed, between all limits, from where it may go another way.
+    """
+
+    def __init__(self, program: Transcription, margins: Margins) -> None:
+        self._program, self._margins = program, margins
+        self.centre: Array | None = None
+        self.rows: Mapping[ApartRow, Held] = {}
+
+    def __call__(self, x: Array, barrier: float) -> bool:
+        """Whether to stop there."""
+        if barrier > _FORMED:
+            self.centre = x.copy()
+        elif barrier > _FINE:
+            with contextlib.suppress(InputError):
+                self.rows = rows_where_deep(self._program, x, self._margins)
+        return bool(self.rows)
+
+
 class _Refining:
     """The way from a program's solution to one that is right between its rows too.
 
@@ -187,7 +211,25 @@ class _Refining:
             t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
         if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
             start = start.x  # of a program with other rows
-        return t, self.budget.run(t.program, start)
+        return self._led(t, start)
+
+    def _led(
+        self, t: Transcription, start: Array | SolverResult, barrier: float | None = None
+    ) -> tuple[Transcription, SolverResult]:
+        """A program led to its end, with more rows where bodies are deep in each other on the way."""
+        done: SolverResult | None = None
+        for last in [False] * _LOOKS + [True]:
+            look = None if last or self.margins is None else _Look(t, self.margins)
+            result = self.budget.run(t.program, start, barrier, look)
+            done = result if done is None else _one_after_the_other(done, result)
+            if look is None or not look.rows or self.budget.left == 0:
+                break
+            if self.report is not None:
+                self.report("bodies are in each other on the way: on with rows between them")
+            t = t.with_apart({**t.apart_rows, **look.rows})
+            start = start if VAR else look.centre
+        assert done is not None
+        return t, done
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
@@ -211,12 +253,12 @@ class _Refining:
             if self.report is not None:
                 self.report(following.why)
             for start in following.starts:
-                new = self.budget.run(following.program.program, start, following.barrier)
+                program, new = self._led(following.program, start, following.barrier)
                 if new.status.usable or self.budget.left == 0:
                     break
             if not new.status.usable:
                 break
-            t, result = following.program, _one_after_the_other(result, new)
+            t, result = program, _one_after_the_other(result, new)
             found.append((t, following.name, new))
         return t, result, found
 

@@ -291,13 +291,13 @@ class ImpactProblem:
 
     @property
     def self_collision(self) -> SelfCollision:
-        """Its term, or one that lets links pass through each other."""
-        return self.extra(SelfCollision) or SelfCollision(enabled=False)
+        """Its term on its own links."""
+        return self.term(SelfCollision)
 
     @property
     def keep_out(self) -> KeepOut:
-        """Its term, or one that lets the robot pass through the world."""
-        return self.extra(KeepOut) or KeepOut(enabled=False)
+        """Its term on the world."""
+        return self.term(KeepOut)
 
     @property
     def keeps_apart(self) -> bool:

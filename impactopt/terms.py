@@ -232,6 +232,8 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     Balance(),
     Incidence(),
     LegExtension(),
+    SelfCollision(),
+    KeepOut(),
 )
 
 

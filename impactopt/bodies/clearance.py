@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.fit import Planes
+from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, transform
 from impactopt.bodies.world import WorldBody
 from impactopt.errors import InputError
@@ -99,19 +100,23 @@ class Near:
         """Of each instant and pair the sphere that is nearest."""
         order = np.argsort(self.gap, kind="stable")
         keys = np.column_stack([self.at, self.joint, self.other])[order]
-        chosen = order[np.unique(keys, axis=0, return_index=True)[1]]
+        return self.only(order[np.unique(keys, axis=0, return_index=True)[1]])
+
+    def only(self, chosen: NDArray[Any]) -> Near:
+        """These of them, by number or by mask."""
         return Near(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
 
 class Closest(NamedTuple):
-    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; and the
-    direction (3,) from the one to the other.
+    """Distance [m] of two bodies, < 0 in each other; the points (3,) [m] of both there, in the world; the
+    direction (3,) from the one to the other; and the pieces of the one that may meet the other's there.
     """
 
     distance: float
     one: Array
     other: Array
     normal: Array
+    pieces: tuple[Piece, ...]
 
 
 class Bodies:
@@ -252,16 +257,18 @@ class Bodies:
         here, there = self._transform(at, k, a), self._transform(at, k, b)
         pieces = self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
         best: Any = None
+        nearest: Any = None
         for one, two in pieces:
             found = coal.DistanceResult()
             coal.distance(one.shape, here, two.shape, there, _REQUEST, found)
             if best is None or found.min_distance < best.min_distance:
-                best = found
+                best, nearest = found, two
         return Closest(
             float(best.min_distance),
             np.array(best.getNearestPoint1()),
             np.array(best.getNearestPoint2()),
             np.array(best.normal),
+            tuple(one for one, two in pieces if two is nearest),
         )
 
     def _transform(self, at: Places, k: int, body: int) -> Any:

@@ -68,10 +68,16 @@ class RobotBodies:
             out[j] = centre, float(np.linalg.norm(points - centre, axis=1).max())
         return out
 
+    @cached_property
+    def _names(self) -> dict[int, str]:
+        def size(piece: Piece) -> float:
+            return float(np.prod(np.ptp(piece.vertices, axis=0)))
+
+        return {j: max(pieces, key=size).link for j, pieces in self.of_joint.items()}
+
     def name(self, joint: int) -> str:
         """What messages call the body that a joint moves: its largest link."""
-        pieces = self.of_joint[joint]
-        return max(pieces, key=lambda p: float(np.prod(np.ptp(p.vertices, axis=0)))).link
+        return self._names[joint]
 
     def piece_pairs(
         self, q: Array, disabled: Iterable[frozenset[str]] = ()

@@ -138,7 +138,7 @@ class HitCone(Section):
 
 
 class Terms(Section):
-    """What the plan must respect; of these, torque_limit to leg_extension hold if left out too."""
+    """What the plan must respect; of these, torque_limit to keep_out hold if left out too."""
 
     torque_limit: TorqueLimit = optional("")
     velocity_limit: VelocityLimit = optional("")

@@ -178,16 +178,6 @@ def _rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
     return out
 
 
-def rows_where_deep(t: ContactProgram, x: Array, margins: Margins) -> Rows:
-    """More rows all along, where spheres are deep in other bodies at the places of a program themselves."""
-    spots = spots_of(t, x)
-    deep = margins.bodies.near(spots.at, -DEEP, BETWEEN).least()
-    pairs = zip(deep.joint, deep.other, strict=True)
-    of_term = [margins.term(margins.bodies.known(int(a), int(b))).enabled for a, b in pairs]
-    rows = _rows_all_along(margins, spots, deep.only(np.array(of_term, dtype=bool)))
-    return {key: held for key, held in rows.items() if key not in t.apart_rows}
-
-
 class Violated(NamedTuple):
     """Rows that a solution needs beside its own, and how deep [m] bodies are in each other without them."""
 

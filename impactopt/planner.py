@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.keeping_apart import DEEP, Margins, rows_near, rows_to_add, rows_where_deep, same_bodies
+from impactopt.keeping_apart import DEEP, Margins, Violated, rows_near, rows_to_add, same_bodies
 from impactopt.nlp.apart import ApartRow, Held
 from impactopt.nlp.contact_error import ContactError, contact_error, refined_elements
 from impactopt.nlp.mesh import Elements
@@ -37,9 +38,9 @@ from impactopt.starts import (
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
 _EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
+_LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
 _BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
-_FORMED, _FINE = 5e-3, 1e-4  # barriers: below the one a motion is formed, above the other it is not yet fine
-import os; VAR = os.environ.get("VAR","1") == "1"; _LOOKS = int(os.environ.get("LOOKS","4"))
+_BARRIER_DEEP = 1e-3  # and breaks by far
 _ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 12, 3, 7  # at most: of all, with more nodes, from the start again
 
 
@@ -156,35 +157,13 @@ class _Round:
     barrier: float | None = None
 
 
-class _Look:
-    """Looks at a motion on its way, before a barrier falls: where it is formed, and not yet fine.
-
-    rows : that it needs, if bodies are deep in each other then.  centre (n,) : variables before it was
-    formed, between all limits, from where it may go another way.
-    """
-
-    def __init__(self, program: Transcription, margins: Margins) -> None:
-        self._program, self._margins = program, margins
-        self.centre: Array | None = None
-        self.rows: Mapping[ApartRow, Held] = {}
-
-    def __call__(self, x: Array, barrier: float) -> bool:
-        """Whether to stop there."""
-        if barrier > _FORMED:
-            self.centre = x.copy()
-        elif barrier > _FINE:
-            with contextlib.suppress(InputError):
-                self.rows = rows_where_deep(self._program, x, self._margins)
-        return bool(self.rows)
-
-
 class _Refining:
     """The way from a program's solution to one that is right between its rows too.
 
     A program has rows between the bodies that come near at its start, and nodes and elements where its mesh
     has them. Where its solution brings other bodies into each other, leaves its limits between nodes, or has
     a contact that is too coarse, it gets more of them there and is solved again: from where it is; or, where
-    limbs are deep in each other, from the start, as the way out may lead nowhere.
+    limbs are through each other, from the start.
     """
 
     def __init__(
@@ -196,6 +175,7 @@ class _Refining:
     ) -> None:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
+        self._out = _LOST  # [m] as deep as bodies may be in each other for a way out from there
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
         """Of a program's contact at its solution; the last one that was asked for is known."""
@@ -211,25 +191,7 @@ class _Refining:
             t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
         if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
             start = start.x  # of a program with other rows
-        return self._led(t, start)
-
-    def _led(
-        self, t: Transcription, start: Array | SolverResult, barrier: float | None = None
-    ) -> tuple[Transcription, SolverResult]:
-        """A program led to its end, with more rows where bodies are deep in each other on the way."""
-        done: SolverResult | None = None
-        for last in [False] * _LOOKS + [True]:
-            look = None if last or self.margins is None else _Look(t, self.margins)
-            result = self.budget.run(t.program, start, barrier, look)
-            done = result if done is None else _one_after_the_other(done, result)
-            if look is None or not look.rows or self.budget.left == 0:
-                break
-            if self.report is not None:
-                self.report("bodies are in each other on the way: on with rows between them")
-            t = t.with_apart({**t.apart_rows, **look.rows})
-            start = start if VAR else look.centre
-        assert done is not None
-        return t, done
+        return t, self.budget.run(t.program, start)
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
@@ -253,12 +215,12 @@ class _Refining:
             if self.report is not None:
                 self.report(following.why)
             for start in following.starts:
-                program, new = self._led(following.program, start, following.barrier)
+                new = self.budget.run(following.program.program, start, following.barrier)
                 if new.status.usable or self.budget.left == 0:
                     break
             if not new.status.usable:
                 break
-            t, result = program, _one_after_the_other(result, new)
+            t, result = following.program, _one_after_the_other(result, new)
             found.append((t, following.name, new))
         return t, result, found
 
@@ -285,13 +247,7 @@ class _Refining:
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
             violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
         if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
-            return _Round(
-                program=t.with_apart({**t.apart_rows, **violated.rows}),
-                starts=(x0, old.x),
-                name="rows between bodies",
-                why=f"bodies are {1e3 * violated.depth:.0f} mm in each other: from the start again, with "
-                "rows between them",
-            )
+            return self._apart_again(t, old, x0, violated)
         if again < _NODE_ROUNDS:
             with contextlib.suppress(InputError):
                 nodes = nodes_to_add(t.decode(old.x), t.nodes)
@@ -322,6 +278,22 @@ class _Refining:
             name=name,
             why=f"the plan is not what it says between nodes: {name}, and on from there",
         )
+
+    def _apart_again(self, t: Transcription, old: SolverResult, x0: Array, violated: Violated) -> _Round:
+        """On with rows between bodies that are deep in each other: from where they are, if that may lead out
+        on the side they came in, and has not failed to, else from the start.
+        """
+        program = t.with_apart({**t.apart_rows, **violated.rows})
+        words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
+        round_of = partial(_Round, program=program, name="rows between bodies")
+        lost, self._out = violated.depth > self._out, violated.depth / 2
+        if lost:
+            self._out = _LOST
+            return round_of(starts=(x0, old.x), why=f"{words}: from the start again, with rows between them")
+        x, y, z = carried_over(program, t, old.x, old.multipliers, old.bound_multipliers)
+        warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
+        why = f"{words}: on with rows between them"
+        return round_of(starts=(warm, x0, old.x), why=why, barrier=_BARRIER_DEEP)
 
 
 def _more(nodes: MoreNodes, elements: Elements | None, rows: int) -> str:

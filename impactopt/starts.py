@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, did_you_mean
 from impactopt.ipopt import solve_ipopt
 from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
-from impactopt.sqp import Centred, SQPOptions, solve_sqp
+from impactopt.sqp import SQPOptions, solve_sqp
 
 if TYPE_CHECKING:
     from impactopt.nlp.at_contact import ContactProgram
@@ -75,17 +75,13 @@ class Budget:
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
 
     def run(
-        self,
-        program: NonlinearProgram,
-        start: Array | SolverResult,
-        barrier: float | None = None,
-        centred: Centred | None = None,
+        self, program: NonlinearProgram, start: Array | SolverResult, barrier: float | None = None
     ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
 
-        start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
         barrier : the first of "sqp" from a result, where that is not as near as it looks.
-        centred : of "sqp", as :func:`impactopt.sqp.solve_sqp` has it.
+
+        start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
         """
         left, y, z = self.left, None, None
         if isinstance(start, SolverResult):
@@ -106,7 +102,6 @@ class Budget:
             callback=self.callback,
             multipliers=y,
             bound_multipliers=z,
-            centred=centred,
         )
 
 

@@ -2,7 +2,6 @@
 
 from impactopt.sqp.options import SQPOptions
 from impactopt.sqp.qp import QP_SOLVERS, QPSolution, QPSolver, QPStatus, QuadraticProgram, make_qp_solver
-from impactopt.sqp.run import Centred
 from impactopt.sqp.solver import solve_sqp
 
 __all__ = [
@@ -11,7 +10,7 @@ __all__ = [
     "QPSolver",
     "QPStatus",
     "QuadraticProgram",
-    "Centred", "SQPOptions",
+    "SQPOptions",
     "make_qp_solver",
     "solve_sqp",
 ]

@@ -79,7 +79,6 @@ class InteriorRun(Run):
 
     def __init__(self, task: Task):
         super().__init__(task)
-        self._centred = task.centred
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
         self._price = self.options.price  # of elastic rows
         self._crawled = self._met = 0  # iterations: of short steps, and of elastic rows that are met
@@ -192,8 +191,7 @@ class InteriorRun(Run):
                 continue
             if self._out_of_time():
                 return Status.TIME_LIMIT
-            if self._lower_barrier(residual):
-                return Status.INTERRUPTED
+            self._lower_barrier(residual)
             found = self._advance(residual)
             if isinstance(found, Status):
                 return found
@@ -509,9 +507,7 @@ class InteriorRun(Run):
             off *= self.options.kkt_tolerance / self.options.complementarity_tolerance
         return max(max(self._dual, slack) / scale, violation, off)
 
-    def _lower_barrier(self, residual: Vector) -> bool:
-        """Whether it falls and the caller, who is told so, wants to stop there."""
-        before = self._mu
+    def _lower_barrier(self, residual: Vector) -> None:
         tolerance, hard = self.options.complementarity_tolerance, self._elastic is None
         close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
         if hard and self._warm:
@@ -519,8 +515,6 @@ class InteriorRun(Run):
         while self._mu > _FINE * tolerance and self._error(self._mu, residual) <= close * self._mu:
             self._mu = max(_FINEST * tolerance, min(_FASTER * self._mu, self._mu**power))
             self._filter = None
-        fallen = self._mu < before and hard and self._centred is not None
-        return fallen and self._centred(self.point.x, before)
 
 
 @dataclass

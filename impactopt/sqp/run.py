@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from impactopt.program import Callback, NonlinearProgram, Status, Vector
@@ -12,16 +11,9 @@ from impactopt.sqp.point import TimedProgram
 from impactopt.sqp.report import Report
 
 
-Centred = Callable[[Vector, float], bool]
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
-    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
-
-    centred : told the variables (n,) at which the problem of a barrier is solved, and that barrier, before it
-        falls; True stops there.
-    """
+    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds."""
 
     program: NonlinearProgram
     options: SQPOptions
@@ -29,7 +21,6 @@ class Task:
     x: Vector
     y: Vector
     z: Vector
-    centred: Centred | None = None
 
 
 class Run(ABC):

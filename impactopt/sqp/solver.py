@@ -10,7 +10,7 @@ from impactopt.errors import check_array
 from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, check_program
 from impactopt.sqp.interior import InteriorRun
 from impactopt.sqp.options import SQPOptions
-from impactopt.sqp.run import Centred, Task
+from impactopt.sqp.run import Task
 from impactopt.sqp.sl1qp import Sl1QPRun
 
 
@@ -22,7 +22,6 @@ def solve_sqp(
     callback: Callback | None = None,
     multipliers: npt.ArrayLike | None = None,
     bound_multipliers: npt.ArrayLike | None = None,
-    centred: Centred | None = None,
 ) -> SolverResult:
     """Solve a nonlinear program by sequential quadratic programming.
 
@@ -33,8 +32,6 @@ def solve_sqp(
     options : see `SQPOptions`.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
     multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
-    centred : of "interior" while its rows are hard: told the variables (n,) that solve a barrier's problem,
-        and that barrier, before it falls; True stops there, as interrupted.
 
     Returns
     -------
@@ -53,7 +50,7 @@ def solve_sqp(
     )
     x0 = np.clip(x0, program.x_lower, program.x_upper)
     options = options or SQPOptions()
-    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z, centred=centred)
+    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z)
     interior = options.qp_solver == "interior"
     run = (InteriorRun if interior else Sl1QPRun)(task)
     # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile

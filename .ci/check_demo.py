@@ -40,6 +40,10 @@ def failures(summary: dict[str, Any]) -> list[str]:
     check("replayed.impulse_error_pct", -3, 3)
     check("replayed.sole_slip_mm", 0, 5)
     check("replayed.sole_lift_collision_mm", 0, 2)
+    for name, numbers in (("plan", summary), *((k, summary.get(k, {})) for k in ("simulated", "replayed"))):
+        if numbers.get("contacts_besides") != []:
+            wrong.append(f"{name}: bodies touch, or nobody looked: {numbers.get('contacts_besides')}")
+    check("clearance_mm", 0, math.inf)
     replayed = summary.get("replayed", {})
     if replayed.get("standing") is not True:
         wrong.append(f"on free soles it does not stand: {replayed.get('reason', 'it was not replayed')}")

@@ -107,6 +107,18 @@ class Solution(Solved):
         error = self.contact_error
         return error.pct if error is not None and np.isfinite(error.pct) else None
 
+    @property
+    def motion_price_pct(self) -> float:
+        """What the prices on motion, sole wrenches and a rest away from the start take of the objective [%].
+
+        They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
+        ``wrench_price`` and ``return_price``.
+        """
+        worth = sum(
+            (-o.weight if o.cost else o.weight) * self.objectives[o.name] for o in self.problem.objectives
+        )
+        return 100 * (self.result.objective + worth) / abs(worth) if worth else np.nan
+
     @cached_property
     def trajectory(self) -> Trajectory:
         """The servo's reference, sampled."""
@@ -194,6 +206,7 @@ class Solution(Solved):
             **self.outcome(),
             **blow_numbers(plan),
             "objectives": dict(self.objectives),
+            "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
             "nodes_added": self.nodes.total,
             "collision_elements": self.contact_elements,

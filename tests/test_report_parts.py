@@ -15,6 +15,7 @@ from scipy.integrate import trapezoid
 from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
+from impactopt.bodies.surroundings import surroundings_of
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -23,7 +24,6 @@ from impactopt.presets import load_robot
 from impactopt.report.charts import charts_of
 from impactopt.report.pack import pack, unpack
 from impactopt.report.stage import stage_of
-from impactopt.report.surroundings import surroundings_of
 from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
 from impactopt.report.visuals import visuals_of

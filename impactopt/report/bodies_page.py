@@ -111,7 +111,8 @@ def _body(
     yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
     yield '<div id="trouble"></div>'
     yield f'<p id="source">Bodies are convex hulls. They are from the {escape(links.source)}. Spheres cover '
-    yield "them for the rows of a plan; clearance is measured between hulls. Point at a row to see its link.</p>"
+    yield "them for the rows of a plan; clearance is measured between hulls. Point at a row to see its link."
+    yield "</p>"
     yield '<div class="top"><section class="card stays" id="animation" aria-label="bodies"></section>'
     yield f'<section class="card" id="fit" aria-label="links"><h3>Links</h3>{_fit(links)}'
     yield "<figcaption>Out: how far spheres stick out of the hull of all that the link's joint moves. Short: "

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.solids import Solid, joined, simplified
+from impactopt.bodies.surroundings import surroundings_of
 from impactopt.bodies.world import WorldBody
 from impactopt.output import Record
 from impactopt.problem import ImpactProblem
-from impactopt.report.surroundings import surroundings_of
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.report.visuals import Visual, visuals_of
 from impactopt.robot import Robot

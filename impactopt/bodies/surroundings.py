@@ -1,4 +1,4 @@
-"""What a picture shows of the world: the same bodies that a plan keeps off, and how the blow moves them."""
+"""What a picture shows of the world: the bodies that a plan keeps off, and how a blow moves them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.solids import Solid, box
@@ -41,6 +42,14 @@ class Part:
     moves: bool = False
     hinge: Hinge | None = None
     clear: bool = False
+
+    def placed(self, travel: float, normal: Array) -> Array:
+        """Its vertices (k, 3) [m] when the target has moved so far [m] along the normal."""
+        vertices = self.solid.vertices
+        if self.hinge is None:
+            return vertices + travel * normal if self.moves else vertices
+        turn = Rotation.from_rotvec(np.arctan2(travel, self.hinge.arm) * self.hinge.axis).as_matrix()
+        return np.asarray((vertices - self.hinge.place) @ turn.T + self.hinge.place)
 
 
 def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:

@@ -305,9 +305,8 @@ def shown(board: ImpactProblem, tmp_path_factory: pytest.TempPathFactory) -> lis
     """A board that is hit, and a robot that stands still."""
     folder = tmp_path_factory.mktemp("bodies")
     pages = [folder / name / "page.html" for name in ("board", "robot")]
-    for page, made in zip(
-        pages, (report_of(record_of(still_solution()), board), bodies_page(biped())), strict=True
-    ):
+    made = [report_of(record_of(still_solution()), board), bodies_page(biped())]
+    for page, report in zip(pages, made, strict=True):
         page.parent.mkdir()
         report.save(page)
     scripts = [WORLD, BODIES]

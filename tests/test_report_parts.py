@@ -211,8 +211,8 @@ def test_what_is_drawn_of_the_world_is_what_a_plan_keeps_off(
         for end in ends:
             way = (end - b.place) / np.linalg.norm(end - b.place)
             inside = drawn[gap_to(b, drawn) < 1e-6]
-            # balls and capsules are drawn with 26 sides, around and from pole to pole
-            short = (1 - np.cos(np.pi / 26) ** 2) * b.radius
+            # balls and capsules are drawn with 50 sides, around and from pole to pole
+            short = (1 - np.cos(np.pi / 50) ** 2) * b.radius
             assert end @ way - short - 1e-9 < (inside @ way).max() < end @ way + 1e-9
 
 

@@ -84,7 +84,7 @@ def sphere(radius: float, *, sides: int = 16) -> Solid:
     return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(row) for row in rows]))
 
 
-def capsule(radius: float, length: float, *, sides: int = 26) -> Solid:
+def capsule(radius: float, length: float, *, sides: int = 50) -> Solid:
     """Of this radius about a line of this length along z, whose middle is the origin [m]; sides: 4 k + 2."""
     round_ = sphere(radius, sides=sides)  # of an odd number of rows: the middle one becomes the cylinder
     lift = np.sign(round_.vertices[:, 2:]) * [0.0, 0.0, length / 2]

@@ -171,7 +171,7 @@ app.command(
         "impactopt validate results/punch --animation punch.gif",
     )
 )(validate)
-app.command(epilog=examples("impactopt show results/punch --open"))(show)
+app.command(epilog=examples("impactopt show results/punch --open", "impactopt show talos --open"))(show)
 app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
 app.command(
     epilog=examples(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt._problem_checks import COLLISIONS, check_at_rest, check_collision, check_names
 from impactopt.bodies.clearance import Bodies
-from impactopt.bodies.world import ground, obstacle_bodies, target_bodies
+from impactopt.bodies.world import WorldBody, ground, obstacle_bodies, target_bodies
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
@@ -305,6 +305,15 @@ class ImpactProblem:
         return self.self_collision.enabled or self.keep_out.enabled
 
     @cached_property
+    def world(self) -> tuple[WorldBody, ...]:
+        """The bodies that are not the robot's: the ground, the target and what holds it, the obstacles."""
+        return (
+            ground(),
+            *target_bodies(self.body, self.target, self.point, self.normal),
+            *obstacle_bodies(self.obstacles),
+        )
+
+    @cached_property
     def bodies(self) -> Bodies:
         """All that can touch something: the robot's links and the world, and which pairs are not to.
 
@@ -313,15 +322,10 @@ class ImpactProblem:
         InputError : the start posture is in the target, in what holds it, or in an obstacle.
         """
         model = self.robot.model
-        world = [
-            ground(),
-            *target_bodies(self.body, self.target, self.point, self.normal),
-            *obstacle_bodies(self.obstacles),
-        ]
         soles = [model.getFrameId(sole.frame) for sole in self.stance.soles(self.robot)]
         return Bodies(
             self.robot,
-            tuple(world),
+            self.world,
             self.start_posture,
             normal=self.normal,
             striking=int(

@@ -18,7 +18,7 @@ from impactopt._validate_command import validate
 from impactopt.cli import app
 from impactopt.errors import InputError
 from impactopt.output import Record, load_record, record_of, save_record
-from impactopt.plotting.animation import AROUND, FPS, SLOW, save_animation, shown_times
+from impactopt.plotting.animation import AROUND, FPS, SLOW, _Stage, save_animation, shown_times
 from impactopt.replay import Planned, Replay, load_planned, replay
 from impactopt.solution import Solution
 from impactopt.validation import Conditions
@@ -156,6 +156,15 @@ def test_a_replay_takes_the_place_of_an_older_one(still: Replay) -> None:
     assert still.record.replayed and not still.planned.record.replayed
     assert still.record.summary["replayed"] == still.report
     assert list(still.record.arrays["replayed_soles"]) == ["left", "right"]
+
+
+def test_the_animation_draws_the_world_where_the_replay_has_it(still: Replay) -> None:
+    problem = still.planned.problem
+    (target,) = _Stage(still).look(0).world
+    ahead = np.sort((target - problem.point) @ problem.normal)
+    assert ahead == pytest.approx(np.repeat([-0.001, 0.179], 4)), "1 mm nearer, 18 cm deep"
+    gone = dataclasses.replace(still, conditions=Conditions(missing=True))
+    assert _Stage(gone).look(0).world == []
 
 
 def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path) -> None:

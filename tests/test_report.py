@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,15 +16,21 @@ from fake_solution import IMPULSE, PROBLEM_FILE, still_problem, still_solution
 from small_robots import biped
 from typer.testing import CliRunner
 
+from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.surroundings import surroundings_of
 from impactopt.cli import app
+from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError
 from impactopt.output import Record, record_of, save_record
 from impactopt.presets import load_robot
-from impactopt.report import animation_of, report_of
+from impactopt.problem import ImpactProblem
+from impactopt.problem_file.names import problem_file
+from impactopt.report import animation_of, bodies_page, report_of
 from impactopt.report.pack import unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 from impactopt.report.visuals import visuals_of
+from impactopt.shapes import Obstacle
 from impactopt.solution import Solution
 
 NASTY = '# a problem <script>alert("no")</script> & more\n'
@@ -253,6 +260,129 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
 
 def test_a_target_that_flies_off_fades(seen: list[dict[str, Any]]) -> None:
     assert seen[0]["seen"] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0]), "over the second half of its way"
+
+
+# ---- the world and the robot's bodies
+
+BOARD = Board(mass=0.1, stiffness=5e4, breaking_force=400.0)
+TRAVELS = (0.0, 0.004, 0.06, 1.0)  # [m]
+WORLD = {
+    "kinds": "page.header.world.map((part) => part.kind)",
+    "places": f"{list(TRAVELS)}.map((travel) => "
+    "page.clock.view.surroundings(travel).map((w) => [...w.place]))",
+    "gone": "page.clock.view.surroundings(page.header.far).map((w) => w.part.kind)",
+    "all": DRAWN % "0, 0",
+    "hidden": "([...document.querySelectorAll('.marks .key')].find((k) => k.textContent === 'obstacles')"
+    ".click(), "
+    "page.clock.view.surroundings(0).map((w) => w.part.kind))",
+    "fewer": DRAWN % "0, 0",
+}
+MARKS = "[...document.querySelectorAll('.marks .key')]"
+BODIES = {
+    "wide": WIDE,
+    "drawn": DRAWN % "",
+    "marks": f"{MARKS}.map((k) => [k.textContent, k.getAttribute('aria-pressed')])",
+    "readout": "document.querySelector('.readout').textContent",
+    "sliders": "document.querySelectorAll('.controls input').length",
+    "pointed": "(document.querySelectorAll('tr[data-joint]')[2].dispatchEvent(new Event('focus')), "
+    "[page.clock.view.pointed, +document.querySelectorAll('tr[data-joint]')[2].dataset.joint])",
+    "left": "(document.querySelectorAll('tr[data-joint]')[2].dispatchEvent(new Event('blur')), "
+    "page.clock.view.pointed)",
+    "spheres": f"({MARKS}.at(-1).click(), page.clock.view.shown.spheres)",
+    "covered": DRAWN % "",
+    "bare": f"({MARKS}.forEach((k) => k.getAttribute('aria-pressed') === 'true' && k.click()), {DRAWN % ''})",
+}
+
+
+@pytest.fixture(scope="module")
+def board() -> ImpactProblem:
+    table = Obstacle(name="table", size=(1.0, 1.0, 0.5), position=(0.9, 0.0, 0.25))
+    return still_problem(target=BOARD, law=KelvinVoigt(stiffness=1e5, damping=100.0), obstacles=(table,))
+
+
+@pytest.fixture(scope="module")
+def shown(board: ImpactProblem, tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """A board that is hit, and a robot that stands still."""
+    folder = tmp_path_factory.mktemp("bodies")
+    pages = [folder / name / "page.html" for name in ("board", "robot")]
+    made = [report_of(record_of(still_solution()), board), bodies_page(biped())]
+    for page, report in zip(pages, made, strict=True):
+        page.parent.mkdir()
+        report.save(page)
+    scripts = [WORLD, BODIES]
+    visits = visit(*(Job(page=p, scripts=tuple(s.values())) for p, s in zip(pages, scripts, strict=True)))
+    return [checked(seen, names) for seen, names in zip(visits, scripts, strict=True)]
+
+
+def test_the_world_moves_on_a_page_as_it_does_in_pictures(
+    shown: list[dict[str, Any]], board: ImpactProblem
+) -> None:
+    page, parts = shown[0], surroundings_of(board.world)
+    assert page["kinds"] == [p.kind for p in parts] == ["target"] * 2 + ["held"] * 2 + ["obstacle"]
+    for travel, places in zip(TRAVELS, page["places"], strict=True):
+        for part, place in zip(parts, places, strict=True):
+            matrix = np.reshape(place, (4, 4)).T
+            drawn = part.solid.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            np.testing.assert_allclose(drawn, part.placed(travel, board.normal), atol=1e-5)
+    assert page["gone"] == ["held"] * 2 + ["obstacle"], "what has flown off is not shown"
+    assert page["hidden"] == ["target"] * 2 + ["held"] * 2
+    assert page["all"][1] == page["fewer"][1] == 0
+
+
+def test_a_robots_bodies_are_drawn_over_it(shown: list[dict[str, Any]]) -> None:
+    page = shown[1]
+    assert page["wide"] and page["readout"] == "posture: half_sitting" and page["sliders"] == 0
+    assert page["marks"] == [
+        ["what the robot looks like", "true"],
+        ["hulls", "true"],
+        ["spheres that cover them", "false"],
+    ]
+    assert page["pointed"][0] == page["pointed"][1] and page["left"] is None and page["spheres"] is True
+    (share, error), (covered, _), (bare, _) = page["drawn"], page["covered"], page["bare"]
+    assert 0.02 < share < 0.9 and error == 0 and covered >= share > bare == 0.0
+
+
+def test_a_robots_page_says_how_well_bodies_fit_and_which_may_touch() -> None:
+    robot = biped()
+    robot = dataclasses.replace(robot, disable_collisions=(("left knee", "right knee"),))
+    text = Reader(bodies_page(robot).html).text
+    links = bodies_of(robot)
+    assert links.source in text
+    for j in links.joints:
+        row = (links.name(j), len(links.of_joint[j]), int((links.joint == j).sum()))
+        assert f"{''.join(map(str, row))}{1e3 * links.out[j]:.0f}{1e3 * links.short[j]:.1f}" in text
+    connected, said, touch = (text.index(why) for why in ("A joint connects", "say so", "They touch in"))
+    assert connected < text.index("left knee" + "left hip pitch") < said
+    assert said < text.index("left knee" + "right knee") < touch
+    _, touching = links.piece_pairs(robot.posture("half_sitting"))
+    assert all(touch < text.rindex("".join(sorted(pair))) for pair in touching)
+
+
+def test_the_command_shows_robots_and_the_worlds_of_problems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runner = CliRunner()
+    done = runner.invoke(app, ["show", "planar_arm"])
+    assert done.exit_code == 0 and done.output.split() == [str(Path("results", "planar_arm.html"))]
+    text = Reader(Path("results", "planar_arm.html").read_text(encoding="utf-8")).text
+    assert "boxes of its links' inertia" in text and "The world" not in text
+    file = tmp_path / "mine.toml"
+    rail = '\n[[obstacles]]\nname = "rail"\nstart_m = [2, 2, 0]\nend_m = [2, 2, 1]\nradius_m = 0.05\n'
+    file.write_text(problem_file("arm_planar").read_text(encoding="utf-8") + rail, encoding="utf-8")
+    done = runner.invoke(app, ["show", str(file), "--out", "mine.html"])
+    assert done.exit_code == 0, done.output
+    text = Reader(Path("mine.html").read_text(encoding="utf-8")).text
+    assert "railcapsule 1 m long, radius 0.05 m(2, 2, 0.5) m" in text
+    for words, said in (
+        (["planar_arn"], "planar_arm"),
+        (["planar_arm", "--problem", str(file)], "--problem is for a result"),
+    ):
+        done = runner.invoke(app, ["show", *words])
+        assert done.exit_code == 2 and said in " ".join(done.output.split())
+    Path("planar_arm").mkdir()  # a directory's name is a result's
+    done = runner.invoke(app, ["show", "planar_arm"])
+    assert done.exit_code == 2 and "solution.npz" in done.output
 
 
 def test_without_3d_the_plots_still_work(page: Path) -> None:

@@ -5,26 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from fake_solution import still_solution
+from fake_solution import still_problem, still_solution
 from scipy.integrate import trapezoid
 
+from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.meshes import find_mesh, read_mesh
-from impactopt.bodies.solids import Solid, box, cylinder, joined, rounded_box, simplified, sphere
-from impactopt.contact import FreeMass
-from impactopt.contact.nail import Nail
-from impactopt.contact.targets import RigidWall
+from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
+from impactopt.bodies.surroundings import surroundings_of
+from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
+from impactopt.contact.targets import Target
+from impactopt.errors import InputError
 from impactopt.output import Record, record_of
 from impactopt.presets import load_robot
 from impactopt.report.charts import charts_of
 from impactopt.report.pack import pack, unpack
-from impactopt.report.stage import target_solids
+from impactopt.report.stage import stage_of
 from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
 from impactopt.report.visuals import visuals_of
 from impactopt.robot import Robot
+from impactopt.shapes import Obstacle, TargetBody
 from impactopt.solution import Solution
 
 
@@ -54,6 +58,7 @@ def volume(solid: Solid) -> float:
         (cylinder(0.1, 0.5, sides=200), np.pi * 0.1**2 * 0.5),
         (cylinder(0.1, 0.3, tip=0.0, sides=200), np.pi * 0.1**2 * 0.3 / 3),
         (sphere(0.2, sides=100), 4 / 3 * np.pi * 0.2**3),
+        (capsule(0.1, 0.3, sides=202), np.pi * 0.1**2 * (0.3 + 4 / 3 * 0.1)),
         (joined([box([0.1, 0.1, 0.1]), box([0.1, 0.2, 0.1]).moved(np.eye(3), np.ones(3))]), 0.003),
     ],
 )
@@ -166,11 +171,110 @@ def test_without_files_links_are_boxes_of_their_inertia() -> None:
     assert middle == pytest.approx([0.0, 0.02, -0.15], abs=1e-6)
 
 
-def test_targets_begin_at_their_face() -> None:
-    for target in (FreeMass(mass=1.0), RigidWall(), Nail(mass=0.1, resistance=1.0, depth=0.02)):
-        solids = target_solids(target)
-        assert min(s.vertices[:, 0].min() for s, _ in solids) == pytest.approx(0.0, abs=1e-12)
-        assert solids[0][1] is not isinstance(target, RigidWall)
+# ---- what the world looks like
+
+LAW = KelvinVoigt(stiffness=1e5, damping=100.0)
+BOARD = Board(mass=0.1, stiffness=5e4, breaking_force=400.0)
+TABLE = Obstacle(name="table", size=(0.4, 0.6, 0.03), position=(1.5, 0.2, 0.5), rpy=(0.1, -0.2, 0.7))
+RAIL = Obstacle(name="rail", start=(1.0, 1.0, 0.2), end=(1.4, 1.2, 1.0), radius=0.03)
+
+
+@pytest.mark.parametrize(
+    ("target", "body", "kinds"),
+    [
+        (FreeMass(mass=1.0), TargetBody(), ["target"]),
+        (FreeMass(mass=1.0), TargetBody(shape="ball", size=(0.22,)), ["target"]),
+        (FreeMass(mass=1.0), TargetBody(shape="none"), []),
+        (RigidWall(), TargetBody(), ["held"]),
+        (Nail(mass=0.1, resistance=1.0, depth=0.02), TargetBody(size=(0.3, 0.2, 0.1)), ["target", "held"]),
+        (BOARD, TargetBody(size=(0.4, 0.2, 0.03)), ["target", "target", "held", "held"]),
+    ],
+)
+def test_what_is_drawn_of_the_world_is_what_a_plan_keeps_off(
+    target: Target, body: TargetBody, kinds: list[str]
+) -> None:
+    problem = still_problem(
+        target=target, body=body, law=LAW, obstacles=(TABLE, RAIL), normal=[0.6, 0.0, -0.8]
+    )
+    parts = surroundings_of(problem.world)
+    assert [part.kind for part in parts] == [*kinds, "obstacle", "obstacle"]
+    kept = [b for k, b in enumerate(problem.world) if k != GROUND and not b.core]
+    drawn = np.concatenate([part.solid.vertices for part in parts])
+    for part in parts:  # no corner of what is drawn is off all bodies that are there
+        gaps = [
+            [gap(coal.Sphere(1e-9), coal.Transform3s(np.eye(3), v), b.shape, at(b)) for b in kept]
+            for v in part.solid.vertices
+        ]
+        assert np.min(gaps, axis=1).max() < 1e-6 and volume(part.solid) > 0
+    for b in kept:  # and all of each is drawn: it goes as far along each of its axes
+        ends = b.place + np.concatenate([s * (b.half + b.radius) * np.eye(3) @ b.rotation.T for s in (-1, 1)])
+        for end in ends:
+            way = (end - b.place) / np.linalg.norm(end - b.place)
+            inside = drawn[gap_to(b, drawn) < 1e-6]
+            # balls and capsules are drawn with 50 sides, around and from pole to pole
+            short = (1 - np.cos(np.pi / 50) ** 2) * b.radius
+            assert end @ way - short - 1e-9 < (inside @ way).max() < end @ way + 1e-9
+
+
+def gap(*given: Any) -> float:
+    return float(coal.distance(*given, coal.DistanceRequest(), coal.DistanceResult()))
+
+
+def at(body: Any) -> Any:
+    return coal.Transform3s(body.rotation, body.place)
+
+
+def gap_to(body: Any, points: Any) -> Any:
+    """How far (k,) points (k, 3) are from a body of the world."""
+    sphere = coal.Sphere(1e-9)
+    return np.array([gap(sphere, coal.Transform3s(np.eye(3), p), body.shape, at(body)) for p in points])
+
+
+def test_what_hides_the_robot_is_seen_through_and_what_stands_still_stays() -> None:
+    parts = surroundings_of(still_problem(target=RigidWall(), obstacles=(TABLE,)).world)
+    assert [(p.clear, p.moves) for p in parts] == [(True, False), (True, False)]
+    parts = surroundings_of(still_problem(target=Nail(mass=0.1, resistance=1.0), law=LAW).world)
+    assert [(p.clear, p.moves) for p in parts] == [(False, True), (False, False)]
+
+
+def test_a_board_opens_over_the_inner_edges_of_its_supports() -> None:
+    problem = still_problem(target=BOARD, normal=[0.0, 0.0, -1.0])
+    one, other, *supports = surroundings_of(problem.world)
+    for half, support in zip((one, other), supports, strict=True):
+        assert half.hinge is not None
+        along = half.hinge.place - problem.point
+        across = problem.world[1].rotation[:, 0]
+        # the support's corner that is nearest to the blow, under the board
+        nearest = np.abs((support.solid.vertices - problem.point) @ across).min()
+        assert abs(along @ across) == pytest.approx(nearest) == pytest.approx(half.hinge.arm)
+        assert along @ problem.normal == pytest.approx(0.02)
+        # turned by a little about its axis, the middle goes along the blow
+        speed = np.cross(half.hinge.axis, problem.point + 0.02 * problem.normal - half.hinge.place)
+        assert speed == pytest.approx(half.hinge.arm * problem.normal, abs=1e-12)
+
+
+def test_a_page_has_a_motion_in_a_world_that_a_plan_would_refuse() -> None:
+    """An old result may be one: its problem is built, and the start is in what stands about now."""
+    around = Obstacle(name="cage", size=(5.0, 5.0, 5.0))
+    problem = still_problem(obstacles=(around,))
+    with pytest.raises(InputError, match="cage"):
+        _ = problem.bodies
+    header, arrays = stage_of(record_of(still_solution()), problem)
+    cage = header["world"][-1]
+    size = arrays[f"{cage['name']}_vertices"].max(axis=0) * cage["step"]
+    assert cage["kind"] == "obstacle" and size == pytest.approx([5.0, 5.0, 5.0])
+
+
+def test_a_board_that_holds_springs_back(record: Record, solution: Solution) -> None:
+    ends = {}
+    for broken in (0.0, 1.0):
+        told = Record(summary={**record.summary, "target": {"broken": broken}}, arrays=record.arrays)
+        track = tracks_of(told, solution.problem)[0]
+        # speed grows linearly to 2 m/s over 40 ms of contact
+        at_end = np.interp(track.contact_end, track.time, track.travel)
+        assert at_end == pytest.approx(0.04, abs=1e-3)
+        ends[broken] = track.travel[-1]
+    assert ends[0.0] == 0.0 and ends[1.0] > 0.04
 
 
 # ---- what moves

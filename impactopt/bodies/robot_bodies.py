@@ -59,6 +59,12 @@ class RobotBodies:
         return {j: tuple(p for p in self.pieces if p.joint == j) for j in self.joints}
 
     @cached_property
+    def connected(self) -> tuple[Pair, ...]:
+        """Each joint that moves something, with its parent if that does too: their bodies always touch."""
+        parents = self.robot.model.parents
+        return tuple((j, int(parents[j])) for j in self.joints if int(parents[j]) in self.joints)
+
+    @cached_property
     def balls(self) -> dict[int, tuple[Array, float]]:
         """Of each joint's pieces the centre (3,) and radius [m] of a sphere about all of them."""
         out = {}
@@ -94,7 +100,7 @@ class RobotBodies:
         touching, without = [], set(disabled)
         for n, a in enumerate(self.joints):
             for b in self.joints[:n]:
-                if b == int(model.parents[a]):
+                if (a, b) in self.connected:
                     continue
                 left = []
                 (centre_a, radius_a), (centre_b, radius_b) = self.balls[a], self.balls[b]

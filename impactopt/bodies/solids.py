@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Solid", "box", "cylinder", "joined", "rounded_box", "simplified", "sphere"]
+__all__ = ["Solid", "box", "capsule", "cylinder", "joined", "rounded_box", "simplified", "sphere"]
 
 Array = NDArray[np.float64]
 TO_MEAN = 1e-3  # how much a simplified vertex is drawn to the mean of those that it stands for
@@ -82,6 +82,13 @@ def sphere(radius: float, *, sides: int = 16) -> Solid:
         a, b = r * sides, (r + 1) * sides
         rows += [(a + k, b + k, b + n), (a + k, b + n, a + n)]
     return Solid(vertices=vertices, triangles=np.concatenate([np.column_stack(row) for row in rows]))
+
+
+def capsule(radius: float, length: float, *, sides: int = 50) -> Solid:
+    """Of this radius about a line of this length along z, whose middle is the origin [m]; sides: 4 k + 2."""
+    round_ = sphere(radius, sides=sides)  # of an odd number of rows: the middle one becomes the cylinder
+    lift = np.sign(round_.vertices[:, 2:]) * [0.0, 0.0, length / 2]
+    return Solid(vertices=round_.vertices + lift, triangles=round_.triangles)
 
 
 def simplified(solid: Solid, cell: float) -> Solid:

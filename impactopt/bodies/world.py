@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.fit import Planes, enclose
+from impactopt.bodies.solids import Solid, capsule
+from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.board import Board
 from impactopt.contact.nail import Nail
 from impactopt.contact.targets import RigidWall, Target
@@ -61,6 +63,12 @@ class WorldBody:
         if not self.radius:
             return coal.Box(*(2 * self.half))
         return coal.Capsule(self.radius, 2 * self.half[2]) if self.half[2] > 0 else coal.Sphere(self.radius)
+
+    @property
+    def solid(self) -> Solid:
+        """Its surface as triangles, to draw, in the world."""
+        own = capsule(self.radius, 2 * self.half[2]) if self.radius else cuboid(2 * self.half)
+        return own.moved(self.rotation, self.place)
 
 
 def ground() -> WorldBody:

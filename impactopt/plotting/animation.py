@@ -15,7 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
+from scipy.spatial import ConvexHull
 
+from impactopt.bodies.surroundings import surroundings_of
 from impactopt.errors import InputError
 from impactopt.output import write_file
 from impactopt.plotting.style import BLACK, BLUE, GREEN, PHASES, STYLE, VERMILION, Array
@@ -30,7 +32,6 @@ AROUND = 0.05  # [s] before and after contact that are slow too
 AFTER = 0.6  # [s] shown beyond the end of the reference's motion
 REST = 1500  # [ms] that the last picture stays
 ARROW = 0.5  # [m] of the robot's weight, and of the largest contact force
-BOX = 0.18  # [m] side of the target
 NEAR = 0.3  # [m] from the hand: farther than this the target may leave the picture
 GREY, LIGHT = "#777777", "#dddddd"
 DRAWN = (BLACK, GREY, LIGHT, BLUE, GREEN, VERMILION)
@@ -48,7 +49,9 @@ class _Scene:
     sticks: Array  # (links, 2, 3)
     soles: list[Array]  # (corners, 3) each
     hand: Array  # (3,)
-    box: Array | None  # (corners, 3), of the target's face and depth
+    world: list[Array]  # vertices (k, 3) of the target, of what holds it, and of obstacles
+    near: list[Array]  # those of them that the picture is to hold
+    face: Array | None  # (3,) where the target is hit, if it is there
     push: Array  # (3,) arrow
     feet: list[tuple[Array, Array]]  # centre of pressure (3,) and arrow (3,)
     zmp: Array | None  # (3,)
@@ -76,6 +79,10 @@ class _Stage:
         self.figure = Figure(figsize=(9.4, 4.2), dpi=80)
         self.canvas: Any = FigureCanvasAgg(self.figure)
         self.panels: list[Any] = []
+        self.world = surroundings_of(done.planned.problem.world)
+        self.shift = (
+            self.scene.point - done.planned.problem.point
+        )  # of a target that is not where it should be
         self.head = self.figure.text(0.02, 0.93, "", fontsize=11, family="monospace")
         self.views = (SIDE, BEHIND, ABOVE)
 
@@ -98,30 +105,28 @@ class _Stage:
             for cop, wrench, bears in zip(cops, ground, loaded, strict=True)
             if bears
         ]
+        world = [
+            (part, part.placed(self.travel[k], scene.normal) + (part.kind != "obstacle") * self.shift)
+            for part in self.world
+            if part.kind == "obstacle" or not self.done.conditions.missing
+        ]
         zmp = centre_of_pressure(sim.ground[k]) if len(ground) else np.full(2, np.nan)
         return _Scene(
             sticks=sticks,
             soles=soles,
             hand=hand,
-            box=None if self.done.conditions.missing else self._box(self.travel[k]),
+            world=[vertices for _, vertices in world],
+            near=[v for part, v in world if not part.clear and np.linalg.norm(v.mean(axis=0) - hand) < NEAR],
+            face=None if self.done.conditions.missing else scene.point + self.travel[k] * scene.normal,
             push=self.per_push * sim.force[k] * scene.normal,
             feet=feet,
             zmp=np.array([*zmp, 0.0]) if np.isfinite(zmp).all() else None,
         )
 
-    def _box(self, travel: float) -> Array:
-        """Corners (8, 3) of the target, its face at the contact plane."""
-        n = self.scene.normal
-        side = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
-        side /= np.linalg.norm(side)
-        axes = np.stack([n, side, np.cross(n, side)])
-        cube = np.array([[a, b, c] for a in (0, 1) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
-        return np.asarray(self.scene.point + travel * n + BOX * cube @ axes)
-
     def set_up(self, scenes: list[_Scene]) -> None:
         """Panels that hold all that comes; the first two are of one scale."""
         body = np.concatenate([s.sticks.reshape(-1, 3) for s in scenes])
-        near = [s.box for s in scenes if s.box is not None and np.linalg.norm(s.box[0] - s.hand) < NEAR]
+        near = [vertices for s in scenes for vertices in s.near]
         low, high = _bounds(np.concatenate([body, *near, *scenes[0].soles]), 0.08)
         low[2] = min(low[2], -0.1)
         spans = [_bounds(np.array([low, high]) @ view.T, 0.0) for view in self.views]
@@ -175,12 +180,12 @@ class _Stage:
         return picture.convert("RGB")
 
     def _robot(self, axes: Any, view: Array, scene: _Scene, moving: list[Any]) -> None:
-        if scene.box is not None:
-            flat = scene.box @ view.T
-            low, high = flat.min(axis=0), flat.max(axis=0)
-            box = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-            moving += axes.fill(*box.T, facecolor=LIGHT, edgecolor=GREY, zorder=1)
-            self._plane(axes, view, scene.box, moving)
+        for vertices in scene.world:
+            flat = vertices @ view.T
+            outline = flat[ConvexHull(flat).vertices]
+            moving += axes.fill(*outline.T, facecolor=LIGHT, edgecolor=GREY, zorder=1)
+        if scene.face is not None:
+            self._plane(axes, view, scene.face, moving)
         for stick, strikes in zip(scene.sticks @ view.T, self.strikes, strict=True):
             colour, order = (BLUE, 4) if strikes else (BLACK, 3)
             moving += axes.plot(*stick.T, color=colour, linewidth=3.0, solid_capstyle="round", zorder=order)
@@ -190,11 +195,11 @@ class _Stage:
         if np.any(scene.push):
             moving.append(_arrow(axes, view @ scene.hand, view @ scene.push, VERMILION))
 
-    def _plane(self, axes: Any, view: Array, box: Array, moving: list[Any]) -> None:
-        """Where it is seen edge-on, the plane of contact: a hand meets it beside the box too."""
+    def _plane(self, axes: Any, view: Array, place: Array, moving: list[Any]) -> None:
+        """Where it is seen edge-on, the plane of contact: a hand meets it beside the target too."""
         normal = view @ self.scene.normal
         if np.linalg.norm(normal) > 0.9:
-            face, way = view @ box[:4].mean(axis=0), np.array([-normal[1], normal[0]])
+            face, way = view @ place, np.array([-normal[1], normal[0]])
             ends = np.array([face - 3 * way, face + 3 * way])
             moving += axes.plot(*ends.T, ":", color=GREY, linewidth=1.0, scalex=False, scaley=False, zorder=0)
 

@@ -1,4 +1,4 @@
-"""A result to look at in a browser: one page with numbers, plots and the moving robot, without a network."""
+"""A result, or a robot's bodies, to look at in a browser: one page that needs no network."""
 
 from __future__ import annotations
 
@@ -6,10 +6,20 @@ from typing import Any
 
 from impactopt.output import record_of
 from impactopt.report.animation import Animation, animation_of
+from impactopt.report.bodies_page import bodies_page, bodies_page_of_problem
 from impactopt.report.report import Report, report_of
 from impactopt.solution import Solution
 
-__all__ = ["Animation", "Report", "animate", "animation_of", "report_of", "report_page"]
+__all__ = [
+    "Animation",
+    "Report",
+    "animate",
+    "animation_of",
+    "bodies_page",
+    "bodies_page_of_problem",
+    "report_of",
+    "report_page",
+]
 
 
 def animate(solution: Solution, *, simulation: Any | None = None, replay: Any | None = None) -> Animation:

@@ -1,4 +1,4 @@
-"""The numbers of an animation: solids on the robot's joints, target, soles, and every motion."""
+"""The numbers of an animation: solids on the robot's joints, the world's bodies, soles, and every motion."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.solids import Solid, box, cylinder, joined, simplified
-from impactopt.contact.board import Board
-from impactopt.contact.nail import Nail
-from impactopt.contact.targets import RigidWall, Target
+from impactopt.bodies.solids import Solid, joined, simplified
+from impactopt.bodies.surroundings import surroundings_of
+from impactopt.bodies.world import WorldBody
 from impactopt.output import Record
 from impactopt.problem import ImpactProblem
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.report.visuals import Visual, visuals_of
-from impactopt.shapes import face_axes
+from impactopt.robot import Robot
 
-__all__ = ["stage_of"]
+__all__ = ["pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -25,32 +24,21 @@ TRIANGLES = 120_000  # at most, of a robot
 CELL = 0.004  # [m] that solids are simplified to at least
 SMALL = 0.3  # [m] smaller solids have smaller cells, but not below a third
 GRID = 65535  # steps of a vertex's coordinate in its solid's bounds
-# [m] what is drawn of targets: depth along the normal, width, height
-BOX, WALL, BOARD, WOOD = (0.18, 0.18, 0.18), (0.06, 0.5, 0.5), (0.02, 0.24, 0.3), (0.06, 0.2, 0.2)
-NAIL = (0.004, 0.07)  # [m] radius, length
 
 
 def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Arrays]:
     """Header and arrays, for :func:`impactopt.report.pack.pack`, of the record's motions."""
     arrays: Arrays = {}
-    bodies = []
-    for k, body in enumerate(_bodies(visuals_of(problem.robot))):
-        bodies.append(
-            {"joint": body.joint, "colour": body.colour, **_pack_solid(f"body{k}", body.solid, arrays)}
-        )
-    axes = face_axes(problem.normal)
-    target = []
-    for k, (solid, moves) in enumerate(target_solids(problem.target)):
-        placed = solid.moved(axes.T, problem.point)
-        target.append({"moves": moves, **_pack_solid(f"target{k}", placed, arrays)})
-    tracks = [_pack_track(f"track{k}", track, arrays) for k, track in enumerate(tracks_of(record, problem))]
+    bodies = pack_robot(problem.robot, arrays)
+    world = pack_world(problem.world, arrays)
+    tracks = [pack_track(f"track{k}", track, arrays) for k, track in enumerate(tracks_of(record, problem))]
     soles = {n: a for n, a in record.arrays.items() if n.startswith("sole_")} | {
         "polygon": record.arrays["polygon"]
     }
     arrays |= {f"ground_{name}": corners for name, corners in soles.items()}
     header = {
         "bodies": bodies,
-        "target": target,
+        "world": world,
         "tracks": tracks,
         "soles": [f"ground_{name}" for name in soles if name != "polygon"],
         "normal": problem.normal,
@@ -64,21 +52,26 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
     return header, arrays
 
 
-def target_solids(target: Target) -> list[tuple[Solid, bool]]:
-    """What is drawn of a target, its face at the origin and x along its normal; whether the blow moves it."""
+def pack_robot(robot: Robot, arrays: Arrays) -> list[dict[str, Any]]:
+    """What the robot looks like, for the page's header; its triangles are added to `arrays`."""
+    return [
+        {"joint": body.joint, "colour": body.colour, **pack_solid(f"body{k}", body.solid, arrays)}
+        for k, body in enumerate(_bodies(visuals_of(robot)))
+    ]
 
-    def slab(sides: tuple[float, float, float], start: float = 0.0) -> Solid:
-        return box(sides).moved(np.eye(3), np.array([start + sides[0] / 2, 0.0, 0.0]))
 
-    if isinstance(target, Nail):
-        radius, length = NAIL
-        along = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # z to x
-        shank = cylinder(radius, length).moved(along, np.array([length / 2, 0.0, 0.0]))
-        head = cylinder(2.5 * radius, radius).moved(along, np.array([radius / 2, 0.0, 0.0]))
-        return [(joined([shank, head]), True), (slab(WOOD, max(length - target.depth, 0.0)), False)]
-    if isinstance(target, RigidWall):
-        return [(slab(WALL), False)]
-    return [(slab(BOARD if isinstance(target, Board) else BOX), True)]
+def pack_world(world: tuple[WorldBody, ...], arrays: Arrays) -> list[dict[str, Any]]:
+    """The same of the world's bodies."""
+    return [
+        {
+            "kind": part.kind,
+            "moves": part.moves,
+            "clear": part.clear,
+            "hinge": None if part.hinge is None else part.hinge._asdict(),
+            **pack_solid(f"world{k}", part.solid, arrays),
+        }
+        for k, part in enumerate(surroundings_of(world))
+    ]
 
 
 def _middle(places: Array) -> float:
@@ -116,7 +109,8 @@ def _share(solid: Solid) -> float:
     return float(np.clip(np.linalg.norm(np.ptp(solid.vertices, axis=0)) / SMALL, 1 / 3, 1.0))
 
 
-def _pack_solid(name: str, solid: Solid, arrays: Arrays) -> dict[str, Any]:
+def pack_solid(name: str, solid: Solid, arrays: Arrays) -> dict[str, Any]:
+    """Its name and scale, for the header; its triangles are added to `arrays`."""
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     span = np.maximum(high - low, 1e-9)
     arrays[f"{name}_vertices"] = np.round((solid.vertices - low) / span * GRID).astype("<u2")
@@ -125,7 +119,8 @@ def _pack_solid(name: str, solid: Solid, arrays: Arrays) -> dict[str, Any]:
     return {"name": name, "low": low, "step": span / GRID}
 
 
-def _pack_track(name: str, track: Track, arrays: Arrays) -> dict[str, Any]:
+def pack_track(name: str, track: Track, arrays: Arrays) -> dict[str, Any]:
+    """The same of a motion."""
     given = ("time", "places", "hand", "mass", "force", "travel", "zmp", "ground")
     arrays |= {f"{name}_{part}": getattr(track, part) for part in given}
     return {

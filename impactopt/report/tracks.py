@@ -73,7 +73,10 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
         q, force = a[f"{prefix}_q"][chosen], a[f"{prefix}_force"][chosen]
         wrench, speed = a[f"{prefix}_sole_ground"].sum(axis=1)[chosen], a[f"{prefix}_target_speed"]
     steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2
-    travel = np.concatenate([[0.0], np.cumsum(steps)])[chosen]
+    travel = np.concatenate([[0.0], np.cumsum(steps)])
+    if prefix == "reference" and record.summary.get("target", {}).get("broken", 1.0) < 0.5:
+        travel[time > end] = 0.0  # a board that holds springs back
+    travel = travel[chosen]
     model = robot.model
     data, striker = model.createData(), model.getFrameId(robot.striker(problem.striker).model_frame)
     places, hand, mass = np.zeros((len(shown), model.njoints, 7)), [], []

@@ -1,17 +1,14 @@
 // Time and controls of the 3D view.
 const SLOWER = 10, REST = 0.8; // how much slower around contact; seconds that the end stays
 const SOON = 1e-6; // seconds that rounding may take
-const MARKS = [
-  ["force", "force on the target", true], ["com", "centre of mass", false], ["zmp", "zero-moment point", false],
-  ["ground", "force of the ground", false], ["polygon", "support polygon", false], ["paths", "paths", true],
-];
 
 class Player {
   constructor(root, header, arrays) {
-    Object.assign(this, { header, arrays, listeners: [], time: 0, track: 0, speed: 1, playing: false, seen: true });
+    Object.assign(this, { header, arrays, still: Boolean(header.hulls), listeners: [], time: 0, track: 0, speed: 1, playing: false, seen: true });
     this.canvas = make("canvas", {
       tabindex: 0, role: "application",
-      "aria-label": "The robot's motion. Arrow keys turn the view, plus and minus zoom, space plays and pauses.",
+      "aria-label": header.hulls ? "The robot's bodies. Arrow keys turn the view, plus and minus zoom." :
+        "The robot's motion. Arrow keys turn the view, plus and minus zoom, space plays and pauses.",
     });
     this.readout = make("div", { class: "readout" });
     this.label = make("span", { class: "label" });
@@ -20,14 +17,15 @@ class Player {
     try {
       this.view = new View(this.canvas, header, arrays);
     } catch (error) {
-      this.stage.replaceChildren(make("p", { class: "note" }, `The motion cannot be shown here: ${error.message}.`));
+      this.stage.replaceChildren(make("p", { class: "note" }, `${header.hulls ? "The robot" : "The motion"} cannot be shown here: ${error.message}.`));
       this.time = header.tracks[0].contact_start ?? 0;
       return;
     }
     root.append(this.controls());
     this.listen();
     this.seek(0);
-    this.play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
+    this.point();
+    this.play(!this.still && !matchMedia("(prefers-reduced-motion: reduce)").matches);
   }
 
   controls() {
@@ -45,18 +43,18 @@ class Player {
     const row = make("div", { class: "row" });
     if (this.header.tracks.length > 1)
       row.append(choose("motion", this.header.tracks.map((t, k) => [k, t.label]), (k) => this.choose(k)));
-    row.append(choose("speed", [[1, "1 x"], [0.5, "1/2 x"], [0.25, "1/4 x"], [0.1, "1/10 x"]], (s) => (this.speed = s)));
+    const speed = choose("speed", [[1, "1 x"], [0.5, "1/2 x"], [0.25, "1/4 x"], [0.1, "1/10 x"]], (s) => (this.speed = s));
     this.slow = make("input", { type: "checkbox", checked: true });
-    row.append(make("label", {}, this.slow, "slow around contact"));
+    if (!this.still) row.append(speed, make("label", {}, this.slow, "slow around contact"));
     const views = make("div", { class: "group", role: "group", "aria-label": "view from" });
     for (const name of Object.keys(VIEWS))
       views.append(make("button", { onclick: () => { this.view.look(name); this.redraw(); } }, name));
     row.append(views);
     const legend = make("div", { class: "row marks" });
-    for (const [name, text, always] of MARKS) {
-      if (!always && !this.header.legged) continue;
+    for (const [name, text, there] of MARKS) {
+      if (!there(this.header)) continue;
       const button = make("button", {
-        class: "key", "aria-pressed": "true",
+        class: "key", "aria-pressed": String(this.view.shown[name]),
         onclick: () => {
           this.view.shown[name] = !this.view.shown[name];
           button.setAttribute("aria-pressed", this.view.shown[name]);
@@ -65,7 +63,17 @@ class Player {
       }, make("i", { class: `dot ${name}` }), text);
       legend.append(button);
     }
-    return make("div", { class: "controls" }, make("div", { class: "row time" }, this.button, this.slider), row, legend);
+    const time = this.still ? null : make("div", { class: "row time" }, this.button, this.slider);
+    return make("div", { class: "controls" }, time, row, legend);
+  }
+
+  // a link whose row in a table is pointed at stands out
+  point() {
+    for (const row of document.querySelectorAll("tr[data-joint]")) {
+      const to = (joint) => () => { this.view.pointed = joint; this.redraw(); };
+      for (const event of ["pointerenter", "focus"]) row.addEventListener(event, to(+row.dataset.joint));
+      for (const event of ["pointerleave", "blur"]) row.addEventListener(event, to(null));
+    }
   }
 
   listen() {
@@ -103,7 +111,7 @@ class Player {
         ArrowLeft: () => view.turn(-0.1, 0), ArrowRight: () => view.turn(0.1, 0),
         ArrowUp: () => view.turn(0, 0.08), ArrowDown: () => view.turn(0, -0.08),
         "+": () => view.zoom(0.9), "=": () => view.zoom(0.9), "-": () => view.zoom(1.1),
-        0: () => view.look("3/4"), " ": () => this.play(!this.playing),
+        0: () => view.look("3/4"), " ": () => this.play(!this.still && !this.playing),
       }[e.key];
       if (!act || e.ctrlKey || e.metaKey || e.altKey) return;
       e.preventDefault();
@@ -182,7 +190,7 @@ class Player {
     const { contact_start: start, contact_end: end } = track, slowness = this.slowness(this.time);
     const phase = start == null || this.time + SOON < start ? "swing" : end == null || this.time + SOON < end ? "contact" : "follow-through";
     const slow = slowness > 1 ? ` · ${slowness} x slower` : "";
-    this.readout.textContent = `${this.time.toFixed(3)} s · ${phase}${slow}`;
+    this.readout.textContent = this.still ? track.label : `${this.time.toFixed(3)} s · ${phase}${slow}`;
     this.label.hidden = !(now.force > 0 && this.view.shown.force);
     if (!this.label.hidden) {
       const [x, y] = this.view.project(now.tip);

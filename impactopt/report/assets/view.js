@@ -32,16 +32,27 @@ void main() {
   }
   result = vec4(c.rgb * c.a, c.a);
 }`;
+// colours of hulls, one after the other: neighbours differ
+const HULLS = [[0.9, 0.62, 0], [0.34, 0.71, 0.91], [0, 0.62, 0.45], [0.8, 0.47, 0.65], [0.84, 0.37, 0], [0, 0.45, 0.7]];
+const CLEAR = 0.4; // of what the robot is seen through
 const ANGLE = (32 * Math.PI) / 180;
 // yaw and pitch, for a target on the right; else the yaws are mirrored
 const VIEWS = { "3/4": [-1.95, 0.2], side: [-Math.PI / 2, 0.05], front: [-0.15, 0.08], top: [-Math.PI / 2, 1.5] };
+
+// what is drawn or not, as the reader likes: name, text, on which pages there is any, and whether it is drawn at first
+const MARKS = [
+  ["force", "force on the target", (h) => !h.hulls], ["com", "centre of mass", (h) => h.legged], ["zmp", "zero-moment point", (h) => h.legged],
+  ["ground", "force of the ground", (h) => h.legged], ["polygon", "support polygon", (h) => h.legged], ["paths", "paths", (h) => !h.hulls],
+  ["obstacles", "obstacles", (h) => h.world.some((part) => part.kind === "obstacle")],
+  ["meshes", "what the robot looks like", (h) => h.hulls], ["hulls", "hulls", (h) => h.hulls], ["spheres", "spheres that cover them", (h) => h.hulls, false],
+];
 
 class View {
   constructor(canvas, header, arrays) {
     Object.assign(this, { canvas, header, arrays });
     this.gl = canvas.getContext("webgl2", { antialias: true, alpha: true, stencil: true, premultipliedAlpha: true });
     if (!this.gl) throw new Error("no WebGL 2");
-    this.shown = { force: true, zmp: true, polygon: true, com: true, ground: true, paths: true };
+    this.shown = Object.fromEntries(MARKS.map(([name, , , on = true]) => [name, on]));
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => { this.setUp(); this.draw(); });
     this.setUp();
@@ -68,7 +79,8 @@ class View {
     const corners = (name) => Array.from({ length: arrays[name].length / 2 }, (_, k) => [...arrays[name].slice(2 * k, 2 * k + 2)]);
     const outline = (name, z) => { const c = corners(name).map(([x, y]) => [x, y, z]); return tube([...c, c[0]], 0.003); };
     this.bodies = header.bodies.map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
-    this.target = header.target.map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
+    this.world = header.world.map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
+    this.hulls = (header.hulls ?? []).map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
     this.floor = this.buffer(flatPolygon([[-4, -4], [4, -4], [4, 4], [-4, 4]], 0));
     this.soles = header.soles.map((name) => this.buffer(outline(name, 0.002)));
     if (header.legged) {
@@ -102,7 +114,7 @@ class View {
     return { array, count: data.length / 6 };
   }
 
-  // what the camera looks at: all joints and hands of the first motion
+  // what the camera looks at: all joints and hands of the first motion, or all of a robot that stands still
   frame() {
     const { arrays, header } = this, { name } = header.tracks[0];
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
@@ -112,6 +124,11 @@ class View {
     for (let k = 0; k < places.length / 7; k++) if (k % joints) take([...places.slice(7 * k, 7 * k + 3)]);
     for (let k = 0; k < hand.length / 3; k++) take([...hand.slice(3 * k, 3 * k + 3)]);
     take(header.point);
+    const still = header.hulls && this.instant(header.tracks[0], 0);
+    arrays.spheres_joint?.forEach((joint, k) => {
+      const m = times(this.pose(still, joint), scaled([...arrays.spheres_centre.slice(3 * k, 3 * k + 3)], 1));
+      for (const r of [-arrays.spheres_radius[k], arrays.spheres_radius[k]]) take([m[12] + r, m[13] + r, m[14] + r]);
+    });
     if (header.legged) low[2] = 0;
     this.middle = low.map((x, k) => (x + high[k]) / 2);
     this.size = Math.max(0.35, 0.5 * Math.hypot(...low.map((x, k) => high[k] - x)));
@@ -221,16 +238,21 @@ class View {
     }
     for (const sole of header.legged ? this.soles : []) this.put(sole, still, themeColour("muted"), 1, 0.6);
     const poses = this.bodies.map((body) => this.pose(now, body.joint));
-    const [travel] = now.mix("travel", 1);
-    const pushed = scaled(header.normal.map((x) => x * travel), 1);
-    const seen = this.seen(travel);
-    if (header.legged) this.shadow(poses, pushed, seen);
+    const world = this.surroundings(now.mix("travel", 1)[0]);
+    if (header.legged) this.shadow(poses, world);
     gl.depthMask(true);
 
-    this.bodies.forEach((body, b) => this.put(body.buffer, poses[b], body.colour));
-    for (const part of this.target)
-      if (!part.moves) this.put(part.buffer, still, themeColour("wood"));
-      else if (seen > 0) this.put(part.buffer, pushed, themeColour("target"), 0, seen);
+    if (shown.meshes) this.bodies.forEach((body, b) => this.put(body.buffer, poses[b], body.colour));
+    for (const { part, place, seen } of world) if (!part.clear) this.put(part.buffer, place, themeColour(part.kind), 0, seen);
+    gl.enable(gl.CULL_FACE);
+    gl.depthMask(false);
+    for (const { part, place } of world) if (part.clear) this.put(part.buffer, place, themeColour(part.kind), 0, CLEAR);
+    gl.enable(gl.POLYGON_OFFSET_FILL); // a hull may lie on what it is about
+    gl.polygonOffset(-1, -1);
+    this.coverings(now);
+    gl.disable(gl.POLYGON_OFFSET_FILL);
+    gl.depthMask(true);
+    gl.disable(gl.CULL_FACE);
     if (shown.paths) this.put(this.paths[k].hand, still, themeColour("path"), 1, 0.8);
 
     gl.clear(gl.DEPTH_BUFFER_BIT); // what follows is seen through the robot
@@ -244,15 +266,45 @@ class View {
     return Math.min(1, Math.max(0, 2 - (2 * Math.abs(travel)) / this.header.far));
   }
 
-  shadow(poses, pushed, seen) {
+  // hulls and spheres of the links, which are seen through; of a link that is pointed at, darker
+  coverings(now) {
+    const { gl, header, arrays, shown } = this, strength = (joint) => (this.pointed == null ? 0.35 : this.pointed === joint ? 0.75 : 0.08);
+    for (const hull of shown.hulls ? this.hulls : []) {
+      if (hull.joint === this.pointed) gl.disable(gl.DEPTH_TEST); // it may be inside of others
+      this.put(hull.buffer, this.pose(now, hull.joint), HULLS[hull.colour % HULLS.length], 0, strength(hull.joint));
+      gl.enable(gl.DEPTH_TEST);
+    }
+    if (!header.hulls || !shown.spheres) return;
+    const { spheres_joint: joint, spheres_centre: centre, spheres_radius: radius } = arrays;
+    joint.forEach((j, k) => {
+      const model = times(this.pose(now, j), scaled([...centre.slice(3 * k, 3 * k + 3)], radius[k]));
+      this.put(this.ball, model, themeColour("sphere"), 0, 0.6 * strength(j));
+    });
+  }
+
+  // where the bodies of the world are after the target's travel: it moves on, and a board's halves tip over
+  surroundings(travel) {
+    const seen = this.seen(travel), out = [];
+    for (const part of this.world) {
+      if (part.kind === "obstacle" && !this.shown.obstacles) continue;
+      let place = scaled(part.moves ? this.header.normal.map((x) => x * travel) : [0, 0, 0], 1);
+      if (part.hinge) {
+        const { place: at, axis, arm } = part.hinge, half = Math.atan2(travel, arm) / 2;
+        const turn = rigid([0, 0, 0], [...axis.map((x) => x * Math.sin(half)), Math.cos(half)]);
+        place = times(times(scaled(at, 1), turn), scaled(at.map((x) => -x), 1));
+      }
+      if (!part.moves || seen > 0) out.push({ part, place, seen: part.moves ? seen : 1 });
+    }
+    return out;
+  }
+
+  shadow(poses, world) {
     const gl = this.gl, flat = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, -0.25, 0.3, 0, 0, 0, 0, 0.0005, 1]);
     gl.enable(gl.STENCIL_TEST);
     gl.stencilFunc(gl.EQUAL, 0, 255);
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
     this.bodies.forEach((body, b) => this.put(body.buffer, times(flat, poses[b]), [0, 0, 0], 1, 0.2));
-    for (const part of this.target)
-      if (!part.moves) this.put(part.buffer, flat, [0, 0, 0], 1, 0.2);
-      else if (seen > 0) this.put(part.buffer, times(flat, pushed), [0, 0, 0], 1, 0.2 * seen);
+    for (const { part, place, seen } of world) this.put(part.buffer, times(flat, place), [0, 0, 0], 1, 0.2 * seen);
     gl.disable(gl.STENCIL_TEST);
   }
 

@@ -1,0 +1,183 @@
+"""A robot's bodies on a page: hulls and spheres over its meshes, how well they fit, which may touch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.robot_bodies import RobotBodies, bodies_of
+from impactopt.bodies.solids import Solid
+from impactopt.bodies.world import WorldBody
+from impactopt.problem import ImpactProblem
+from impactopt.report.page import html_page
+from impactopt.report.report import Report
+from impactopt.report.stage import Arrays, pack_robot, pack_solid, pack_track, pack_world
+from impactopt.report.tracks import Track
+from impactopt.robot import Robot
+
+__all__ = ["bodies_page", "bodies_page_of_problem"]
+
+Array = NDArray[np.float64]
+USUAL = "half_sitting"  # the posture that a robot without a problem is shown in, if it has one
+
+
+def bodies_page(robot: Robot) -> Report:
+    """The bodies of a robot in its posture `USUAL`, or else in its first one, or at its model's neutral."""
+    names = sorted(robot.postures, key=lambda name: name != USUAL)
+    posture = robot.posture(names[0]) if names else pin.neutral(robot.model)
+    return _page(robot, posture, names[0] if names else "neutral", robot.name)
+
+
+def bodies_page_of_problem(problem: ImpactProblem) -> Report:
+    """The bodies of a problem's robot where it starts, and of the problem's world."""
+    where = problem.start if isinstance(problem.start, str) else "start"
+    title = problem.name or problem.robot.name
+    return _page(
+        problem.robot, problem.start_posture, where, title, world=problem.world, normal=problem.normal
+    )
+
+
+def _page(
+    robot: Robot,
+    q: Array,
+    posture: str,
+    title: str,
+    *,
+    world: tuple[WorldBody, ...] = (),
+    normal: Array | None = None,
+) -> Report:
+    links, arrays = bodies_of(robot), dict[str, Any]()
+    header = {
+        "bodies": pack_robot(robot, arrays),
+        "hulls": _pack_hulls(links, arrays),
+        "world": pack_world(world, arrays),
+        "tracks": [pack_track("track0", _still(robot, q, f"posture: {posture}"), arrays)],
+        "soles": [],
+        "normal": np.array([1.0, 0.0, 0.0]) if normal is None else normal,
+        "point": arrays["track0_hand"][0],
+        "side": float(arrays["track0_places"][0, 1:, 1].mean()),
+        "weight": 1.0,
+        "around": 0.0,
+        "far": 1.0,
+        "legged": False,
+        "charts": [],
+    }
+    arrays |= {f"spheres_{name}": getattr(links, name) for name in ("centre", "radius")}
+    arrays["spheres_joint"] = links.joint.astype("<u2")
+    body = "\n".join(_body(links, q, posture, title, world))
+    return Report(html_page(title=f"{title}: bodies", kind="report", body=body, header=header, arrays=arrays))
+
+
+def _pack_hulls(links: RobotBodies, arrays: Arrays) -> list[dict[str, Any]]:
+    out = []
+    for k, piece in enumerate(links.pieces):
+        packed = pack_solid(f"hull{k}", Solid(vertices=piece.vertices, triangles=piece.triangles), arrays)
+        out.append({"joint": piece.joint, "colour": links.joints.index(piece.joint), **packed})
+    return out
+
+
+def _still(robot: Robot, q: Array, label: str) -> Track:
+    """One instant, in which nothing is hit."""
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    nothing, none = np.zeros(1), np.full((1, 3), np.nan)
+    strikers = [data.oMf[model.getFrameId(s.model_frame)].translation for s in robot.strikers.values()]
+    middle = np.array(pin.centerOfMass(model, data, q))
+    return Track(
+        name=label,
+        time=nothing,
+        places=np.array([[pin.SE3ToXYZQUAT(place) for place in data.oMi]]),
+        hand=np.array([strikers[0] if strikers else middle]),
+        mass=middle[None],
+        force=nothing,
+        travel=nothing,
+        zmp=none[:, :2],
+        ground=none,
+        contact_start=np.nan,
+        contact_end=np.nan,
+    )
+
+
+def _body(
+    links: RobotBodies, q: Array, posture: str, title: str, world: Sequence[WorldBody]
+) -> Iterator[str]:
+    yield f'<header><h1>{escape(title)}</h1><span class="sub">'
+    yield f"{escape(links.robot.name)}: what of it can touch something</span>"
+    yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
+    yield '<div id="trouble"></div>'
+    yield f'<p id="source">Bodies are convex hulls. They are from the {escape(links.source)}. Spheres cover '
+    yield "them for the rows of a plan; clearance is measured between hulls. Point at a row to see its link."
+    yield "</p>"
+    yield '<div class="top"><section class="card stays" id="animation" aria-label="bodies"></section>'
+    yield f'<section class="card" id="fit" aria-label="links"><h3>Links</h3>{_fit(links)}'
+    yield "<figcaption>Out: how far spheres stick out of the hull of all that the link's joint moves. Short: "
+    yield "what of its surface they leave out.</figcaption></section></div>"
+    if world:
+        yield f'<h2>The world</h2><section class="card" id="world">{_world(world)}</section>'
+    yield "<h2>Pairs that may touch</h2>"
+    for number, (why, pairs) in enumerate(_left_out(links, q, posture)):
+        rows = [(one, other) for one, other in pairs] or [("none", "")]
+        yield f'<section class="card left-out" id="why{number}"><h3>{escape(why)}</h3>'
+        yield f"{_table(('link', 'and link'), rows)}</section>"
+    yield "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network."
+    yield "</main></footer>"
+
+
+def _fit(links: RobotBodies) -> str:
+    rows, joints = [], []
+    for j in links.joints:
+        spheres = int((links.joint == j).sum())
+        millimetres = (f"{1e3 * links.out[j]:.0f}", f"{1e3 * links.short[j]:.1f}")
+        rows.append((links.name(j), str(len(links.of_joint[j])), str(spheres), *millimetres))
+        joints.append(j)
+    head = ("link", "hulls", "spheres", "out [mm]", "short [mm]")
+    return _table(head, rows, joints)
+
+
+def _world(world: Sequence[WorldBody]) -> str:
+    def shape(body: WorldBody) -> str:
+        if not body.radius:
+            return f"box {' x '.join(f'{2 * h:.3g}' for h in body.half)} m"
+        length = 2 * float(body.half[2])
+        return f"{f'capsule {length:.3g} m long' if length else 'ball'}, radius {body.radius:.3g} m"
+
+    def place(body: WorldBody) -> str:
+        return f"({', '.join(f'{x:.3g}' for x in body.place)}) m"
+
+    rows = [(b.name, shape(b), place(b)) for b in world[1:] if not b.core]
+    return _table(("body", "shape", "middle"), rows or [("the ground alone", "", "")])
+
+
+def _left_out(links: RobotBodies, q: Array, posture: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """Why pairs of links may touch, and which those are."""
+    robot = links.robot
+    yield "A joint connects them", [(links.name(a), links.name(b)) for a, b in links.connected]
+    said = {frozenset(pair) for pair in robot.disable_collisions}
+    joints = {piece.link: piece.joint for piece in links.pieces}
+    near = {frozenset(pair) for pair in links.connected}
+    told = [p for p in said if p <= joints.keys() and len(p) == 2]
+    beyond = [p for p in told if len(moved := {joints[n] for n in p}) == 2 and frozenset(moved) not in near]
+    yield "The robot's files, or its disable_collisions, say so", _sorted(beyond)
+    _, touching = links.piece_pairs(q, said)
+    yield f"They touch in the posture {posture}", _sorted(map(frozenset, touching))
+
+
+def _sorted(pairs: Iterable[frozenset[str]]) -> list[tuple[str, str]]:
+    """Names of two each, of a pair of one link that name twice."""
+    return sorted({(min(pair), max(pair)) for pair in pairs})
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], joints: Sequence[int] | None = None) -> str:
+    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    lines = []
+    for k, (first, *cells) in enumerate(rows):
+        joint = f' data-joint="{joints[k]}" tabindex="0"' if joints is not None else ""
+        inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+        lines.append(f'<tr{joint}><th scope="row">{escape(first)}</th>{inner}</tr>')
+    table = f"<thead><tr>{top}</tr></thead><tbody>{''.join(lines)}</tbody>"
+    return f'<div class="scroll"><table>{table}</table></div>'

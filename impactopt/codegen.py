@@ -36,13 +36,13 @@ import numpy.typing as npt
 from impactopt._compiler import CompileError, Compiler, find_compiler
 from impactopt._hashing import canonical, model_hash
 from impactopt.errors import CacheWarning, NoCompilerWarning
+from impactopt.files import write_atomically
 from impactopt.private_files import (
     UnsafePath,
     check_private_file,
     locked,
     private_directory,
     temporary_private_directory,
-    write_atomically,
 )
 
 __all__ = [
@@ -72,6 +72,7 @@ _NOT_IN_GRAPHS = frozenset(
         "cases",
         "cli",
         "errors",
+        "files",
         "ipopt",
         "output",
         "planner",
@@ -224,7 +225,7 @@ def kept(kind: str, digest: str, make: Callable[[], bytes]) -> bytes:
         pass  # not there yet
     made = make()
     with contextlib.suppress(OSError):  # a full disk: they are made again next time
-        write_atomically(path, hashlib.sha256(made).digest() + made)
+        _put(path, hashlib.sha256(made).digest() + made)
     return made
 
 
@@ -288,7 +289,7 @@ def _build_entry(
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
         ordered = {"functions": {function: listing[function] for function in functions}}
-        write_atomically(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
+        _put(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
     except (CompileError, OSError) as error:
         warnings.warn(
             f"{name}: {error}; its functions run in CasADi's virtual machine, 10 to 20 times slower",
@@ -330,9 +331,13 @@ def _library(
     compiler.run(source, made, level)
     content = made.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
-    write_atomically(library, content, mode=0o700)
-    write_atomically(seal, digest.encode())
+    _put(library, content, mode=0o700)
+    _put(seal, digest.encode())
     return library.name, digest
+
+
+def _put(path: Path, content: bytes, *, mode: int = 0o600) -> None:
+    write_atomically(path, lambda file: file.write(content), mode=mode)
 
 
 def _longest_body(function: Buildable) -> int:

@@ -33,6 +33,8 @@ from impactopt.program import (
 )
 
 IPOPT_DEFAULTS: Mapping[str, Any] = {
+    # none is read: an ipopt.opt in the working directory could load libraries and write files
+    "option_file_name": "",
     "print_level": 0,
     "sb": "yes",
     "linear_solver": "mumps",

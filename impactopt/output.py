@@ -7,7 +7,6 @@ old ones, what was made of those goes first: whenever a process ends, all files 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import io
 import json
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.files import write_atomically
 from impactopt.problem import ImpactProblem
 from impactopt.program import SolverResult
 from impactopt.reference.poses import poses_of
@@ -272,21 +272,10 @@ def write_file(
     ------
     InputError : it cannot be written; what was at `path` before is still there.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())  # a name that is there before its content would be an empty file
-        if before is not None:
-            before()
-        os.replace(temporary, path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise InputError(f"cannot write {path}: {error.strerror}") from error
-        raise
+        write_atomically(path, write, before=before)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def load_record(directory: str | os.PathLike[str]) -> Record:

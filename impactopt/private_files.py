@@ -12,13 +12,14 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from impactopt.files import open_own
+
 __all__ = [
     "UnsafePath",
     "check_private_file",
     "locked",
     "private_directory",
     "temporary_private_directory",
-    "write_atomically",
 ]
 
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -62,26 +63,12 @@ def check_private_file(path: Path) -> None:
     _check(path, os.lstat(path), stat.S_ISREG, "file")
 
 
-def write_atomically(path: Path, content: bytes, *, mode: int = 0o600) -> None:
-    """Put `content` at `path` in one step: a reader sees the old file or the whole new one."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, mode)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-
-
 @contextlib.contextmanager
 def locked(path: Path, *, on_wait: Callable[[], None]) -> Iterator[None]:
     """Hold a lock on `path` between processes; `on_wait` is called if another one holds it."""
     import fcntl  # POSIX only, as compiling is
 
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)
+    handle = open_own(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.files import open_own
 from impactopt.sweeps.units import Columns
 
 __all__ = ["Entry", "Journal"]
@@ -53,7 +54,7 @@ class Journal:
         self.path, self.torn, self.damaged = path, False, 0
         self._places: dict[int, int] = {}
         try:
-            self._file = open(path, "r+b" if path.exists() else "w+b", buffering=0)  # noqa: SIM115
+            self._file = os.fdopen(open_own(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
             self._end = self._scan()
             self._file.truncate(self._end)
         except OSError as error:

@@ -31,6 +31,7 @@ def show(
     Exit code: 0 written, 2 bad input.
     """
     with plain_errors("interrupted before the page was written"):
+        from impactopt.errors import printable
         from impactopt.output import load_record, make_directory
         from impactopt.replay import load_planned
         from impactopt.report import report_of
@@ -40,6 +41,6 @@ def show(
         page = out if out is not None else (result if result.is_dir() else result.parent) / PAGE
         make_directory(page.parent)
         written = report_of(record, about).save(page)
-        typer.echo(str(written))
+        typer.echo(printable(str(written)))
         if open_:
             webbrowser.open(written.resolve().as_uri())

@@ -1,8 +1,9 @@
-"""The one way in which files are written: whole, in one step, through no link that someone has put there."""
+"""How files are written, whole and through no planted link, and how those that could be anything are read."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import stat
@@ -10,7 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["open_own", "write_atomically"]
+__all__ = ["is_plain_file", "open_own", "read_plain", "write_atomically"]
+
+_NONBLOCK = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer, or a reader, would wait for one
 
 
 def write_atomically(
@@ -55,9 +58,37 @@ def open_own(path: str | os.PathLike[str], flags: int, mode: int = 0o666) -> int
     ------
     OSError : it is a link, a directory, a pipe or a device; or it cannot be opened.
     """
-    # a pipe without a reader would wait for one
-    handle = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), mode)
+    return _plain(path, os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | _NONBLOCK, mode))
+
+
+def read_plain(path: str | os.PathLike[str], most: int) -> bytes:
+    """The content of a plain file of at most so many bytes; links are followed.
+
+    Raises
+    ------
+    OSError : it is larger, a directory, a pipe or a device, which may never end; it cannot be read.
+    """
+    try:
+        handle = _plain(path, os.open(path, os.O_RDONLY | _NONBLOCK))
+    except ValueError:  # of a null byte
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), os.fspath(path)) from None
+    with os.fdopen(handle, "rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", os.fspath(path))
+    return content
+
+
+def is_plain_file(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a plain file; of names that no file can have too."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def _plain(path: str | os.PathLike[str], handle: int) -> int:
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
-        raise OSError(0, "not a plain file", str(path))
+        raise OSError(errno.EINVAL, "not a plain file", os.fspath(path))
     return handle

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from pydantic import AfterValidator, Field, PlainValidator
 
-from impactopt.errors import did_you_mean
+from impactopt.errors import did_you_mean, shortened
 from impactopt.ipopt import IPOPT_DEFAULTS
 from impactopt.presets import robot_names
 from impactopt.problem_file.ipopt_options import ALLOWED
@@ -22,7 +22,9 @@ def _known_robot(name: str) -> str:
     """A preset's name."""
     if name not in robot_names():
         near = did_you_mean(name, robot_names())
-        raise ValueError(f"there is no robot {name!r}{near}; presets are {', '.join(robot_names())}")
+        raise ValueError(
+            f"there is no robot {shortened(name)!r}{near}; presets are {', '.join(robot_names())}"
+        )
     return name
 
 
@@ -117,6 +119,8 @@ def _inertia(value: Any) -> Any:
 def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
     """A table."""
     # IPOPT itself is asked about each value, with a program of one variable
+    if len(options) > len(ALLOWED):
+        raise ValueError(f"has {len(options)} keys; there are {len(ALLOWED)} to give")
     x, wrong = ca.MX.sym("x"), []
     for name, value in options.items():
         if name not in ALLOWED:

@@ -41,7 +41,7 @@ LAYERS = (
     ("validation",),
     ("reference", "cases"),
     ("keeping_apart", "starts", "solution", "baseline", "strike", "planner", "blows", "robustness"),
-    ("problem_file", "output", "result_folder", "replay", "sweeps"),
+    ("problem_file", "record_schema", "output", "result_folder", "replay", "sweeps"),
     ("plotting", "result_rows", "report", "screen"),
     ("plain_errors", "bench", "reproduce"),
     (

@@ -22,7 +22,7 @@ def check(
     not.
     """
     with plain_errors("interrupted", verbose=verbose):
-        from impactopt.errors import InputError
+        from impactopt.errors import InputError, printable
         from impactopt.problem_file import parse_settings, read_problem_file
 
         try:
@@ -38,9 +38,9 @@ def check(
             found = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
             typer.echo(json.dumps(found, indent=2))
             return
-        typer.echo(f"{file} is sound:")
+        typer.echo(printable(f"{file} is sound:"))
         for name, value in problem.describe().items():
-            typer.echo(f"  {name:<8} {value}")
+            typer.echo(printable(f"  {name:<8} {value}"))
 
 
 def new(

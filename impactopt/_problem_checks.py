@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,9 +18,21 @@ from impactopt.robot import Robot
 from impactopt.support import margin, support_polygon
 from impactopt.terms import Term
 
-__all__ = ["COLLISIONS", "check_at_rest", "check_collision", "check_names"]
+__all__ = ["COLLISIONS", "check_apart", "check_at_rest", "check_collision", "check_names"]
 
 COLLISIONS = ("dynamics", "rigid", "virtual mass")
+MANY = 100  # scenarios or obstacles
+
+
+def check_apart(kind: str, names: Sequence[str]) -> None:
+    """InputError if there are too many things of a kind, or two of the same name."""
+    if len(names) > MANY:
+        raise InputError(
+            f"there are {len(names)} {kind}s; give at most {MANY}, each of which is part of the program"
+        )
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"two {kind}s are called {twice!r}: give each a name of its own")
 
 
 def check_at_rest(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike, fspath
@@ -12,11 +13,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt._robot_checks import check_frame
+from impactopt._robot_checks import HEAVIEST, check_frame
 from impactopt._robot_parts import Striker, Tool
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import InputError, check_array, did_you_mean, shortened
+from impactopt.files import is_plain_file
 
 Array = NDArray[np.float64]
+MANY = 100  # soles, strikers or tools
 
 
 def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
@@ -101,9 +104,10 @@ def armature(
     own = np.array(model.armature[model.nv - len(joints) :], dtype=np.float64)
     result = per_joint("armature", value, joints, per_joint("rotor", reflected, joints, own))
     for name, number in zip(joints, result, strict=True):
-        if number < 0:
+        if not 0 <= number <= HEAVIEST:
             raise InputError(
-                f"armature of joint {name!r} is {number:g} kg m2; give rotor inertia x gear^2, >= 0"
+                f"armature of joint {name!r} is {number:g} kg m2; give rotor inertia x gear^2, "
+                f"0 to {HEAVIEST:g}"
             )
     return result
 
@@ -253,6 +257,12 @@ def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
     return q
 
 
+def check_count(kind: str, things: Sequence[Any]) -> None:
+    """InputError if a robot has so many of them that it is none."""
+    if len(things) > MANY:
+        raise InputError(f"the robot has {len(things)} {kind}s; give at most {MANY}")
+
+
 def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
     """The things by their names; InputError if two have the same."""
     named = {thing.name: thing for thing in things}
@@ -276,7 +286,9 @@ def _joints(model: pin.Model) -> list[Any]:
 
 
 def _existing(path: str | PathLike[str], kind: str) -> str:
-    file = Path(fspath(path)).expanduser()
-    if not file.is_file():
-        raise InputError(f"{kind} {file}: no such file")
+    file = Path(fspath(path))
+    with contextlib.suppress(RuntimeError):  # of a user that there is not
+        file = file.expanduser()
+    if not is_plain_file(file):
+        raise InputError(f"{kind} {shortened(str(file), 300)}: no such file")
     return str(file)

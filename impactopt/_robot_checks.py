@@ -8,13 +8,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean
 
 Array = NDArray[np.float64]
 
 # Fastest servo that makes sense [1/s]: a time constant of 33 us is below a tenth of any servo's sampling
 # time. Light wrists without armature reach 1e5.
 MAX_SERVO_RATE = 3e4
+HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool, a rotor: a ship
+STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
 
 
 def check_joint_types(model: pin.Model) -> None:
@@ -28,16 +30,39 @@ def check_joint_types(model: pin.Model) -> None:
             )
 
 
+def check_joints(joints: Sequence[str], name: str) -> None:
+    """InputError if there is no joint to drive."""
+    if not joints:
+        raise InputError(
+            f"robot {name!r} has no joints that move: there is nothing to plan; see its <joint>s"
+        )
+    for joint in joints:
+        if not joint.isprintable():
+            raise InputError(f"the name of joint {joint!r} has control characters; take them out")
+
+
 def check_inertias(model: pin.Model) -> None:
     """InputError if a moving body's mass or inertia cannot be those of matter."""
     for i in range(1, model.njoints):
         body = model.inertias[i]
         where = f"the link moved by joint {model.names[i]!r} (with what is fixed to it)"
-        if not np.isfinite(body.mass) or body.mass <= 0:
-            raise InputError(f"{where} has mass {body.mass:g} kg; give its <inertial> a positive mass")
-        inertia = np.array(body.inertia)
+        if not 0 < body.mass <= HEAVIEST:
+            raise InputError(
+                f"{where} has mass {body.mass:g} kg; give its <inertial> one > 0 and <= {HEAVIEST:g}"
+            )
+        inertia, placed = np.array(body.inertia), model.jointPlacements[i].translation
         if not (np.isfinite(inertia).all() and np.isfinite(body.lever).all()):
             raise InputError(f"{where} has NaN or infinity in its <inertial>; give finite numbers")
+        if not (np.abs(inertia).max() <= HEAVIEST and max(np.abs(body.lever)) <= FARTHEST):
+            raise InputError(
+                f"{where} has more than {HEAVIEST:g} kg m2, or its centre of mass more than {FARTHEST:g} m "
+                "from its joint; correct its <inertial>"
+            )
+        if not max(np.abs(placed)) <= FARTHEST:
+            raise InputError(
+                f"joint {model.names[i]!r} is {max(np.abs(placed)):g} m from the one before, and "
+                f"{FARTHEST:g} is the most; correct its <origin>"
+            )
         small, middle, large = np.linalg.eigvalsh(inertia)
         moments = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m2"
         if small <= 0:
@@ -60,7 +85,7 @@ def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: A
         *((j, x, "rad/s", "velocity_limit") for j, x in zip(joints, velocity, strict=True)),
     ):
         # Pinocchio writes a missing limit as infinity or the largest double
-        if not 0 < value < 1e300:
+        if not 0 < value <= STRONGEST:
             raise InputError(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
                 f"set it in the URDF's <limit>, or give {option}={{{name!r}: ...}}"
@@ -89,7 +114,15 @@ def check_gains(
     data = model.createData()
     for q in configurations:
         upper = np.triu(pin.crba(model, data, q))
-        mobility = np.diag(np.linalg.inv(upper + np.triu(upper, 1).T))[model.nv - len(joints) :]
+        try:
+            mobility = np.diag(np.linalg.inv(upper + np.triu(upper, 1).T))[model.nv - len(joints) :]
+        except np.linalg.LinAlgError:
+            mobility = np.full(len(joints), np.nan)
+        if not np.all(np.isfinite(mobility)):
+            raise InputError(
+                "the robot's inertia matrix is singular: its links' inertias are too far apart for numbers "
+                "of 16 digits; correct the smallest and the largest <inertial>, or give armature"
+            )
         rates = np.maximum(kd * mobility, np.sqrt(kp * np.maximum(mobility, 0)))
         worst = int(np.argmax(rates))
         if rates[worst] > MAX_SERVO_RATE:

@@ -11,7 +11,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt import _robot_checks as checks
-from impactopt.errors import InputError, check_array
+from impactopt._robot_checks import HEAVIEST
+from impactopt.errors import FARTHEST, InputError, check_array
 
 Array = NDArray[np.float64]
 
@@ -36,11 +37,13 @@ class Sole:
     placement: Any = None
 
     def __post_init__(self) -> None:
-        polygon = check_array(f"sole {self.name!r}: polygon [m]", self.polygon, (None, 2))
+        polygon = check_array(f"sole {self.name!r}: polygon [m]", self.polygon, (None, 2), most=FARTHEST)
         checks.check_polygon(self.name, polygon)
         object.__setattr__(self, "polygon", read_only(polygon))
         if (self.parent is None) != (self.placement is None):
             raise InputError(f"sole {self.name!r}: give parent and placement together, or neither")
+        if self.placement is not None:
+            check_array(f"sole {self.name!r}: placement [m]", self.placement.translation, (3,), most=FARTHEST)
 
     @classmethod
     def box(
@@ -68,7 +71,7 @@ class Striker:
     point: Array
 
     def __post_init__(self) -> None:
-        point = check_array(f"striker {self.name!r}: point [m]", self.point, (3,))
+        point = check_array(f"striker {self.name!r}: point [m]", self.point, (3,), most=FARTHEST)
         object.__setattr__(self, "point", read_only(point))
 
     @property
@@ -91,8 +94,8 @@ class Tool:
 
     Raises
     ------
-    InputError : a mass that is not positive, an inertia that is not symmetric. Whether it is one of matter is
-        checked with the link, by `Robot.with_tool`.
+    InputError : a mass that is not positive, an inertia that is not symmetric or negative. Whether it is one
+        of matter is checked with the link, by `Robot.with_tool`.
     """
 
     name: str
@@ -104,17 +107,25 @@ class Tool:
 
     def __post_init__(self) -> None:
         what = f"tool {self.name!r}"
-        if not check_array(f"{what}: mass [kg]", self.mass, ()) > 0:
+        if not check_array(f"{what}: mass [kg]", self.mass, (), most=HEAVIEST) > 0:
             raise InputError(f"{what}: mass is {self.mass:g} kg; give a number > 0")
         inertia = np.asarray(self.inertia, dtype=float)
         inertia = check_array(
-            f"{what}: inertia [kg m2]", np.diag(inertia) if inertia.shape == (3,) else inertia, (3, 3)
+            f"{what}: inertia [kg m2]",
+            np.diag(inertia) if inertia.shape == (3,) else inertia,
+            (3, 3),
+            most=HEAVIEST,
         )
         if not np.allclose(inertia, inertia.T, rtol=0, atol=1e-12):
             raise InputError(f"{what}: its inertia is not symmetric; give the same number on both sides")
+        least = float(np.linalg.eigvalsh(inertia)[0])
+        if least < 0:
+            raise InputError(
+                f"{what}: its inertia has the principal moment {least:.3g} kg m2; give that of a body, >= 0"
+            )
         object.__setattr__(self, "inertia", read_only(inertia))
         for part in ("center", "head"):
-            point = check_array(f"{what}: {part} [m]", getattr(self, part), (3,))
+            point = check_array(f"{what}: {part} [m]", getattr(self, part), (3,), most=FARTHEST)
             object.__setattr__(self, part, read_only(point))
 
     @classmethod

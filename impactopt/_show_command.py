@@ -47,13 +47,14 @@ def show(
     Exit code: 0 written, 2 bad input.
     """
     with plain_errors("interrupted before the page was written"):
+        from impactopt.errors import printable
         from impactopt.output import make_directory
 
         made, usual = _bodies(what, problem) if _is_robot(what) else _result(what, problem)
         page = out if out is not None else usual
         make_directory(page.parent)
         written = made.save(page)
-        typer.echo(str(written))
+        typer.echo(printable(str(written)))
         if open_:
             webbrowser.open(written.resolve().as_uri())
 

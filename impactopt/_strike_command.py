@@ -48,6 +48,7 @@ def strike(
     result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
+        from impactopt.errors import printable
         from impactopt.output import make_directory, record_of_strike
         from impactopt.problem_file import parse_settings, read_problem_file
         from impactopt.result_folder import keep_record, set_aside
@@ -88,7 +89,7 @@ def strike(
             if record.summary["violations"]:
                 shown.print(violation_table(record.summary["violations"]))
             for path in written:
-                shown.print(str(path), highlight=False, markup=False, soft_wrap=True)
+                shown.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
             if aside := set_aside(record.summary):
                 shown.print(aside, highlight=False, markup=False, soft_wrap=True)
         if not solution.status.usable:

@@ -113,7 +113,9 @@ class _Screen:
 
     def say(self, text: str) -> None:
         if not self._quiet:
-            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+            from impactopt.errors import printable
+
+            self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
     def progress(self, now: Progress) -> None:
         text = f"{now.rate:.3g} a second, {_time(now.remaining)} left"
@@ -132,6 +134,8 @@ def _show(result: SweepResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from impactopt.errors import printable
+
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
     rows = {
         "without a usable result": str(result.failed),
@@ -146,7 +150,7 @@ def _show(result: SweepResult) -> None:
     console = Console()
     console.print(table)
     for reason, count in result.reasons.items():
-        console.print(f"{count} x {reason}", markup=False, highlight=False)
+        console.print(printable(f"{count} x {reason}"), markup=False, highlight=False)
     console.print(str(result.table), markup=False, highlight=False, soft_wrap=True)
 
 

@@ -66,6 +66,7 @@ def validate(
     Exit code: 0 stands (or the engine holds the soles), 1 fell, 2 bad input.
     """
     with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
+        from impactopt.errors import printable
         from impactopt.output import make_directory, remove_file, write_file
         from impactopt.problem_file import parse_settings
         from impactopt.replay import load_planned, replay
@@ -121,6 +122,6 @@ def validate(
             console = Console()
             console.print(replay_table(done.report, planned.record.summary))
             for path in written:
-                console.print(str(path), highlight=False, markup=False, soft_wrap=True)
+                console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
         if done.report["standing"] is False:
             raise typer.Exit(FELL)

@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from impactopt.collision import Collision, CollisionModel, effective_mass
 from impactopt.coordinates import StanceCoordinates
-from impactopt.errors import InputError, check_array
+from impactopt.errors import MOST, InputError, check_array
 from impactopt.reference import holding_torque
 from impactopt.robot import Robot
 from impactopt.stance import BothSoles, Stance, usual_stance
@@ -148,7 +148,8 @@ def striking_velocity(
     InputError : wrong shapes or NaN; an unknown striker; a stance the robot cannot take; a posture in which
         the striking point cannot move like that.
     """
-    q, n = robot.check_configuration(q), check_array("normal", normal, (3,))
+    q, n = robot.check_configuration(q), check_array("normal", normal, (3,), most=MOST)
+    speed = float(check_array("speed [m/s]", speed, (), most=MOST))
     held_by = usual_stance(robot) if stance is None else stance
     model, data = robot.model, robot.model.createData()
     H = np.array(pin.crba(model, data, q))
@@ -167,7 +168,7 @@ def striking_velocity(
     spread = np.linalg.solve(H, J.T)
     v = spread @ np.linalg.lstsq(J @ spread, wanted, rcond=1e-12)[0]
     off = float(np.abs(J @ v - wanted).max())
-    if off > 1e-6 * max(1.0, abs(speed)):
+    if not off <= 1e-6 * max(1.0, abs(speed)):
         raise InputError(
             f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with what is held at rest (off "
             f"by {off:.2g} m/s): choose another posture"

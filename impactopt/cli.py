@@ -251,6 +251,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         return
     from rich.console import Console
 
+    from impactopt.errors import printable
     from impactopt.result_folder import set_aside
     from impactopt.screen import result_table, starts_table, told_touches, violation_table
 
@@ -267,7 +268,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
     error = summary.get("simulated", {}).get("error")
     for text in (summary.get("note"), error, reach.get("error"), told_touches(summary)):
         if text:
-            console.print(text, markup=False, highlight=False)
+            console.print(printable(str(text)), markup=False, highlight=False)
     if len(summary["starts"]) > 1:
         console.print(starts_table(summary["starts"]))
     if summary["violations"]:
@@ -278,9 +279,9 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         highlight=False,
     )
     names = ", ".join(path.name for path in written)
-    console.print(f"{written[0].parent}: {names}", highlight=False, soft_wrap=True)
+    console.print(printable(f"{written[0].parent}: {names}"), markup=False, highlight=False, soft_wrap=True)
     if aside := set_aside(summary):
-        console.print(aside, markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(aside), markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -31,18 +31,21 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
 import numpy.typing as npt
 
-from impactopt._compiler import CompileError, Compiler, find_compiler
+from impactopt._compiler import CompileError, Compiler, find_compiler, why_no_compiler
 from impactopt._hashing import canonical, model_hash
-from impactopt.errors import CacheWarning, NoCompilerWarning
+from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
+from impactopt.files import write_atomically
 from impactopt.private_files import (
     UnsafePath,
+    allows_code,
     check_private_file,
     locked,
     private_directory,
+    sweep_away,
     temporary_private_directory,
-    write_atomically,
 )
 
 __all__ = [
@@ -72,6 +75,7 @@ _NOT_IN_GRAPHS = frozenset(
         "cases",
         "cli",
         "errors",
+        "files",
         "ipopt",
         "output",
         "planner",
@@ -93,6 +97,8 @@ _NOT_IN_GRAPHS = frozenset(
 # gcc -O1 allocates registers in more than linear time: 6, 18, 71 s for 16, 47, 118 thousand instructions.
 # Beyond this many, -O0: compiled ten times sooner, two to three times slower, but 5 times faster than the VM.
 _MAX_OPTIMIZED = 60_000
+# [s] from which on an unfinished compilation is one that was killed: no single function takes so long
+_LEFT_BEHIND = 24 * 3600.0
 # Loops over vectors gain from all that keeps the order of sums; -ffast-math would not keep it, nor NaN.
 _NATIVE_LEVEL = "-O3 -fvisibility=hidden -ffp-contract=fast -fno-math-errno -fno-trapping-math"
 
@@ -149,17 +155,25 @@ def cached(
     if compiler is None:
         _warn_no_compiler()
         return _graphs(_by_name(build()))
-    directory = _directory()
     entry = f"{_slug(name)}-{_entry_key(name, recipe, compiler)}"
-    functions = _load_entry(directory, entry)
-    if functions is not None:
-        return functions
-    lock = directory / f"{entry}.lock"
-    with locked(lock, on_wait=lambda: tell(f"{name}: another process is compiling, waiting")):
+
+    def waits() -> None:
+        tell(f"{name}: another process is compiling, waiting")
+
+    def found(directory: Path) -> dict[str, ca.Function]:
         functions = _load_entry(directory, entry)
-        if functions is not None:
-            return functions
-        return _build_entry(directory, entry, name, build, compiler, tell)
+        if functions is None:
+            with locked(directory / f"{entry}.lock", on_wait=waits):
+                functions = _load_entry(directory, entry)
+                if functions is None:
+                    functions = _build_entry(directory, entry, name, build, compiler, tell)
+        return functions
+
+    try:
+        return found(_directory())
+    except UnsafePath as error:
+        _warn(f"{error}; compiling into a temporary directory, for this process only")
+        return found(temporary_private_directory())
 
 
 def native_library(package: str, name: str) -> Any:
@@ -176,7 +190,7 @@ def native_library(package: str, name: str) -> Any:
         ):
             path = _library(directory, Path(scratch), name, code, _NATIVE_LEVEL, compiler)[0]
             return ctypes.CDLL(str(directory / path))
-    except (CompileError, OSError) as error:
+    except (CompileError, OSError, UnsafePath) as error:
         warnings.warn(f"{name}: {error}; its work is done in Python", NoCompilerWarning, stacklevel=3)
         return None
 
@@ -203,10 +217,22 @@ def library_path(name: str, recipe: tuple[Any, ...], function: str) -> Path | No
 def _directory() -> Path:
     """The cache, or where it cannot be used a directory of this process."""
     try:
-        return private_directory(cache_directory())
+        directory = private_directory(cache_directory())
+        if not allows_code(directory):
+            raise UnsafePath(
+                f"{directory} is on a file system that no code can be loaded from (mounted noexec); set "
+                "IMPACTOPT_CACHE to a directory elsewhere"
+            )
+        _sweep(directory)
+        return directory
     except (UnsafePath, OSError) as error:
         _warn(f"{error}; compiling into a temporary directory, for this process only")
         return temporary_private_directory()
+
+
+@functools.cache  # once a process
+def _sweep(directory: Path) -> None:
+    sweep_away(directory, ("tmp-*", ".*.tmp"), older=_LEFT_BEHIND)
 
 
 def kept(kind: str, digest: str, make: Callable[[], bytes]) -> bytes:
@@ -224,17 +250,33 @@ def kept(kind: str, digest: str, make: Callable[[], bytes]) -> bytes:
         pass  # not there yet
     made = make()
     with contextlib.suppress(OSError):  # a full disk: they are made again next time
-        write_atomically(path, hashlib.sha256(made).digest() + made)
+        _put(path, hashlib.sha256(made).digest() + made)
     return made
 
 
 def cache_directory() -> Path:
-    """Where libraries are kept: $IMPACTOPT_CACHE, $XDG_CACHE_HOME/impactopt or ~/.cache/impactopt."""
-    own = os.environ.get("IMPACTOPT_CACHE")
-    if own:
-        return Path(own).expanduser().absolute()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache").absolute() / "impactopt"
+    """Where libraries are kept: $IMPACTOPT_CACHE, $XDG_CACHE_HOME/impactopt or ~/.cache/impactopt.
+
+    Who has no home, as users of containers may, has a directory of his own among the temporary ones.
+
+    Raises
+    ------
+    InputError : IMPACTOPT_CACHE begins with the home of a user that there is not.
+    """
+    own, base = os.environ.get("IMPACTOPT_CACHE"), Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        if own:
+            return Path(own).expanduser().absolute()
+        home = Path.home()
+    except RuntimeError as error:
+        if own:
+            raise InputError(f"IMPACTOPT_CACHE is {own!r}: {error}; give a directory") from None
+        home = Path()
+    if base.is_absolute():  # a relative one is to be ignored, as freedesktop.org's specification says
+        return base / "impactopt"
+    if home.is_absolute() and home != Path(home.anchor):
+        return home / ".cache" / "impactopt"
+    return Path(tempfile.gettempdir()).absolute() / f"impactopt-{os.getuid()}"
 
 
 def _load_entry(directory: Path, entry: str) -> dict[str, ca.Function] | None:
@@ -251,7 +293,7 @@ def _load_entry(directory: Path, entry: str) -> dict[str, ca.Function] | None:
             if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 return None
             functions[function] = ca.external(function, str(path))
-        return functions
+        return functions or None
     except UnsafePath as error:
         _warn(f"{error}; compiling again")
         return None
@@ -288,7 +330,7 @@ def _build_entry(
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
         ordered = {"functions": {function: listing[function] for function in functions}}
-        write_atomically(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
+        _put(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
     except (CompileError, OSError) as error:
         warnings.warn(
             f"{name}: {error}; its functions run in CasADi's virtual machine, 10 to 20 times slower",
@@ -296,7 +338,17 @@ def _build_entry(
             stacklevel=4,
         )
         return _graphs(functions)
-    return {f: ca.external(f, str(directory / listing[f][0])) for f in functions}
+    try:
+        return {f: ca.external(f, str(directory / listing[f][0])) for f in functions}
+    except RuntimeError as error:
+        said = str(error).strip().splitlines()[-1]
+        warnings.warn(
+            f"{name}: what was compiled cannot be loaded ({said}); its functions run in CasADi's virtual "
+            "machine, 10 to 20 times slower",
+            NoCompilerWarning,
+            stacklevel=4,
+        )
+        return _graphs(functions)
 
 
 def _c_code(function: Buildable) -> tuple[str, str, str]:
@@ -320,8 +372,9 @@ def _library(
     try:
         check_private_file(library)
         check_private_file(seal)
-        digest = hashlib.sha256(library.read_bytes()).hexdigest()
-        if seal.read_text(encoding="ascii") == digest:
+        content = library.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        if content and seal.read_text(encoding="ascii") == digest:
             return library.name, digest
     except (UnsafePath, OSError, ValueError):
         pass
@@ -329,10 +382,16 @@ def _library(
     source.write_text(code, encoding="utf-8")
     compiler.run(source, made, level)
     content = made.read_bytes()
+    if not content:
+        raise CompileError(f"{compiler.command[0]} has made an empty library of {source.name}")
     digest = hashlib.sha256(content).hexdigest()
-    write_atomically(library, content, mode=0o700)
-    write_atomically(seal, digest.encode())
+    _put(library, content, mode=0o700)
+    _put(seal, digest.encode())
     return library.name, digest
+
+
+def _put(path: Path, content: bytes, *, mode: int = 0o600) -> None:
+    write_atomically(path, lambda file: file.write(content), mode=mode)
 
 
 def _longest_body(function: Buildable) -> int:
@@ -361,14 +420,23 @@ def _by_name(functions: Sequence[Buildable]) -> dict[str, Buildable]:
 
 def _graphs(functions: dict[str, Buildable]) -> dict[str, ca.Function]:
     """The functions as CasADi can run them itself."""
-    return {name: f.graph() if isinstance(f, NativeCode) else f for name, f in functions.items()}
+    return {name: _no_nan(f.graph()) if isinstance(f, NativeCode) else f for name, f in functions.items()}
+
+
+def _no_nan(graph: ca.Function) -> ca.Function:
+    """A function that gives no numbers where an input is none, as C code does."""
+    inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
+    # a comparison with none is false; x == x would be simplified
+    finite = ca.mmin(ca.vertcat(1, *[ca.vec(ca.densify(x)) >= -np.inf for x in inputs]))
+    out = [ca.if_else(finite, x, np.nan) for x in graph.call(inputs)]
+    return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 
 @functools.cache
 def _warn_no_compiler() -> None:
     warnings.warn(
-        "no C compiler: functions run in CasADi's virtual machine, 10 to 20 times slower; "
-        "install gcc or clang, or name one in the environment variable CC",
+        f"no C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower; "
+        f"{why_no_compiler()}",
         NoCompilerWarning,
         stacklevel=3,
     )

@@ -8,7 +8,21 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CacheWarning", "InputError", "Mistakes", "NoCompilerWarning", "check_array", "did_you_mean"]
+__all__ = [
+    "FARTHEST",
+    "MOST",
+    "CacheWarning",
+    "InputError",
+    "Mistakes",
+    "NoCompilerWarning",
+    "check_array",
+    "did_you_mean",
+    "printable",
+]
+
+FARTHEST = 1e3  # [m] from the origin of a frame or the world; micrometres still count there
+# of any other number that is given, in SI units: products of a few such ones are still finite
+MOST = 1e15
 
 
 class InputError(ValueError):
@@ -64,8 +78,18 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     return f" (did you mean {candidates[near[0]]!r}?)" if near else ""
 
 
+def printable(text: str) -> str:
+    """Text for a terminal: control characters but new lines are shown by their codes, not obeyed."""
+    return "".join(c if c == "\n" or c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def check_array(
-    name: str, value: ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True
+    name: str,
+    value: ArrayLike,
+    shape: tuple[int | None, ...],
+    *,
+    finite: bool = True,
+    most: float | None = None,
 ) -> NDArray[np.float64]:
     """A float64 copy of `value`, known to have the given shape.
 
@@ -75,27 +99,36 @@ def check_array(
     value : anything NumPy can turn into numbers.
     shape : the wanted shape; None stands for any length, () for a single number.
     finite : refuse NaN and infinity when True, NaN alone when False.
+    most : the largest magnitude, if there is one.
 
     Raises
     ------
-    InputError : not numbers, another shape, or NaN or infinity at a named place.
+    InputError : not numbers, another shape, or NaN, infinity or too large a number at a named place.
     """
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected numbers, got {value!r}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name}: expected numbers, got {shortened(repr(value))}") from error
     if array.ndim != len(shape) or any(
         want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
     ):
         wanted = "(" + ", ".join("any" if want is None else str(want) for want in shape) + ")"
         raise InputError(f"{name}: expected shape {wanted}, got {array.shape}")
     bad = ~np.isfinite(array) if finite else np.isnan(array)
+    limit = ""
+    if most is not None and not bad.any():
+        bad, limit = np.abs(array) > most, f" of at most {most:g}"
     if bad.any():
         place = tuple(int(i) for i in np.argwhere(bad)[0])
         where = f" at index {place[0] if len(place) == 1 else place}" if place else ""
         allowed = "a finite number" if finite else "a number"
-        raise InputError(f"{name}: {array[place]}{where}; give {allowed}")
+        raise InputError(f"{name}: {array[place]}{where}; give {allowed}{limit}")
     return array
+
+
+def shortened(text: str, most: int = 80) -> str:
+    """Text with its middle left out where it is long."""
+    return text if len(text) <= most else f"{text[: most - 20]} ... {text[-10:]}"
 
 
 def check_direction(name: str, value: ArrayLike) -> NDArray[np.float64]:

@@ -33,6 +33,8 @@ from impactopt.program import (
 )
 
 IPOPT_DEFAULTS: Mapping[str, Any] = {
+    # none is read: an ipopt.opt in the working directory could load libraries and write files
+    "option_file_name": "",
     "print_level": 0,
     "sb": "yes",
     "linear_solver": "mumps",
@@ -99,7 +101,7 @@ def solve_ipopt(
     settings = {**IPOPT_DEFAULTS, **(options or {})}
     if time_limit is not None:
         settings["max_wall_time"] = max(float(time_limit), 1e-3)
-    tolerance = float(settings["constr_viol_tol"])
+    tolerance = float(check_array("constr_viol_tol", settings["constr_viol_tol"], ()))
     start = time.perf_counter()
     functions = Functions(
         program, tolerance, deadline=start + time_limit if time_limit is not None else np.inf
@@ -218,7 +220,7 @@ def _build(
     own = {"print_time": False, "no_nlp_grad": True, "show_eval_warnings": False, "ipopt": dict(settings)}
     try:
         solver = ca.nlpsol("ipopt", "ipopt", {"x": x, "f": f(x), "g": g(x)}, {**given, **own})
-    except RuntimeError as error:
+    except (RuntimeError, NotImplementedError, TypeError, OverflowError) as error:
         raise InputError(f"IPOPT does not take these options: {dict(settings)}\n{error}") from error
     return solver, alive
 

@@ -10,9 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
-
-from impactopt.errors import InputError
+from impactopt.errors import MOST, InputError, check_array
 from impactopt.terms import check_known, kind_of
 
 
@@ -40,7 +38,7 @@ class Objective:
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
-        if not np.isfinite(self.weight) or self.weight == 0:
+        if not check_array(f"{kind}.weight", self.weight, (), most=MOST):
             raise InputError(f"{kind}.weight is {self.weight}; give a number, or leave {kind} out")
         if self.cost and self.weight < 0:
             raise InputError(

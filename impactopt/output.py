@@ -7,7 +7,6 @@ old ones, what was made of those goes first: whenever a process ends, all files 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import io
 import json
@@ -23,8 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.files import read_plain, write_atomically
 from impactopt.problem import ImpactProblem
 from impactopt.program import SolverResult
+from impactopt.record_schema import check_arrays, check_summary
 from impactopt.reference.poses import poses_of
 from impactopt.solution import Solution
 from impactopt.strike import StrikeSolution
@@ -45,6 +46,7 @@ __all__ = [
 ]
 
 FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
+LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
 NUMBERS, SUMMARY = "solution.npz", "summary.json"
 # what is made of the numbers beside them: by `impactopt show`, by `impactopt validate`, pictures
 DERIVED = (
@@ -272,21 +274,22 @@ def write_file(
     ------
     InputError : it cannot be written; what was at `path` before is still there.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())  # a name that is there before its content would be an empty file
-        if before is not None:
-            before()
-        os.replace(temporary, path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise InputError(f"cannot write {path}: {error.strerror}") from error
-        raise
+        write_atomically(path, write, before=before)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _check_archive(content: IO[bytes]) -> None:
+    """ValueError for an archive that is larger unpacked than any of ours, or has two arrays of one name."""
+    with zipfile.ZipFile(content) as archive:
+        entries = archive.infolist()
+    names = {entry.filename for entry in entries}
+    if len(entries) > MOST_ARRAYS or len(names) < len(entries):
+        raise ValueError(f"{len(entries)} arrays, or two of the same name")
+    if sum(entry.file_size for entry in entries) > LARGEST:
+        raise ValueError(f"larger than {LARGEST / 2**20:g} MiB when it is unpacked")
+    content.seek(0)
 
 
 def load_record(directory: str | os.PathLike[str]) -> Record:
@@ -301,7 +304,9 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     mend = "solve again with `impactopt solve`"
     try:
         # from memory: np.load leaves a damaged file open
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        content = io.BytesIO(read_plain(path, LARGEST))
+        _check_archive(content)
+        with np.load(content, allow_pickle=False) as file:
             version = int(file["format"])
             if version > FORMAT:
                 raise InputError(f"{path} is of a newer impactopt (format {version}); update impactopt")
@@ -310,6 +315,8 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
         problem = str(arrays.pop("problem_toml"))
         near = str(arrays.pop("problem_path", ""))
         del arrays["format"]
+        check_summary(summary, whole="joints" in arrays)
+        check_arrays(arrays)
     except InputError:
         raise
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -319,7 +326,14 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     # what NumPy and zipfile raise for files that are cut, overwritten or of another kind
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
         raise InputError(f"{path} is damaged ({error}); {mend}") from error
-    except (zipfile.BadZipFile, zlib.error) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        MemoryError,
+        OverflowError,
+        RecursionError,
+        RuntimeError,
+    ) as error:
         raise InputError(f"{path} is damaged ({error}); {mend}") from error
     place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)

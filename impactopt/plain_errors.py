@@ -26,17 +26,19 @@ def plain_errors(interrupted: str, *, verbose: bool = False) -> Iterator[Console
     """
     from rich.console import Console
 
-    from impactopt.errors import InputError
+    from impactopt.errors import InputError, printable
 
     console = Console(stderr=True)
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_a, **_k: console.print(f"warning: {message}", markup=False)
+        warnings.showwarning = lambda message, *_a, **_k: console.print(
+            printable(f"warning: {message}"), markup=False
+        )
         try:
             yield console
         except InputError as error:
             if verbose:
                 traceback.print_exc()
-            typer.echo(f"error: {error}", err=True)
+            typer.echo(printable(f"error: {error}"), err=True)
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             typer.echo(interrupted, err=True)

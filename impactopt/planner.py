@@ -28,7 +28,6 @@ from impactopt.starts import (
     Budget,
     Starts,
     attempt_of,
-    check_solver,
     check_starts,
     drawn,
     solve_from,
@@ -65,7 +64,8 @@ def solve(
         the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
     starts : so many of them, the first one plain, the others with perturbed postures and other speeds, drawn
         by ``seed``; the best motion is kept, ``Solution.attempts`` tells of all.
-    options : the solver's own.  time_limit [s] : of the solver, for all starts together.
+    options : the solver's own.  time_limit [s] : for the program and all starts together; compiling
+        functions, which is done once, does not count.
     between : whether a motion that leaves its limits between the nodes of its program gets more of them
         there, and is solved once more from where it is: while it gives up half of a margin somewhere, at most
         thrice. ``Solution.nodes`` tells where they are. So does one whose contact is too coarse: it gets
@@ -80,7 +80,7 @@ def solve(
     ------
     InputError : unknown solver, option or start, a start of the wrong length, several of a given start.
     """
-    check_solver(solver)
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=not isinstance(start, str))
     given: str | Array | SolverResult
     nodes: MoreNodes = NO_MORE
@@ -99,10 +99,10 @@ def solve(
         )
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report, elements)
+    budget = budget.started()
     t = Transcription(problem, problem.coordinates, functions, nodes, elements)
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
-    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     margins = Margins(problem) if problem.keeps_apart else None
     refining = _Refining(budget, margins, apart, report)
     # limbs that are in each other say nothing of what a start is worth: each is led to its end before they

@@ -5,20 +5,25 @@ from __future__ import annotations
 import atexit
 import contextlib
 import functools
+import itertools
 import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+
+from impactopt.files import open_own
 
 __all__ = [
     "UnsafePath",
+    "allows_code",
     "check_private_file",
     "locked",
     "private_directory",
+    "sweep_away",
     "temporary_private_directory",
-    "write_atomically",
 ]
 
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -62,26 +67,20 @@ def check_private_file(path: Path) -> None:
     _check(path, os.lstat(path), stat.S_ISREG, "file")
 
 
-def write_atomically(path: Path, content: bytes, *, mode: int = 0o600) -> None:
-    """Put `content` at `path` in one step: a reader sees the old file or the whole new one."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, mode)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-
-
 @contextlib.contextmanager
 def locked(path: Path, *, on_wait: Callable[[], None]) -> Iterator[None]:
-    """Hold a lock on `path` between processes; `on_wait` is called if another one holds it."""
+    """Hold a lock on `path` between processes; `on_wait` is called if another one holds it.
+
+    Raises
+    ------
+    UnsafePath : it is no plain file, or cannot be made.
+    """
     import fcntl  # POSIX only, as compiling is
 
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)
+    try:
+        handle = open_own(path, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise UnsafePath(f"{path} cannot be locked: {error.strerror}") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -91,6 +90,24 @@ def locked(path: Path, *, on_wait: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def allows_code(path: Path) -> bool:
+    """Whether libraries can be loaded from a directory: its file system is not mounted noexec."""
+    return not os.statvfs(path).f_flag & getattr(os, "ST_NOEXEC", 0)
+
+
+def sweep_away(directory: Path, patterns: Sequence[str], older: float) -> None:
+    """Remove what killed processes have left: files and directories of these names, older than that [s]."""
+    past = time.time() - older
+    for path in itertools.chain.from_iterable(map(directory.glob, patterns)):
+        with contextlib.suppress(OSError):
+            status = os.lstat(path)
+            if status.st_mtime < past:
+                if stat.S_ISDIR(status.st_mode):
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink()
 
 
 @functools.cache

@@ -10,13 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt._problem_checks import COLLISIONS, check_at_rest, check_collision, check_names
+from impactopt._problem_checks import COLLISIONS, check_apart, check_at_rest, check_collision, check_names
 from impactopt.bodies.clearance import Bodies
 from impactopt.bodies.world import WorldBody, ground, obstacle_bodies, target_bodies
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
-from impactopt.errors import InputError, Mistakes, check_array
+from impactopt.errors import FARTHEST, MOST, InputError, Mistakes, check_array, shortened
 from impactopt.extra_terms import HandOrientation, HitCone
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem_hash import problem_hash
@@ -31,6 +31,12 @@ Array = NDArray[np.float64]
 __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)
+
+SHORTEST, LONGEST = 1e-3, 1e3  # [s] of a phase: no servo is faster, and no blow is prepared for longer
+FINEST = 2000  # intervals of a phase: nodes of a swing of 1 s come as often as a servo of 4 kHz samples
+STEEPEST = 1e3  # grading
+LONGEST_CONTACT = 100.0  # [s]
+MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,16 +54,18 @@ class Phase:
 
     def __post_init__(self) -> None:
         duration = (self.duration,) * 2 if isinstance(self.duration, (int, float)) else tuple(self.duration)
-        if len(duration) != 2 or not 0 < duration[0] <= duration[1] < np.inf:
+        if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
             raise InputError(
-                f"a phase's duration [s] is one positive number or (shortest, longest), not {self.duration}"
+                f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
+                f"not {shortened(str(self.duration))}"
             )
         object.__setattr__(self, "duration", tuple(float(d) for d in duration))
-        if not self.grading >= 1:
-            raise InputError(f"a phase's grading must be at least 1, not {self.grading}")
-        if self.intervals != int(self.intervals) or self.intervals < 6:
+        if not 1 <= self.grading <= STEEPEST:
+            raise InputError(f"a phase's grading must be 1 to {STEEPEST:g}, not {self.grading:g}")
+        if not 6 <= self.intervals <= FINEST or self.intervals != int(self.intervals):
             raise InputError(
-                f"a phase needs at least 6 spline intervals, a whole number, not {self.intervals}"
+                f"a phase needs 6 to {FINEST} spline intervals, a whole number, not "
+                f"{shortened(str(self.intervals))}"
             )
         object.__setattr__(self, "intervals", int(self.intervals))
 
@@ -149,7 +157,7 @@ class ImpactProblem:
         found.raise_if_any("the problem")
 
     def _check_aim(self) -> None:
-        object.__setattr__(self, "point", check_array("point", self.point, (3,)))
+        object.__setattr__(self, "point", check_array("point [m]", self.point, (3,), most=FARTHEST))
         normal = check_array("normal", self.normal, (3,))
         if abs(np.linalg.norm(normal) - 1) > 1e-6:
             length = float(np.linalg.norm(normal))
@@ -164,11 +172,12 @@ class ImpactProblem:
                 f"{self.collision_elements}"
             )
         for lengths in self.collision_elements:
-            if not lengths or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
+            if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
                 raise InputError(
-                    f"collision_elements must be positive fractions that sum to 1, not {lengths}"
+                    f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
+                    f"{shortened(str(lengths))}"
                 )
-        lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,))
+        lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,), most=LONGEST_CONTACT)
         if not 0 < lo <= hi:
             raise InputError(
                 f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
@@ -176,8 +185,8 @@ class ImpactProblem:
 
     def _check_prices(self) -> None:
         for name in ("smoothness", "wrench_price", "return_price"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"{name} must be a number >= 0, not {getattr(self, name)}")
+            if not 0 <= getattr(self, name) <= MOST:
+                raise InputError(f"{name} must be a number of 0 to {MOST:g}, not {getattr(self, name)}")
 
     def _check_scenarios(self) -> None:
         listed = isinstance(self.scenarios, (list, tuple))
@@ -186,10 +195,7 @@ class ImpactProblem:
         object.__setattr__(self, "scenarios", tuple(self.scenarios))
         if self.scenarios and self.collision != "dynamics":
             raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
-        names = [s.name for s in self.scenarios]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"two scenarios are called {name!r}: give each a name of its own")
+        check_apart("scenario", [s.name for s in self.scenarios])
 
     def _check_world(self) -> None:
         if not isinstance(self.body, TargetBody):
@@ -199,10 +205,7 @@ class ImpactProblem:
         ):
             raise InputError(f"obstacles must be a tuple of Obstacle, not {self.obstacles!r}")
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
-        names = [o.name for o in self.obstacles]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"two obstacles are called {name!r}: give each a name of its own")
+        check_apart("obstacle", [o.name for o in self.obstacles])
 
     def _check_stance(self) -> None:
         if np.any(self.stance.compliance > 0):

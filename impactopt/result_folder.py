@@ -9,7 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.output import DERIVED, NUMBERS, SUMMARY, Record, load_record, plain, save_record, write_file
+from impactopt.files import read_plain
+from impactopt.output import (
+    DERIVED,
+    LARGEST,
+    NUMBERS,
+    SUMMARY,
+    Record,
+    load_record,
+    plain,
+    save_record,
+    write_file,
+)
 from impactopt.program import Status
 
 __all__ = ["keep_record", "keep_series", "set_aside"]
@@ -88,8 +99,8 @@ def _status_in(directory: Path) -> Any:
 
 def _read(path: Path) -> dict[str, Any]:
     """A file of ours; nothing where it is none."""
-    with contextlib.suppress(OSError, ValueError):
-        found = json.loads(path.read_text(encoding="utf-8"))
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        found = json.loads(read_plain(path, LARGEST))
         return found if isinstance(found, dict) else {}
     return {}
 

@@ -72,6 +72,7 @@ class Robot:
 
     def __post_init__(self) -> None:
         checks.check_joint_types(self.model)
+        checks.check_joints(self.joint_names, self.name)
         for name in ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper"):
             value = check_array(f"{name} of {self.name!r}", getattr(self, name), (self.n,), finite=False)
             object.__setattr__(self, name, read_only(value))
@@ -162,6 +163,8 @@ class Robot:
         disable_collisions : pairs of links that may pass through each other.
         urdf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
         """
+        build.check_count("sole", soles)
+        build.check_count("striker", strikers)
         model = model.copy()
         checks.check_joint_types(model)
         joints = build.joint_names(model)

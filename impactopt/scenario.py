@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-import numpy as np
-
 from impactopt.contact.factors import scaled_numbers
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import InputError
+from impactopt.errors import MOST, InputError, check_array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +54,8 @@ class Scenario:
             value = getattr(self, f.name)
             if value is None and f.default is None:
                 continue
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"{where}: {f.name} is {value}; give a finite number >= 0")
+            if not check_array(f"{where}: {f.name}", value, (), most=MOST) >= 0:
+                raise InputError(f"{where}: {f.name} is {value:g}; give a number >= 0")
         for name in ("mass", "stiffness", "torque"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{where}: {name} is {getattr(self, name):g}; give a number > 0")

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.status import Status
 from rich.table import Table
 
+from impactopt.errors import printable
 from impactopt.program import IterationRecord
 from impactopt.result_rows import (
     PHASES,
@@ -38,6 +39,11 @@ __all__ = [
 
 PHASES_OF_STRIKE = ("contact", "collision")
 QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
+
+
+def _plain(text: str) -> str:
+    """Text that comes from files, for a console: neither markup nor control characters are obeyed."""
+    return escape(printable(text))
 
 
 class Progress:
@@ -69,9 +75,9 @@ class Progress:
         if self._quiet:
             return
         elapsed = time.perf_counter() - self._start
-        self._console.print(f"{elapsed:6.1f} s  {escape(text)}", highlight=False, soft_wrap=True)
+        self._console.print(f"{elapsed:6.1f} s  {_plain(text)}", highlight=False, soft_wrap=True)
         if self._live is not None:
-            self._live.update(escape(text))
+            self._live.update(_plain(text))
 
     def iteration(self, record: IterationRecord) -> None:
         """A solver's callback."""
@@ -111,9 +117,9 @@ def strike_table(summary: Mapping[str, Any]) -> Table:
 def collision_table(found: Mapping[str, Any]) -> Table:
     """One collision, beside what a saved result says of it; `found` as in `impactopt collide --json`."""
     model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
-    table = Table(title=escape(f"{found['problem']}: {model}"), title_justify="left")
+    table = Table(title=_plain(f"{found['problem']}: {model}"), title_justify="left")
     if "believe" in found:
-        table.caption, table.caption_justify = escape(f"{found['model']}: {found['believe']}"), "left"
+        table.caption, table.caption_justify = _plain(f"{found['model']}: {found['believe']}"), "left"
     table.add_column("")
     for name in ("collision", *(found.get("saved") or {})):
         table.add_column(name, justify="right")
@@ -129,7 +135,7 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
         table.add_column(name, justify="left" if name == "joint" else "right")
     for joint in joints[:most]:
         numbers = (f"{joint['torque_Nm']:.1f}", f"{joint['limit_Nm']:.1f}", f"{joint['ratio']:.2f}")
-        table.add_row(str(joint["joint"]), *numbers)
+        table.add_row(_plain(str(joint["joint"])), *numbers)
     return table
 
 
@@ -141,14 +147,16 @@ def starts_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     for start in starts:
         name, numbers = str(start["start"]), (start["impulse_Ns"], start["iterations"], start["seconds"])
         cells = (f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 0, 1), strict=True))
-        table.add_row(f"{name}, kept" if start["kept"] else name, str(start["status"]), *cells)
+        table.add_row(
+            _plain(f"{name}, kept" if start["kept"] else name), _plain(str(start["status"])), *cells
+        )
     return table
 
 
 def _table(
     summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
 ) -> Table:
-    table = Table(title=escape(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
+    table = Table(title=_plain(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
     table.add_column("")
     for name in columns:
         table.add_column(name, justify="right")
@@ -158,8 +166,9 @@ def _table(
 
 
 def _add(table: Table, row: Row) -> None:
-    cells = (cell.text if cell.good else f"[bold red]! {cell.text}[/]" for cell in row.cells)
-    table.add_row(escape(row.label), *cells)
+    texts = ((_plain(cell.text), cell.good) for cell in row.cells)
+    cells = (text if good else f"[bold red]! {text}[/]" for text, good in texts)
+    table.add_row(_plain(row.label), *cells)
 
 
 def told_touches(summary: Mapping[str, Any]) -> str:
@@ -182,7 +191,7 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     table.add_column("row", overflow="fold")
     table.add_column("by how much", overflow="fold")
     for violation in violations:
-        table.add_row(escape(str(violation["row"])), escape(str(violation["by"])))
+        table.add_row(_plain(str(violation["row"])), _plain(str(violation["by"])))
     return table
 
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean
 
 Vector = tuple[float, float, float]
 
 
 def vector(name: str, value: Sequence[float]) -> Vector:
     """Three finite numbers; InputError names what is wrong."""
-    x, y, z = check_array(name, value, (3,)).tolist()
+    x, y, z = check_array(name, value, (3,), most=FARTHEST).tolist()
     return x, y, z
 
 
@@ -45,7 +45,7 @@ class TargetBody:
         if self.size is None:
             return
         wanted = 1 if self.shape == "ball" else 3
-        size = check_array("TargetBody.size [m]", self.size, (wanted,))
+        size = check_array("TargetBody.size [m]", self.size, (wanted,), most=FARTHEST)
         if self.shape == "none" or not np.all(size > 0):
             raise InputError(
                 f"TargetBody.size is {size.tolist()} m; give lengths > 0, and none of shape 'none'"
@@ -90,7 +90,7 @@ class Obstacle:
             if min(self.size) <= 0 or self.radius or self.end is not None:
                 raise InputError(f"{where}: a box has a size of three lengths > 0 m, no end and no radius")
             return
-        if not 0 < self.radius < np.inf or any(self.rpy) or any(self.position):
+        if not 0 < self.radius <= FARTHEST or any(self.rpy) or any(self.position):
             raise InputError(
                 f"{where}: a capsule has a radius > 0 m, a start and an end, and no position or rpy"
             )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.ipopt import solve_ipopt
 from impactopt.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
 from impactopt.sqp import SQPOptions, solve_sqp
@@ -59,13 +59,45 @@ class Attempt:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """A solver with its options, and the time [s] that is left for all that it is given; None: any."""
+    """A solver with its options, and the time [s] that is left for all that it is given; None: any.
+
+    Raises
+    ------
+    InputError : an unknown solver; a time that is none; options that the SQP does not have (IPOPT is asked
+        about its own when it starts).
+    """
 
     solver: str
     options: Mapping[str, Any] | None
     time_limit: float | None
     callback: Callback | None
     since: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        if self.solver not in SOLVERS:
+            raise InputError(
+                f"unknown solver {self.solver!r}{did_you_mean(self.solver, SOLVERS)}: there are "
+                f"{', '.join(SOLVERS)}"
+            )
+        if self.time_limit is not None and not check_array("time_limit [s]", self.time_limit, ()) > 0:
+            raise InputError(f"time_limit [s]: {self.time_limit:g}; give a number > 0")
+        if self.options is None:
+            return
+        if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
+            raise InputError(f"options are those of the solver by name, not {self.options!r}")
+        if self.solver == "sqp":
+            known = [f.name for f in fields(SQPOptions)]
+            for name in self.options:
+                if name not in known:
+                    raise InputError(
+                        f"the solver 'sqp' has no option {name!r}{did_you_mean(name, known)}; it has "
+                        f"{', '.join(known)}"
+                    )
+            SQPOptions(**self.options)
+
+    def started(self) -> Budget:
+        """The same with all its time, which begins now."""
+        return replace(self, since=time.perf_counter())
 
     @property
     def left(self) -> float | None:
@@ -102,14 +134,6 @@ class Budget:
             callback=self.callback,
             multipliers=y,
             bound_multipliers=z,
-        )
-
-
-def check_solver(solver: str) -> None:
-    """InputError if there is no solver of this name."""
-    if solver not in SOLVERS:
-        raise InputError(
-            f"unknown solver {solver!r}{did_you_mean(solver, SOLVERS)}: there are {', '.join(SOLVERS)}"
         )
 
 

@@ -20,7 +20,7 @@ from impactopt.planned_strike import PlannedStrike
 from impactopt.problem import ImpactProblem
 from impactopt.program import Callback, SolverResult
 from impactopt.solution import Solved, blow_numbers, versions
-from impactopt.starts import Budget, Starts, check_solver, check_starts, drawn, solve_from
+from impactopt.starts import Budget, Starts, check_starts, drawn, solve_from
 
 Array = NDArray[np.float64]
 ROUNDS = 5  # of more rows between bodies
@@ -86,17 +86,17 @@ def optimize_strike(
     InputError : unknown solver or option, a start of the wrong length, several of a given start, a problem
         with objectives of a whole motion only.
     """
-    check_solver(solver)
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=start is not None)
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
     given = None if start is None else check_array("start", start, (None,))
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report)
+    budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions)
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
-    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     margins = Margins(problem) if problem.keeps_apart else None
     t, fields = solve_from(
         t, _starts(t, given, starts, seed), budget, began, partial(_clear, budget, margins)

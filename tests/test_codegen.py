@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from impactopt import codegen, private_files
 from impactopt._compiler import Compiler, find_compiler
 from impactopt._hashing import canonical
 from impactopt.codegen import cache_directory, cached, model_hash
-from impactopt.errors import CacheWarning, NoCompilerWarning
+from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
 
 ROOT = Path(__file__).parent.parent
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -188,6 +189,23 @@ def test_cache_directory_follows_the_environment(monkeypatch: pytest.MonkeyPatch
     assert cache_directory() == tmp_path / "xdg" / "impactopt"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_directory() == tmp_path / "home" / ".cache" / "impactopt"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert cache_directory() == tmp_path / "home" / ".cache" / "impactopt"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    nowhere = Path(tempfile.gettempdir()) / f"impactopt-{os.getuid()}"
+    for home in ("/", ""):
+        monkeypatch.setenv("HOME", home)
+        assert cache_directory() == nowhere
+
+    def none(_uid: int) -> None:
+        raise KeyError
+
+    monkeypatch.setattr("pwd.getpwuid", none)
+    monkeypatch.delenv("HOME")
+    assert cache_directory() == nowhere
+    monkeypatch.setenv("IMPACTOPT_CACHE", "~no-such-user/cache")
+    with pytest.raises(InputError, match="IMPACTOPT_CACHE"):
+        cache_directory()
 
 
 # ---- processes
@@ -408,16 +426,20 @@ def test_everything_made_is_private(cache: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("variable", "content"), [("IMPACTOPT_NO_COMPILER", "1"), ("CC", "no-such-compiler")]
+    ("variable", "content", "why"),
+    [
+        ("IMPACTOPT_NO_COMPILER", "1", "IMPACTOPT_NO_COMPILER is set"),
+        ("CC", "no-such-compiler", "install gcc or clang, or name one in the environment variable CC"),
+        # it says which version it is, and compiles nothing
+        ("CC", "cc -fno-such-flag", r"cc -fno-such-flag failed on trial.c .*; mend it, or what CC names"),
+    ],
 )
 def test_without_compiler_the_virtual_machine_and_one_warning(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, variable: str, content: str
+    cache: Path, monkeypatch: pytest.MonkeyPatch, variable: str, content: str, why: str
 ) -> None:
     monkeypatch.setenv(variable, content)
     codegen._warn_no_compiler.cache_clear()
-    with pytest.warns(
-        NoCompilerWarning, match="install gcc or clang, or name one in the environment variable CC"
-    ):
+    with pytest.warns(NoCompilerWarning, match=why):
         functions = cached("toy", (1,), Builder())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -428,11 +450,83 @@ def test_without_compiler_the_virtual_machine_and_one_warning(
 
 
 @needs_compiler
+@pytest.mark.parametrize("listing", ['{"functions": {}}', '{"functions": 1}', "[]", "{}"])
+def test_an_entry_of_nothing_is_made_again(cache: Path, listing: str) -> None:
+    cached("toy", (1,), Builder())
+    (entry,) = cache.glob("*.json")
+    entry.write_text(listing)
+    again = Builder()
+    assert value(cached("toy", (1,), again)) == pytest.approx(TRUE, rel=1e-14)
+    assert again.calls == 1
+
+
+@needs_compiler
+def test_a_lock_that_is_none_is_gone_round(cache: Path) -> None:
+    cached("toy", (1,), Builder())
+    for path in cache.iterdir():
+        path.unlink()
+        if path.suffix == ".lock":
+            path.mkdir()
+    with pytest.warns(CacheWarning, match="cannot be locked"):
+        functions = cached("toy", (1,), Builder())
+    assert value(functions) == pytest.approx(TRUE, rel=1e-14)
+
+
+@needs_compiler
+def test_an_empty_library_with_its_seal_is_made_again(cache: Path) -> None:
+    cached("toy", (1,), Builder())
+    for path in cache.iterdir():
+        if path.suffix == ".so":
+            path.write_bytes(b"")
+            path.with_suffix(".sha256").write_text(hashlib.sha256(b"").hexdigest())
+        elif path.suffix == ".json":
+            path.unlink()
+    assert value(cached("toy", (1,), Builder())) == pytest.approx(TRUE, rel=1e-14)
+
+
+@needs_compiler
+def test_a_library_that_cannot_be_loaded_costs_only_time(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def external(*_arguments: object) -> None:
+        raise RuntimeError("failed to map segment from shared object")
+
+    monkeypatch.setattr(codegen.ca, "external", external)
+    with pytest.warns(NoCompilerWarning, match="cannot be loaded .*failed to map segment"):
+        functions = cached("toy", (1,), Builder())
+    assert value(functions) == pytest.approx(TRUE, rel=1e-14)
+
+
+@needs_compiler
+def test_a_place_that_allows_no_code_is_not_used(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codegen, "allows_code", lambda path: path != cache)
+    with pytest.warns(CacheWarning, match="noexec"):
+        functions = cached("toy", (1,), Builder())
+    assert value(functions) == pytest.approx(TRUE, rel=1e-14)
+    assert not list(cache.iterdir())
+
+
+@needs_compiler
+def test_what_killed_compilations_have_left_is_swept(cache: Path) -> None:
+    cache.mkdir(mode=0o700)
+    left, others = [cache / "tmp-old", cache / ".toy.json.0a.tmp"], [cache / "tmp-new", cache / "kept"]
+    (cache / "tmp-old").mkdir()
+    (cache / "tmp-old" / "value.c").touch()
+    for path in (left[1], *others):
+        path.touch()
+    for path in (*left, cache / "kept"):
+        os.utime(path, (0, 0))
+    cached("toy", (1,), Builder())
+    assert not any(path.exists() for path in left) and all(path.exists() for path in others)
+
+
+@needs_compiler
 def test_compiler_that_fails_is_quoted(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = tmp_path / "cc"
     script.write_text(
         "#!/bin/sh\n"
         '[ "$1" = --version ] && echo fake 1 && exit 0\n'
+        'case "$*" in *trial.c*) exec cc "$@";; esac\n'
         'echo "value.c: error: disk full" >&2\n'
         'echo "  ^~~" >&2\n'
         "exit 3\n"

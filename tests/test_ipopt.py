@@ -118,6 +118,15 @@ def test_bad_options_are_refused():
         solve_ipopt(case.build(), case.x0, multipliers=[1.0, 2.0])
 
 
+def test_an_options_file_in_the_working_directory_is_not_read(tmp_path, monkeypatch):
+    planted = tmp_path / "ipopt.opt"
+    planted.write_text("max_iter 0\noutput_file written.txt\nfile_print_level 5\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    case = CASES["HS71"]
+    assert solve_ipopt(case.build(), case.x0).status is Status.SOLVED
+    assert list(tmp_path.iterdir()) == [planted]
+
+
 @pytest.mark.parametrize("how", ["raise", "return"])
 def test_interruption_leaves_the_best_iterate(how):
     case, seen = CASES["HS100"], []

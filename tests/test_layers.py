@@ -15,7 +15,7 @@ PACKAGE = Path(impactopt.__file__).parent
 # Each module or folder may import from those above it; of one line, only from those before it.
 LAYERS = (
     ("__init__", "errors", "_folders"),
-    ("private_files", "_compiler", "_hashing", "codegen", "_workers"),
+    ("files", "private_files", "_compiler", "_hashing", "codegen", "_workers"),
     ("_robot_checks", "_robot_parts", "_robot_build", "robot", "_links", "_standin", "_arms", "presets"),
     ("rigid_body",),
     ("stance", "contact"),
@@ -41,7 +41,7 @@ LAYERS = (
     ("validation",),
     ("reference", "cases"),
     ("keeping_apart", "starts", "solution", "baseline", "strike", "planner", "blows", "robustness"),
-    ("problem_file", "output", "result_folder", "replay", "sweeps"),
+    ("problem_file", "record_schema", "output", "result_folder", "replay", "sweeps"),
     ("plotting", "result_rows", "report", "screen"),
     ("plain_errors", "bench", "reproduce"),
     (

@@ -404,7 +404,7 @@ def test_every_condition_has_its_range_and_the_defaults_are_the_plan() -> None:
     for f in fields(Scene):
         assert np.array_equal(getattr(same, f.name), getattr(there, f.name)), f.name
     for f in fields(Conditions):
-        with pytest.raises(InputError, match=rf"conditions: {f.name} is nan"):
+        with pytest.raises(InputError, match=f"conditions: {f.name}.*nan"):
             Conditions(**{f.name: float("nan")})
         if f.name not in ("distance", "missing"):
             with pytest.raises(InputError, match=f"conditions: {f.name} is -1"):

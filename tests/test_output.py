@@ -175,6 +175,33 @@ def test_a_damaged_record_is_never_read_as_another(tmp_path: Path) -> None:
     assert refused > len(damaged) / 2
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("reference_q", np.zeros((3, 2))),
+        ("reference_time", np.array(["a"])),
+        ("reference_time", np.full(4, np.nan)),
+        ("reference_torque", None),
+        ("joints", np.zeros(3)),
+        ("torque_limit", np.zeros(1)),
+        ("plan_x", np.zeros(2, dtype="S3")),
+        ("summary_json", np.array("[" * 100_000)),
+        ("summary_json", np.array("[]")),
+        ("summary_json", np.array('{"status": 3}')),
+        ("format", np.zeros(2)),
+    ],
+)
+def test_an_array_that_is_not_what_it_should_be_is_named(
+    record: Record, tmp_path: Path, name: str, value: Any
+) -> None:
+    numbers, _ = save_record(record, tmp_path)
+    with np.load(numbers) as file:
+        arrays = {key: file[key] for key in file.files if key != name}
+    np.savez(numbers, **arrays, **({} if value is None else {name: value}))
+    with pytest.raises(InputError, match="is damaged"):
+        load_record(tmp_path)
+
+
 def test_a_record_of_a_newer_version_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "solution.npz", format=FORMAT + 1)
     with pytest.raises(InputError, match="newer impactopt"):

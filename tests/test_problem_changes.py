@@ -247,6 +247,9 @@ def test_every_field_of_a_problem_counts_in_its_hash(problem: ImpactProblem) -> 
         ("pardisolib", "{folder}/evil.so"),
         ("output_file", "{folder}/written.txt"),
         ("option_file_name", "{folder}/options.txt"),
+        ("resto.hsllib", "{folder}/evil.so"),
+        ("resto.tol", 1e-5),
+        ("linear_solver", "ma77"),
         ("tol", [1e-5]),
     ],
 )
@@ -255,6 +258,16 @@ def test_a_file_loads_no_library_and_writes_no_file(tmp_path: Path, option: str,
     with pytest.raises(InputError, match=rf"\[solver\] ipopt: {option}"):
         problem_from_data({**DATA, "solver": {"ipopt": {option: given}}}, where="arm.toml")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_options_file_in_the_working_directory_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planted = tmp_path / "ipopt.opt"
+    planted.write_text("output_file written.txt\nfile_print_level 5\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    problem_from_data({**DATA, "solver": {"ipopt": {"tol": 1e-5}}}, where="arm.toml")
+    assert list(tmp_path.iterdir()) == [planted]
 
 
 @pytest.mark.parametrize(

@@ -532,7 +532,7 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         ("[target]", "[robot]\npreset = 'g1'\n[target]", ["robot", "twice"]),
         ("[target]", "[swing]\nduration_s = [0.9, 0.5]\n[target]", ["duration_s", "0.9", "not exceed"]),
         ("[target]", "[swing]\nduration_s = -1\n[target]", ["duration_s", "-1", "> 0"]),
-        ("[target]", "[swing]\nduration_s = 1\nintervals = 3\n[target]", ["[swing]", "at least 6", "3"]),
+        ("[target]", "[swing]\nduration_s = 1\nintervals = 3\n[target]", ["[swing]", "6 to 2000", "3"]),
         ("[target]", "[terms.torque_limit]\nfraction = 85\n[target]", ["fraction", "85", "> 0 and <= 1"]),
         (
             "[target]",

@@ -95,7 +95,7 @@ def test_every_condition_is_an_option_with_its_default() -> None:
     [
         (["--friction", "-1"], ["friction is -1"]),
         (["--engine", "pinocchio", "--missing"], ["pinocchio", "take engine 'mujoco'"]),
-        (["--step", "0"], ["step of the simulation is 0"]),
+        (["--step", "0"], ["step [s]: 0"]),
         (["--animation", "punch.mp4", "--step", "1e-3", "--settle", "0"], ["punch.mp4", ".gif"]),
     ],
 )

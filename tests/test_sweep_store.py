@@ -7,6 +7,7 @@ import os
 import resource
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import pytest
 
 from impactopt.errors import InputError
 from impactopt.sweeps import sweep_from_data
-from impactopt.sweeps.journal import Entry, Journal
+from impactopt.sweeps.journal import HEAD, MARK, Entry, Journal
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import merge_kinds, unit_of, write_table
 from impactopt.sweeps.units import Found
@@ -92,6 +93,37 @@ def test_damage_in_the_middle_costs_its_own_record(tmp_path: Path) -> None:
         for found, unit in zip(journal.read(), (0, 1, 2), strict=True):
             same(found, entry(unit))
         journal.close()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"[]\n",
+        b"{}\n",
+        b"[" * 100_000,
+        b'{"unit": -1, "peak_mb": 1, "lists": {}, "arrays": {}, "order": []}\n',
+        b'{"unit": 1, "peak_mb": "x", "lists": {}, "arrays": {}, "order": []}\n',
+        b'{"unit": 1, "peak_mb": 1, "lists": {}, "arrays": {"a": ["O", 1]}, "order": ["a"]}\n12345678',
+        b'{"unit": 1, "peak_mb": 1, "lists": {}, "arrays": {"a": ["<f8", -1]}, "order": ["a"]}\n12345678',
+        b'{"unit": 1, "peak_mb": 1, "lists": {}, "arrays": {"a": ["<f8", 1000000000000]}, "order": ["a"]}\n',
+        b'{"unit": 1, "peak_mb": 1, "lists": {"a": [1], "b": []}, "arrays": {}, "order": ["a", "b"]}\n',
+        b'{"unit": 1, "peak_mb": 1, "lists": {"a": [1]}, "arrays": {}, "order": ["b"]}\n',
+        b'{"unit": 1, "peak_mb": 1, "lists": {"a": [[]]}, "arrays": {}, "order": ["a"]}\n',
+    ],
+)
+def test_a_record_that_is_none_is_damaged_whatever_its_checksum(tmp_path: Path, content: bytes) -> None:
+    journal = Journal(tmp_path / "j")
+    journal.add(entry(0))
+    journal.close()
+    with (tmp_path / "j").open("ab") as file:
+        file.write(MARK + HEAD.pack(len(content), zlib.crc32(content)) + content)
+    journal = Journal(tmp_path / "j")
+    journal.add(entry(2))
+    assert journal.units == {0, 2}
+    for found, unit in zip(journal.read(), (0, 2), strict=True):
+        same(found, entry(unit))
+    journal.close()
 
 
 def test_an_empty_or_foreign_file_has_no_units(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from impactopt.bench.attempts import Attempt, Make, attempt
 from impactopt.bench.report import Report, Say, columns_table
 from impactopt.bench.solvers import SOLVERS
 from impactopt.errors import InputError, did_you_mean
+from impactopt.files import open_own, write_atomically
 from impactopt.output import make_directory, plain
 from impactopt.problem_file import read_problem_file
 from impactopt.problem_file.names import problem_file, problem_names
@@ -188,7 +189,7 @@ class _Kept:
                     known: dict[str, Any] = {k: np.nan if v is None else v for k, v in entry.items()}
                     self.found[key] = Attempt(**known)
             else:
-                path.write_text("", encoding="utf-8")
+                write_atomically(path, lambda _file: None)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path} cannot be used for the attempts: {error}") from error
 
@@ -196,7 +197,7 @@ class _Kept:
         problem, solver, start, time_limit = key
         entry = {"problem": problem, "solver": solver, "start": start, "time_limit": time_limit}
         line = json.dumps(plain({**entry, **dataclasses.asdict(found)}), allow_nan=False)
-        with self._path.open("a", encoding="utf-8") as file:
+        with open(self._path, "a", encoding="utf-8", opener=open_own) as file:
             file.write(line + "\n")
 
 

@@ -22,6 +22,7 @@ from impactopt.bench.report import Report, Say, columns_table
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
+from impactopt.files import open_own, write_atomically
 from impactopt.output import make_directory, plain
 from impactopt.planner import solve
 from impactopt.problem import ImpactProblem
@@ -329,12 +330,12 @@ class _Kept:
                     entry: dict[str, Any] = json.loads(line)
                     self.found[entry["problem"], entry.pop("seed")] = entry
             else:
-                path.write_text("", encoding="utf-8")
+                write_atomically(path, lambda _file: None)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{path} cannot be used for the rows: {error}") from error
 
     def add(self, key: Key, found: Mapping[str, Any]) -> None:
         self.found[key] = plain(found)
         line = json.dumps(plain({"seed": key[1], **found}), allow_nan=False)
-        with self._path.open("a", encoding="utf-8") as file:
+        with open(self._path, "a", encoding="utf-8", opener=open_own) as file:
             file.write(line + "\n")

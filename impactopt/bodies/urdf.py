@@ -45,7 +45,7 @@ def urdf_root(urdf: Path) -> ElementTree.Element | None:
 def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> Iterator[LinkShape]:
     """All readable shapes of a ``kind``, "collision" or "visual", of the links that a pin.Model has.
 
-    Meshes that are missing or damaged are left out.
+    What is malformed is left out, and so are meshes that are missing or damaged.
     """
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -53,16 +53,19 @@ def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> I
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
         for element in link.findall(kind):
-            solid = _solid(element.find("geometry"), urdf)
-            if solid is not None:
-                place = frame.placement * _origin(element.find("origin"))
+            solid, origin = _solid(element.find("geometry"), urdf), _origin(element.find("origin"))
+            if solid is not None and origin is not None:
+                place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
-def numbers(text: str) -> Array:
-    """The numbers in a text, apart by spaces."""
-    return np.array([float(word) for word in text.split()])
+def numbers(text: str, count: int = 3) -> Array:
+    """So many finite numbers in a text, apart by spaces; ValueError for anything else."""
+    found = np.array([float(word) for word in text.split()])
+    if len(found) != count or not np.all(np.isfinite(found)):
+        raise ValueError(f"{text!r} are no {count} finite numbers")
+    return found
 
 
 def _solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
@@ -82,7 +85,11 @@ def _solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
 
 
 def _origin(origin: ElementTree.Element | None) -> Any:
+    """The placement (pin.SE3) of an <origin>; None if it is none."""
     if origin is None:
         return pin.SE3.Identity()
-    xyz, rpy = (numbers(origin.get(key, "0 0 0")) for key in ("xyz", "rpy"))
+    try:
+        xyz, rpy = (numbers(origin.get(key, "0 0 0")) for key in ("xyz", "rpy"))
+    except ValueError:
+        return None
     return pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)

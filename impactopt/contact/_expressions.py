@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..errors import InputError, check_array
+from ..errors import MOST, InputError, check_array
 
 Parameters = Mapping[str, Any]
 
@@ -42,10 +42,16 @@ def numbers_of(instance: Any) -> dict[str, float]:
 
 
 def positive(name: str, value: Any, *, zero: bool = False) -> float:
-    """`value` as a float; InputError unless it is one finite number > 0 (or >= 0 where `zero`)."""
-    number = float(check_array(name, value, ()))
+    """`value` as a float; InputError unless it is one number > 0 (or >= 0 where `zero`), neither too large
+    nor so small that what is divided by it is.
+    """
+    number = float(check_array(name, value, (), most=MOST))
     if number < 0 or (number == 0 and not zero):
         raise InputError(f"{name}: {number:g}; give a number {'>= 0' if zero else '> 0'}")
+    if 0 < number < 1 / MOST:
+        raise InputError(
+            f"{name}: {number:g}; give {'0, or ' if zero else ''}a number of at least {1 / MOST:g}"
+        )
     return number
 
 

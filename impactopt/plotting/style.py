@@ -41,6 +41,7 @@ COLUMN, PAGE = 3.5, 7.2
 DPI = 200
 
 STYLE: Any = {
+    "text.usetex": False,  # a matplotlibrc in the working directory would have LaTeX run what it says
     "figure.dpi": DPI,
     "savefig.dpi": DPI,
     "figure.constrained_layout.use": True,

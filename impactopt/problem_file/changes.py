@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any, get_args, get_origin
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.problem_file.contacts import with_kinds
 from impactopt.problem_file.section import Section
 from impactopt.problem_file.sections import File
@@ -19,6 +19,7 @@ from impactopt.problem_file.toml import Place, TOMLError, plain_value, read_toml
 
 __all__ = ["change_data", "key_place", "parse_settings"]
 
+LONGEST_KEY = 1000  # characters, dots included
 _WORD = re.compile(r"[A-Za-z_][\w -]*")
 
 
@@ -66,7 +67,9 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Any]:
         except TOMLError:
             parsed = {"value": value} if _WORD.fullmatch(value) else {}
         if not (key and equals and parsed.keys() == {"value"}):
-            wrong.append(f"{text!r} is no setting; give KEY=VALUE with a value as in TOML, as target.mass=8")
+            wrong.append(
+                f"{shortened(text)!r} is no setting; give KEY=VALUE with a value as in TOML, as target.mass=8"
+            )
             continue
         settings[key] = parsed["value"]
     _raise(wrong)
@@ -104,6 +107,8 @@ def _raise(wrong: list[str]) -> None:
 
 def _find(model: type[Section], data: Mapping[str, Any], key: str) -> Place:
     """The place of a dotted key; KeyError with a message if there is none."""
+    if len(key) > LONGEST_KEY:
+        raise KeyError(f"{shortened(key)}: no key is so long")
     place: list[str | int] = []
     kind: Any = model  # what is described here
     value: Any = data  # what the file has of it

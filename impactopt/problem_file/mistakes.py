@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -11,10 +12,11 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from impactopt.errors import did_you_mean
+from impactopt.errors import did_you_mean, shortened
 from impactopt.problem_file.toml import Place
 
-_HEADER = re.compile(r"""^\s*(\[\[?)\s*([\w."'\s-]+?)\s*\]\]?\s*(?:#.*)?$""")
+# no two parts of these can take the same character: a long line costs its length, not its square
+_HEADER = re.compile(r"""^\s*(\[\[?)([\w."'\s-]+)\]\]?\s*(?:#.*)?$""")
 _KEY = re.compile(r"""^\s*([\w."'-]+)\s*=""")
 
 _KINDS = {
@@ -29,6 +31,7 @@ _KINDS = {
     "model_type": "give a section of its own",
     "model_attributes_type": "give a section of its own",
 }
+_MOST, _LONGEST = 100, 1000  # mistakes that are told, and characters of each
 _SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -64,10 +67,11 @@ def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[M
         line = next((lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines), None)
         at = "" if line is None else f"line {line}, " if line else "as set, "
         found.append((line is None, line or 0, f"{at}{mistake}"))
-    rows = list(dict.fromkeys(row for _, _, row in sorted(found)))
+    rows = list(dict.fromkeys(shortened(row, _LONGEST) for _, _, row in sorted(found)))
     if len(rows) == 1:
         return f"{where}, {rows[0]}" if rows[0].startswith(("line", "as set")) else f"{where}: {rows[0]}"
-    return "\n".join([f"{where} has {len(rows)} mistakes:", *(f"  {row}" for row in rows)])
+    told = rows[:_MOST] + ([f"... and {len(rows) - _MOST} more"] if len(rows) > _MOST else [])
+    return "\n".join([f"{where} has {len(rows)} mistakes:", *(f"  {row}" for row in told)])
 
 
 def mistakes_of(error: ValidationError, model: type[BaseModel]) -> list[Mistake]:
@@ -165,13 +169,14 @@ def key_lines(text: str) -> dict[Place, int]:
     """
     lines: dict[Place, int] = {}
     table: Place = ()
+    entries: Counter[Place] = Counter()
     for number, line in enumerate(text.splitlines(), start=1):
         if header := _HEADER.match(line):
             table = _split(header.group(2))
             if header.group(1) == "[[":
-                count = sum(1 for place in lines if place[:-1] == table and isinstance(place[-1], int))
                 lines.setdefault(table, number)
-                table = (*table, count)
+                entries[table] += 1
+                table = (*table, entries[table] - 1)
             lines.setdefault(table, number)
         elif key := _KEY.match(line):
             lines.setdefault((*table, *_split(key.group(1))), number)

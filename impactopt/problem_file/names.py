@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from impactopt._folders import SWEEPS, named_files
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.files import is_plain_file
 
 __all__ = ["problem_file", "problem_names", "problem_summary", "sweep_file", "sweep_names"]
 
@@ -51,11 +52,11 @@ def problem_summary(name: str) -> str:
 
 def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) -> Path:
     path = Path(name)
-    if path.suffix or len(path.parts) != 1 or path.is_file():
+    if path.suffix or len(path.parts) != 1 or is_plain_file(path):
         return path
     if path.name not in named:
         raise InputError(
-            f"there is no {kind} {path.name!r}{did_you_mean(path.name, named)}; {kind}s are "
+            f"there is no {kind} {shortened(path.name)!r}{did_you_mean(path.name, named)}; {kind}s are "
             f"{', '.join(named)}; or give the path of a file"
         )
     return named[path.name]

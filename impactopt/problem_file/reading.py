@@ -11,8 +11,9 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from impactopt._problem_checks import check_names
-from impactopt.errors import InputError, did_you_mean
+from impactopt._problem_checks import MANY, check_names
+from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.files import read_plain
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file.changes import change_and_place
 from impactopt.problem_file.contacts import with_kinds
@@ -20,7 +21,16 @@ from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, rep
 from impactopt.problem_file.names import problem_file
 from impactopt.problem_file.sections import File
 from impactopt.problem_file.solver_sections import SolverSettings
-from impactopt.problem_file.toml import Place, TOMLError, plain_value, read_toml, write_toml
+from impactopt.problem_file.toml import (
+    LONGEST_TEXT,
+    Place,
+    TOMLError,
+    check_plain,
+    plain_value,
+    read_toml,
+    text_with_control,
+    write_toml,
+)
 
 __all__ = [
     "ProblemFile",
@@ -33,6 +43,14 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
+# each entry is checked by itself, and most are part of the program: of thousands a file could say too much
+_LISTS = (
+    ("scenarios",),
+    ("obstacles",),
+    ("robot", "soles"),
+    ("robot", "strikers"),
+    ("robot", "tools"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +139,10 @@ def problem_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str])
 
 def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str]) -> ProblemFile:
     """Data checked like the text of a problem file, with that text; see `problem_from_data`."""
+    try:
+        check_plain(data)
+    except TOMLError as error:
+        raise InputError(f"{where}: {error}") from error
     data = plain_value(data)
     return _checked(data, Path(where), write_toml(data), {})
 
@@ -153,6 +175,14 @@ def parse_problem_file(text: str, path: Path, settings: Mapping[str, Any] | None
 
 
 def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Place, int]) -> ProblemFile:
+    for place in _LISTS:
+        there: Any = data
+        for key in place:
+            there = there.get(key) if isinstance(there, Mapping) else None
+        if isinstance(there, list) and len(there) > MANY:
+            raise InputError(f"{path}: there are {len(there)} [[{'.'.join(place)}]]; give at most {MANY}")
+    if found := text_with_control(data):
+        raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
     mistakes, model = _robot_given_once(data), with_kinds(File, data)
     try:
         content = model.model_validate(data)
@@ -208,12 +238,12 @@ def _robot_given_once(data: Mapping[str, Any]) -> list[Mistake]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_plain(path, LONGEST_TEXT).decode()
     except FileNotFoundError as error:
         folder = path.parent
         near = did_you_mean(path.name, [p.name for p in folder.glob("*.toml")]) if folder.is_dir() else ""
-        raise InputError(f"there is no file {path}{near}") from error
+        raise InputError(f"there is no file {shortened(str(path), 300)}{near}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8: {error.reason} at byte {error.start}") from error
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
+        raise InputError(f"cannot read {shortened(str(path), 300)}: {error.strerror}") from error

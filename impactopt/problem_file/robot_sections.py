@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from pydantic import model_validator
 
+from impactopt._robot_build import check_count
 from impactopt.errors import InputError
 from impactopt.presets import load_robot
 from impactopt.problem_file.section import Section, optional, required
@@ -112,6 +113,8 @@ class RobotSection(Section):
 
     def make(self, folder: Path) -> Robot:
         """The robot; relative files are in `folder`."""
+        for key in ("soles", "strikers", "tools"):
+            check_count(key.removesuffix("s"), getattr(self, key) or ())
         options = self.given()
         for file in ("urdf", "srdf"):
             if file in options:

@@ -12,19 +12,64 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["TOMLError", "plain_value", "read_toml", "write_toml"]
+__all__ = [
+    "LONGEST_TEXT",
+    "TOMLError",
+    "check_plain",
+    "plain_value",
+    "read_toml",
+    "text_with_control",
+    "write_toml",
+]
 
 _tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 TOMLError: type[ValueError] = _tomllib.TOMLDecodeError
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+LONGEST_TEXT = 1 << 22  # bytes: 400 times the longest of our files, and read in a few seconds
+DEEPEST = 32  # tables and lists in each other; ours are five deep
 _COMMENTS_FROM = 32  # column, where lines are shorter
 
 Place = tuple[str | int, ...]
 
 
 def read_toml(text: str) -> dict[str, Any]:
-    """The data of a TOML text; TOMLError if it is none."""
-    return dict(_tomllib.loads(text))
+    """The data of a TOML text.
+
+    Raises
+    ------
+    TOMLError : it is none; it is nested deeper, or has longer numbers, than anything here.
+    """
+    if len(text) > LONGEST_TEXT:
+        raise TOMLError(f"longer than {LONGEST_TEXT / 2**20:g} MiB")
+    try:
+        data = dict(_tomllib.loads(text))
+    except TOMLError:
+        raise
+    except RecursionError:
+        raise TOMLError(f"nested deeper than {DEEPEST}") from None
+    except ValueError as error:  # of numbers with thousands of digits
+        raise TOMLError(str(error)) from None
+    check_plain(data)
+    return data
+
+
+def check_plain(data: Any) -> None:
+    """TOMLError for data that are nested deeper than anything here, or have whole numbers beyond 64 bits."""
+    level: list[Any] = [data]
+    for _ in range(DEEPEST + 1):
+        inner: list[Any] = []
+        for value in level:
+            if isinstance(value, Mapping):
+                inner += value.values()
+            elif isinstance(value, (list, tuple)):
+                inner += value
+            elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise TOMLError("a whole number has more than 64 bits; write it with a decimal point")
+        if not inner:
+            return
+        level = inner
+    raise TOMLError(f"nested deeper than {DEEPEST}")
 
 
 def write_toml(
@@ -51,6 +96,17 @@ def plain_value(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain_value(item) for item in value]
     return value
+
+
+def text_with_control(data: Any) -> str:
+    """A key or a text with control characters, which a terminal would obey; "" if there is none."""
+    if isinstance(data, str):
+        return data if _CONTROL.search(data) else ""
+    if isinstance(data, Mapping):
+        return next(filter(None, map(text_with_control, (*data, *data.values()))), "")
+    if isinstance(data, (list, tuple)):
+        return next(filter(None, map(text_with_control, data)), "")
+    return ""
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,19 @@ import casadi as ca
 import numpy as np
 from pydantic import AfterValidator, Field, PlainValidator
 
-from impactopt.errors import did_you_mean
+from impactopt.errors import did_you_mean, shortened
+from impactopt.ipopt import IPOPT_DEFAULTS
 from impactopt.presets import robot_names
+from impactopt.problem_file.ipopt_options import ALLOWED
 
 
 def _known_robot(name: str) -> str:
     """A preset's name."""
     if name not in robot_names():
         near = did_you_mean(name, robot_names())
-        raise ValueError(f"there is no robot {name!r}{near}; presets are {', '.join(robot_names())}")
+        raise ValueError(
+            f"there is no robot {shortened(name)!r}{near}; presets are {', '.join(robot_names())}"
+        )
     return name
 
 
@@ -112,34 +116,28 @@ def _inertia(value: Any) -> Any:
     return value
 
 
-# With these IPOPT loads libraries and writes files: a problem file is data, and can do neither.
-_NOT_DATA = (
-    "hsllib",
-    "pardisolib",
-    "option_file_name",
-    "output_file",
-    "ma97_dump_matrix",
-    "wsmp_write_matrix_iteration",
-)
-
-
 def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
     """A table."""
-    # IPOPT itself is asked about each, with a program of one variable
+    # IPOPT itself is asked about each value, with a program of one variable
+    if len(options) > len(ALLOWED):
+        raise ValueError(f"has {len(options)} keys; there are {len(ALLOWED)} to give")
     x, wrong = ca.MX.sym("x"), []
     for name, value in options.items():
-        if name in _NOT_DATA:
-            wrong.append(f"{name} is not for problem files, which load no libraries and write no files")
+        if name not in ALLOWED:
+            near = did_you_mean(name, ALLOWED)
+            wrong.append(
+                f"{name} is not among the options of IPOPT that problem files set: those with which it loads "
+                f"no library and writes no file{near}"
+            )
             continue
         if not isinstance(value, (bool, int, float, str)):
             wrong.append(f"{name} = {value!r}; give a number or text")
             continue
-        trial = {"print_level": 0, "sb": "yes", name: value}
+        trial = {**IPOPT_DEFAULTS, "print_level": 0, name: value}
         try:
             ca.nlpsol("trial", "ipopt", {"x": x, "f": x**2}, {"ipopt": trial})
-        except (RuntimeError, NotImplementedError) as error:
-            known = "No such IPOPT option" not in str(error)
-            wrong.append(f"IPOPT refuses {name} = {value!r}" if known else f"IPOPT has no option {name}")
+        except (RuntimeError, NotImplementedError):
+            wrong.append(f"IPOPT refuses {name} = {value!r}")
     if wrong:
         raise ValueError("; ".join(wrong))
     return options

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import InputError
 from ..robot import Robot
 from ..stance import Stance, usual_stance
 
@@ -28,6 +29,8 @@ def holding_torque(
     held_by = usual_stance(robot) if stance is None else stance
     model, data = robot.model, robot.model.createData()
     bias = pin.nonLinearEffects(model, data, q, v)
+    if not np.all(np.isfinite(bias)):
+        raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     columns = [np.eye(robot.nv)[:, -robot.n :]]

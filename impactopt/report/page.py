@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
@@ -33,10 +34,8 @@ def html_page(
         "scripts": scripts,
     }
     page = _asset("page.html")
-    for name, value in given.items():
-        before, after = page.split(f"{{{{{name}}}}}")
-        page = f"{before}{value}{after}"
-    return page
+    # in one pass: what is put in may have such marks in it
+    return re.sub(r"\{\{(\w+)\}\}", lambda mark: given[mark.group(1)], page)
 
 
 def _asset(name: str) -> str:

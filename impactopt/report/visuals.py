@@ -57,10 +57,12 @@ def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
 
 
 def _colour(material: ElementTree.Element) -> tuple[float, float, float] | None:
+    """The <color> of a <material>; None if it has none, or none that can be read."""
     colour = material.find("color")
-    if colour is None:
+    try:
+        red, green, blue, _ = numbers("" if colour is None else colour.get("rgba", ""), 4).tolist()
+    except ValueError:
         return None
-    red, green, blue, *_ = numbers(colour.get("rgba", "")).tolist()
     return red, green, blue
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.sqp.qp import QP_SOLVERS
 
 HESSIANS = ("exact", "bfgs")
@@ -84,9 +84,15 @@ class SQPOptions:
             )
         may_be_zero = {"levenberg", "augmentation", "max_iterations", "dense_limit"}
         for option in fields(self):
-            value = getattr(self, option.name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
+            value, default = getattr(self, option.name), option.default
+            if isinstance(default, (bool, str)) or (value is None and default is None):
+                if default is not None and not isinstance(value, type(default)):
+                    wanted = "text" if isinstance(default, str) else "true or false"
+                    raise InputError(f"{option.name}: {value!r}; give {wanted}")
                 continue
+            number = float(check_array(option.name, value, ()))
+            if isinstance(default, int) and number != int(number):
+                raise InputError(f"{option.name}: {value!r}; give a whole number")
             if not (value > 0 or (value == 0 and option.name in may_be_zero)):
                 raise InputError(f"{option.name}: {value} is out of range; it must be positive")
         for low, high in (("radius", "radius_max"), ("price", "price_max")):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,10 +64,13 @@ class _Block:
     entries: float
     children: list[_Block] = field(default_factory=list)
 
-    def in_order(self) -> Iterator[_Block]:
-        for child in self.children:
-            yield from child.in_order()
-        yield self
+    def in_order(self) -> list[_Block]:
+        """This block after all that are below it, without recursion: a long motion's are thousands deep."""
+        out, waiting = list[_Block](), [self]
+        while waiting:  # parents before their children, and the last child first
+            out.append(block := waiting.pop())
+            waiting += block.children
+        return out[::-1]
 
     def joined(self, other: _Block, sizes: Index) -> _Block | None:
         """With one that comes after it; None where that would be too many zeros."""

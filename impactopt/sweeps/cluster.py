@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from impactopt.errors import InputError
@@ -17,7 +19,7 @@ __all__ = ["connected", "on_cluster"]
 
 AHEAD = 3  # units a worker's thread that are handed to the scheduler at once
 LOOK = 5.0  # [s] between looks at how many workers there are
-PATIENCE = 30.0  # [s] for a scheduler to answer
+PATIENCE = 10.0  # [s] for a scheduler to answer
 
 
 @contextlib.contextmanager
@@ -36,14 +38,29 @@ def connected(address: str) -> Iterator[Any]:
         for logger in loggers:
             logger.setLevel(logging.CRITICAL)
         try:
+            with ThreadPoolExecutor(1) as apart:  # a notebook has a loop of its own
+                apart.submit(asyncio.run, _greet(address)).result()
             client = distributed.Client(address, timeout=PATIENCE)
-        except (OSError, ValueError, TypeError) as error:
-            raise InputError(f"no Dask scheduler answers at {address}: {error}") from error
+        except (OSError, ValueError, TypeError, asyncio.TimeoutError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {address}: {str(error) or f'nothing in {PATIENCE:g} s'}"
+            ) from error
         with client:
             yield client
     finally:
         for logger, level in zip(loggers, before, strict=True):
             logger.setLevel(level)
+
+
+async def _greet(address: str) -> None:
+    """OSError or TimeoutError where no scheduler answers.
+
+    A `Client` waits for ever for what takes its connection and is none.
+    """
+    distributed = _distributed()
+    given = distributed.Security().get_connection_args("client")
+    comm = await asyncio.wait_for(distributed.comm.connect(address, timeout=PATIENCE, **given), PATIENCE)
+    comm.abort()
 
 
 def on_cluster(

@@ -14,11 +14,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.files import is_plain_file, read_plain
 from impactopt.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
 from impactopt.problem_file.names import problem_file, sweep_file
-from impactopt.problem_file.toml import TOMLError, plain_value
+from impactopt.problem_file.toml import LONGEST_TEXT, TOMLError, check_plain, plain_value, text_with_control
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column
@@ -83,10 +84,10 @@ def read_sweep_file(
     """
     path = sweep_file(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_plain(path, LONGEST_TEXT).decode()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
-        raise InputError(f"cannot read {path}: {reason}") from error
+        raise InputError(f"cannot read {shortened(str(path), 300)}: {reason}") from error
     return parse_sweep(text, path, settings)
 
 
@@ -105,6 +106,10 @@ def parse_sweep(text: str, path: Path, settings: Mapping[str, Any] = MappingProx
 
 def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = "sweep") -> Sweep:
     """The sweep that the data of a file describe; see `parse_sweep`."""
+    try:
+        check_plain(data)
+    except TOMLError as error:
+        raise InputError(f"{where}: {error}") from error
     plain: dict[str, Any] = plain_value(data)
     return _checked(plain, Path(where), _written(plain))
 
@@ -123,6 +128,8 @@ def _written(data: Mapping[str, Any]) -> str:
 
 
 def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
+    if found := text_with_control(data):
+        raise InputError(f"{path}: the text {shortened(repr(found))} has control characters; take them out")
     lines, mistakes = key_lines(text), list[Mistake]()
 
     def raise_if_any() -> None:
@@ -199,4 +206,4 @@ def _check_collisions(path: Path, base: ProblemFile, content: File, design: Desi
 def _near(problem: str, path: Path) -> Path:
     """The problem's file: by name, or relative to the sweep's."""
     beside = path.parent / problem
-    return beside if beside.is_file() else problem_file(problem)
+    return beside if is_plain_file(beside) else problem_file(problem)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.files import open_own
 from impactopt.sweeps.units import Columns
 
 __all__ = ["Entry", "Journal"]
@@ -53,7 +54,7 @@ class Journal:
         self.path, self.torn, self.damaged = path, False, 0
         self._places: dict[int, int] = {}
         try:
-            self._file = open(path, "r+b" if path.exists() else "w+b", buffering=0)  # noqa: SIM115
+            self._file = os.fdopen(open_own(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
             self._end = self._scan()
             self._file.truncate(self._end)
         except OSError as error:
@@ -102,12 +103,13 @@ class Journal:
         lost = False
         while at < size:
             content = self._record(at)
-            if content is None:
+            unit = None if content is None else _unit(content)
+            if content is None or unit is None:
                 lost, at = True, self._next_mark(at + 1, size)
                 continue
             if lost:  # in the middle: records follow
                 self.damaged, lost = self.damaged + 1, False
-            self._places[_unpack(content).unit] = at
+            self._places[unit] = at
             at += len(MARK) + HEAD.size + len(content)
             sound = at
         self.torn = sound < size
@@ -148,13 +150,31 @@ def _pack(entry: Entry) -> bytes:
     return b"".join([json.dumps(line).encode(), b"\n", *(x.tobytes() for x in arrays.values())])
 
 
+def _unit(content: bytes) -> int | None:
+    """The unit of a record's content; None where it is none that `_pack` writes, whatever its checksum."""
+    try:
+        return _unpack(content).unit
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+
+
 def _unpack(content: bytes) -> Entry:
     line, _, numbers = content.partition(b"\n")
     given: Mapping[str, Any] = json.loads(line)
+    unit, peak = given["unit"], float(given["peak_mb"])
     columns: dict[str, Any] = dict(given["lists"])
     at = 0
     for name, (kind, count) in given["arrays"].items():
-        x: NDArray[Any] = np.frombuffer(numbers, dtype=np.dtype(kind), count=count, offset=at)
+        dtype = np.dtype(str(kind))
+        if dtype.kind not in "biuf" or not isinstance(count, int) or count < 0:
+            raise ValueError(f"{name} is no column of numbers")
+        x: NDArray[Any] = np.frombuffer(numbers, dtype=dtype, count=count, offset=at)
         columns[name], at = x, at + x.nbytes
-    ordered = {name: columns[name] for name in given["order"]}
-    return Entry(unit=given["unit"], peak_mb=given["peak_mb"], columns=ordered)
+    ordered = {str(name): columns[name] for name in given["order"]}
+    lengths = {len(x) for x in ordered.values()}
+    cells = (cell for x in ordered.values() if isinstance(x, list) for cell in x)
+    if isinstance(unit, bool) or not isinstance(unit, int) or unit < 0 or at != len(numbers):
+        raise ValueError("not a unit's number, or more numbers than columns")
+    if len(ordered) != len(columns) or len(lengths) > 1 or any(isinstance(c, (list, dict)) for c in cells):
+        raise ValueError("columns of different lengths, or of no numbers and texts")
+    return Entry(unit=unit, peak_mb=peak, columns=ordered)

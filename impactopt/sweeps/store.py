@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from impactopt.errors import InputError
+from impactopt.files import open_own
 from impactopt.output import make_directory, save_record, write_file
 from impactopt.solution import versions
 from impactopt.sweeps.definition import Sweep
@@ -105,7 +106,12 @@ def _lock(path: Path) -> int:
     """A lock on the directory; it is free when the process ends, in whatever way."""
     import fcntl  # POSIX only
 
-    handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        handle = open_own(path / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise InputError(
+            f"cannot lock {path}: {path / '.lock'}: {error.strerror}; remove it, or give another --out"
+        ) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

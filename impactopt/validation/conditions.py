@@ -7,8 +7,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from impactopt.contact.factors import scaled_numbers
-from impactopt.errors import InputError
+from impactopt.errors import FARTHEST, InputError, check_array, shortened
 from impactopt.validation.result import Scene
+
+LARGEST = 1e6  # factor, friction, payload [kg]
+SLOWEST = 10.0  # [s] of the servo's clock and of the floor: longer than most motions
+LIGHTEST = 1e-6  # [kg] of a payload that is one: MuJoCo takes no body without inertia
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +50,23 @@ class Conditions:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
+        most = {"distance": FARTHEST, **dict.fromkeys(("period", "delay", "floor_time"), SLOWEST)}
         for f in fields(self):
-            value = float(getattr(self, f.name))
-            if not np.isfinite(value):
-                raise InputError(f"conditions: {f.name} is {value}; give a finite number")
+            if f.name == "missing":
+                if not isinstance(self.missing, (bool, np.bool_)):
+                    raise InputError(
+                        f"conditions: missing is {shortened(repr(self.missing))}; give True or False"
+                    )
+                continue
+            value = float(
+                check_array(
+                    f"conditions: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
+                )
+            )
             if f.name != "distance" and value < 0:
                 raise InputError(f"conditions: {f.name} is {value:g}; give a number >= 0")
+        if 0 < self.payload < LIGHTEST:
+            raise InputError(f"conditions: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg")
         for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
             if not getattr(self, name) > 0:
                 raise InputError(f"conditions: {name} is {getattr(self, name):g}; give a number > 0")

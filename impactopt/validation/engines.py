@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.problem import ImpactProblem
 from impactopt.validation.clearing import with_clearance
 from impactopt.validation.mujoco_engine import simulate_mujoco
@@ -19,6 +19,11 @@ ENGINES: dict[str, Callable[..., Simulation]] = {
 }
 
 
+STEPS = (1e-6, 1e-2)  # [s]: below, a replay takes hours; above, it steps over most contacts
+LONGEST = 60.0  # [s] beyond the motion: what falls has fallen in a tenth of that
+MOST_STEPS = 20_000_000  # an hour's work
+
+
 def simulate(
     problem: ImpactProblem, reference: Any, *, engine: str = "pinocchio", **options: Any
 ) -> Simulation:
@@ -28,7 +33,7 @@ def simulate(
 
     Raises
     ------
-    InputError : an unknown engine or option.
+    InputError : an unknown engine or option; a step or a time beyond the motion that no replay has.
     """
     if engine not in ENGINES:
         raise InputError(
@@ -46,4 +51,19 @@ def simulate(
                 f"engine {engine!r} has no option {name!r}{did_you_mean(name, known)}: there are "
                 f"{', '.join(sorted(known))}"
             )
+    _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
     return with_clearance(problem, run(problem.robot, reference, scene_of(problem), **options))
+
+
+def _check_times(options: Mapping[str, Any], end: float) -> None:
+    """InputError for a step or a time to settle that is out of its range."""
+    step, settle = (float(check_array(f"{name} [s]", options[name], ())) for name in ("step", "settle"))
+    if not STEPS[0] <= step <= STEPS[1]:
+        raise InputError(f"step [s]: {step:g}; give a number of {STEPS[0]:g} to {STEPS[1]:g}")
+    if not 0 <= settle <= LONGEST:
+        raise InputError(f"settle [s]: {settle:g}; give a number of 0 to {LONGEST:g}")
+    if (end + settle) / step > MOST_STEPS:
+        raise InputError(
+            f"a replay of {end + settle:g} s in steps of {step:g} s has {(end + settle) / step:.2g} of them; "
+            f"give a longer step, for at most {MOST_STEPS:.2g}"
+        )

@@ -1,0 +1,94 @@
+"""How files are written, whole and through no planted link, and how those that could be anything are read."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+__all__ = ["is_plain_file", "open_own", "read_plain", "write_atomically"]
+
+_NONBLOCK = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer, or a reader, would wait for one
+
+
+def write_atomically(
+    path: Path,
+    write: Callable[[IO[bytes]], Any],
+    *,
+    mode: int = 0o666,
+    before: Callable[[], object] | None = None,
+) -> None:
+    """Let `write` fill a new file beside `path` that takes its place: readers see the old or the new one.
+
+    mode : of the new file, less what the process's umask takes away.
+    before : what is to be done just before that, when nothing of the new file can fail any more.
+
+    Raises
+    ------
+    OSError : it cannot be written; what was at `path` before is still there, and nothing beside it.
+    """
+    # A name that nobody can guess, and one that is not there yet ("x" is O_EXCL): no link is followed. As of
+    # tempfile.mkstemp, but with the permissions of any other new file.
+    temporary = path.with_name(f".{path.name[:64]}.{secrets.token_hex(8)}.tmp")
+    try:
+        with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())  # a name that is there before its content would be an empty file
+        if before is not None:
+            before()
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def open_own(path: str | os.PathLike[str], flags: int, mode: int = 0o666) -> int:
+    """A handle of a plain file that this program goes on with: a log, a journal, a lock.
+
+    flags : of `os.open`, such as O_RDWR | O_CREAT; it fits `open` as its opener.
+
+    Raises
+    ------
+    OSError : it is a link, a directory, a pipe or a device; or it cannot be opened.
+    """
+    return _plain(path, os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | _NONBLOCK, mode))
+
+
+def read_plain(path: str | os.PathLike[str], most: int) -> bytes:
+    """The content of a plain file of at most so many bytes; links are followed.
+
+    Raises
+    ------
+    OSError : it is larger, a directory, a pipe or a device, which may never end; it cannot be read.
+    """
+    try:
+        handle = _plain(path, os.open(path, os.O_RDONLY | _NONBLOCK))
+    except ValueError:  # of a null byte
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), os.fspath(path)) from None
+    with os.fdopen(handle, "rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", os.fspath(path))
+    return content
+
+
+def is_plain_file(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a plain file; of names that no file can have too."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def _plain(path: str | os.PathLike[str], handle: int) -> int:
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise OSError(errno.EINVAL, "not a plain file", os.fspath(path))
+    return handle

@@ -8,14 +8,18 @@ import platform
 import shlex
 import shutil
 import subprocess
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import casadi as ca
 
-__all__ = ["CompileError", "Compiler", "find_compiler"]
+__all__ = ["CompileError", "Compiler", "find_compiler", "why_no_compiler"]
 
 _FLAGS = ("-march=native", "-fPIC", "-shared", "-w")
+# what a compiler has to make a library of before it is taken for one
+_TRIAL = "double impactopt_trial(double x) { return x + 1.0; }\n"
+_PATIENCE = 20  # [s] for the trial
 
 
 class CompileError(RuntimeError):
@@ -24,7 +28,7 @@ class CompileError(RuntimeError):
 
 @dataclass(frozen=True, kw_only=True)
 class Compiler:
-    """A C compiler that answered to --version."""
+    """A C compiler that has made a library."""
 
     command: tuple[str, ...]
     version: str
@@ -41,27 +45,72 @@ class Compiler:
         ------
         CompileError : with the compiler's first error.
         """
-        command = [*self.command, *level.split(), *_FLAGS, str(source), "-o", str(library), "-lm"]
-        result = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
-        if result.returncode != 0:
-            lines = result.stderr.strip().splitlines() or ["no message"]
-            words = next((line for line in lines if "error" in line), lines[-1])
-            program = shlex.join(self.command)
-            raise CompileError(f"{program} failed on {source.name} (code {result.returncode}): {words}")
+        _compile(self, source, library, level, None)
 
 
 def find_compiler() -> Compiler | None:
-    """$CC, or else cc, gcc or clang; None if there is none or IMPACTOPT_NO_COMPILER is set."""
-    if os.environ.get("IMPACTOPT_NO_COMPILER", "") not in ("", "0") or os.name != "posix":
+    """$CC, or else cc, gcc or clang; None if there is none that compiles, or IMPACTOPT_NO_COMPILER is set.
+
+    To answer to --version is no proof: each is tried on a small file once a process.
+    """
+    if _forbidden():
         return None
-    wanted = shlex.split(os.environ.get("CC", ""))
-    for words in [wanted] if wanted else [["cc"], ["gcc"], ["clang"]]:
-        program = shutil.which(words[0])
-        command = (program, *words[1:]) if program else None
-        version = _version(command) if command else None
-        if command and version:
+    for command in _candidates():
+        version = _version(command)
+        if version and not _trouble(Compiler(command=command, version=version)):
             return Compiler(command=command, version=version)
     return None
+
+
+def why_no_compiler() -> str:
+    """Why `find_compiler` has found none, in a few words."""
+    if _forbidden():
+        return "IMPACTOPT_NO_COMPILER is set" if os.name == "posix" else "there is none for this system"
+    for command in _candidates():
+        version = _version(command)
+        if version and (trouble := _trouble(Compiler(command=command, version=version))):
+            return f"{trouble}; mend it, or what CC names"
+    return "install gcc or clang, or name one in the environment variable CC"
+
+
+def _forbidden() -> bool:
+    return os.environ.get("IMPACTOPT_NO_COMPILER", "") not in ("", "0") or os.name != "posix"
+
+
+def _candidates() -> list[tuple[str, ...]]:
+    wanted = shlex.split(os.environ.get("CC", ""))
+    names = [wanted] if wanted else [["cc"], ["gcc"], ["clang"]]
+    found = [(shutil.which(words[0]), words[1:]) for words in names]
+    return [(program, *rest) for program, rest in found if program]
+
+
+@functools.cache
+def _trouble(compiler: Compiler) -> str:
+    """What stands against compiling with it, or nothing."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="impactopt-") as scratch:
+            source, library = Path(scratch) / "trial.c", Path(scratch) / "trial.so"
+            source.write_text(_TRIAL, encoding="ascii")
+            _compile(compiler, source, library, "-O1", _PATIENCE)
+            return "" if library.stat().st_size else f"{shlex.join(compiler.command)} leaves an empty library"
+    except (CompileError, OSError) as error:
+        return str(error)
+
+
+def _compile(compiler: Compiler, source: Path, library: Path, level: str, patience: float | None) -> None:
+    """As `Compiler.run`, in no more than `patience` [s]."""
+    program = shlex.join(compiler.command)
+    command = [*compiler.command, *level.split(), *_FLAGS, str(source), "-o", str(library), "-lm"]
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", check=False, timeout=patience
+        )
+    except subprocess.TimeoutExpired:
+        raise CompileError(f"{program} has not answered within {patience} s") from None
+    if result.returncode != 0:
+        lines = result.stderr.strip().splitlines() or ["no message"]
+        words = next((line for line in lines if "error" in line), lines[-1])
+        raise CompileError(f"{program} failed on {source.name} (code {result.returncode}): {words}")
 
 
 @functools.cache

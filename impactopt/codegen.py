@@ -33,7 +33,7 @@ from typing import Any
 import casadi as ca
 import numpy.typing as npt
 
-from impactopt._compiler import CompileError, Compiler, find_compiler
+from impactopt._compiler import CompileError, Compiler, find_compiler, why_no_compiler
 from impactopt._hashing import canonical, model_hash
 from impactopt.errors import CacheWarning, NoCompilerWarning
 from impactopt.private_files import (
@@ -367,8 +367,8 @@ def _graphs(functions: dict[str, Buildable]) -> dict[str, ca.Function]:
 @functools.cache
 def _warn_no_compiler() -> None:
     warnings.warn(
-        "no C compiler: functions run in CasADi's virtual machine, 10 to 20 times slower; "
-        "install gcc or clang, or name one in the environment variable CC",
+        f"no C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower; "
+        f"{why_no_compiler()}",
         NoCompilerWarning,
         stacklevel=3,
     )

@@ -408,16 +408,20 @@ def test_everything_made_is_private(cache: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("variable", "content"), [("IMPACTOPT_NO_COMPILER", "1"), ("CC", "no-such-compiler")]
+    ("variable", "content", "why"),
+    [
+        ("IMPACTOPT_NO_COMPILER", "1", "IMPACTOPT_NO_COMPILER is set"),
+        ("CC", "no-such-compiler", "install gcc or clang, or name one in the environment variable CC"),
+        # it says which version it is, and compiles nothing
+        ("CC", "cc -fno-such-flag", r"cc -fno-such-flag failed on trial.c .*; mend it, or what CC names"),
+    ],
 )
 def test_without_compiler_the_virtual_machine_and_one_warning(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, variable: str, content: str
+    cache: Path, monkeypatch: pytest.MonkeyPatch, variable: str, content: str, why: str
 ) -> None:
     monkeypatch.setenv(variable, content)
     codegen._warn_no_compiler.cache_clear()
-    with pytest.warns(
-        NoCompilerWarning, match="install gcc or clang, or name one in the environment variable CC"
-    ):
+    with pytest.warns(NoCompilerWarning, match=why):
         functions = cached("toy", (1,), Builder())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -433,6 +437,7 @@ def test_compiler_that_fails_is_quoted(cache: Path, tmp_path: Path, monkeypatch:
     script.write_text(
         "#!/bin/sh\n"
         '[ "$1" = --version ] && echo fake 1 && exit 0\n'
+        'case "$*" in *trial.c*) exec cc "$@";; esac\n'
         'echo "value.c: error: disk full" >&2\n'
         'echo "  ^~~" >&2\n'
         "exit 3\n"

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import pairwise
-from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..course import GIVES_WAY, cuts
 from ..events import BEYOND
-from ..graph import joint_space_model, number_of_steps
+from ..graph import MOST_STEPS, columns_of, joint_space_model, number_of_steps
 from ..implicit import STAGES, gamma, tables
 from ..loop import BLOCK
 from ..model import shape_of
@@ -23,10 +22,6 @@ if TYPE_CHECKING:
     from ..symbolic import SymbolicModel
 
 __all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_jacobians"]
-
-
-# where steps find their own length
-_MOST_STEPS = 5000
 
 
 def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:
@@ -77,7 +72,7 @@ def _ends(collision: SymbolicModel) -> list[float]:
 def _blocks(collision: SymbolicModel, fraction: float) -> int:
     """Steps for a fraction of the horizon, in whole blocks; or the most, where they find their own length."""
     if collision.stepping == "implicit":
-        return _MOST_STEPS
+        return MOST_STEPS
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 
@@ -90,8 +85,7 @@ def _steps(collision: SymbolicModel) -> list[int]:
 def _columns(collision: SymbolicModel, every: int) -> list[int]:
     if collision.stepping == "implicit":
         shares = [b - a for a, b in pairwise(_ends(collision))]
-        spacing = every * collision.step_length
-        return [ceil(share * collision.horizon / spacing - 1e-9) + 1 for share in (*shares[:-1], 1.0)]
+        return [columns_of(collision, share, every) for share in (*shares[:-1], 1.0)]
     return [-(-count // every) + 1 for count in _steps(collision)]
 
 

@@ -12,7 +12,18 @@ from scipy.integrate import solve_ivp
 
 from impactopt._compiler import find_compiler
 from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
-from impactopt.contact import Board, ContactLaw, FreeMass, KelvinVoigt, Nail, RigidWall, SpringDamper, Target
+from impactopt.contact import (
+    Board,
+    ContactLaw,
+    FreeMass,
+    HuntCrossley,
+    KelvinVoigt,
+    Nail,
+    RigidWall,
+    SpringDamper,
+    Target,
+)
+from impactopt.errors import InputError
 from impactopt.sweeps.collisions import collide_many
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -35,7 +46,9 @@ def fails(tmp_path: Path, *, on: str) -> str:
     """A compiler that says its version, and fails on some files (a pattern of the shell's)."""
     script = tmp_path / "cc"
     script.write_text(
-        f'#!/bin/sh\ncase "$*" in {on}) echo "error: No space left on device" >&2; exit 1;; esac\nexec cc "$@"\n'
+        "#!/bin/sh\n"
+        f'case "$*" in {on}) echo "error: No space left on device" >&2; exit 1;; esac\n'
+        'exec cc "$@"\n'
     )
     script.chmod(0o755)
     return str(script)
@@ -98,25 +111,36 @@ def test_a_point_mass_against_its_closed_form_without_a_compiler(monkeypatch: py
 
 
 # ---------------------------------------------------------------- against an ODE of its own
-def by_ode(contact: ContactLaw, mass: float, own: float, speed: float) -> float:
-    """Impulse of two point masses, by SciPy's stiff integrator."""
+def by_ode(law: ContactLaw, mass: float, own: float, speed: float) -> tuple[float, float]:
+    """Impulse and peak force of two point masses, by SciPy's stiff integrator."""
+
+    def force(y: Any) -> float:
+        return float(law.branch(y[0], y[1], y[1] > 0))
 
     def flow(_t: float, y: Any) -> Any:
-        x, rate, _ = y
-        force = max(float(contact.force(x, rate)), 0.0)
-        return [rate, -force * (1 / own + 1 / mass), force]
+        f = max(force(y), 0.0)
+        return [y[1], -f * (1 / own + 1 / mass), f]
 
     def parted(_t: float, y: Any) -> float:
-        return float(contact.branch(y[0], y[1], y[1] > 0)) if y[1] <= 0 else 1.0
+        return 1.0 if y[1] > 0 else force(y) - 1e-9
 
     parted.terminal = True  # type: ignore[attr-defined]
-    law = contact.parameters
-    period = np.pi * np.sqrt(1 / (law["stiffness"] * (1 / own + 1 / mass)))
-    span = 10 * period + 10 * law["damping"] / law["stiffness"]
+    reduced = 1 / (1 / own + 1 / mass)
+    deepest = speed * np.sqrt(reduced / law.parameters["stiffness"])
+    if isinstance(law, HuntCrossley):
+        deepest = (1.25 * reduced * speed**2 / law.stiffness) ** 0.4
+    span = 20 * deepest / speed + 10 * law.parameters.get("damping", 0.0) / law.parameters["stiffness"]
     found = solve_ivp(
-        flow, (0.0, span), [0.0, speed, 0.0], method="Radau", events=parted, rtol=1e-9, atol=1e-15
+        flow,
+        (0.0, span),
+        [0.0, speed, 0.0],
+        method="Radau",
+        events=parted,
+        rtol=1e-9,
+        atol=1e-9 * np.array([deepest, speed, reduced * speed]),
+        max_step=0.02 * deepest / speed,
     )
-    return float(found.y[2, -1])
+    return float(found.y[2, -1]), max(force(y) for y in found.y.T)
 
 
 @pytest.mark.parametrize("how", ["compiler", "broken compiler", "full disk", "no compiler"])
@@ -148,7 +172,7 @@ def test_stiff_and_light_collisions_are_right_with_any_compiler(
         contact_damping=damping,
         target_mass=mass,
     )
-    truth = [by_ode(SpringDamper(stiffness=k, damping=d), m, 2.0, v) for k, d, m, v in cases]
+    truth = [by_ode(SpringDamper(stiffness=k, damping=d), m, 2.0, v)[0] for k, d, m, v in cases]
     np.testing.assert_allclose(found["impulse"], truth, rtol=1e-6)
     assert found["separated"].all()
 
@@ -162,3 +186,48 @@ def test_many_collisions_of_a_stiff_contact_are_those_of_a_compiler(monkeypatch:
     monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
     assert np.isfinite(compiled).all()
     np.testing.assert_allclose(found(), compiled, rtol=1e-6)
+
+
+# ---------------------------------------------------------------- each row by its own estimate
+@pytest.mark.parametrize(
+    ("law", "names", "accuracy"),
+    [
+        (HuntCrossley(stiffness=1e6, dissipation=0.1), ("stiffness", "dissipation"), 1e-2),
+        (SpringDamper(stiffness=1e4, damping=30.0), ("stiffness", "damping"), 1e-5),
+    ],
+    ids=["rk4", "events"],
+)
+def test_every_row_of_explicit_steps_is_right_or_refused(
+    law: ContactLaw, names: tuple[str, str], accuracy: float
+) -> None:
+    method = "rk4" if isinstance(law, HuntCrossley) else "events"
+    model = SDC(
+        robot=small_robots.slider(2.0),
+        striker="tip",
+        normal=X,
+        law=law,
+        target=FreeMass(mass=5.0),
+        horizon=0.1,
+        method=method,
+    )
+    rng, count = np.random.default_rng(5), 40
+    # the first row is a soft one: it says nothing of the others
+    stiffness = np.append(law.parameters["stiffness"], 10 ** rng.uniform(3.5, 10.0, count - 1))
+    other = np.append(0.1, rng.uniform(0.0, 0.2, count - 1))
+    if method == "events":
+        other = other * np.sqrt(stiffness)
+    mass, speed = 10 ** rng.uniform(-2, 2, count), rng.uniform(0.5, 4.0, count)
+    settings = {f"contact_{names[0]}": stiffness, f"contact_{names[1]}": other, "target_mass": mass}
+    found = model.batch(
+        np.zeros((count, 1)), speed[:, None], np.zeros(1), outputs=("impulse", "peak_force"), **settings
+    )
+    kept = np.isfinite(found["impulse"])
+    assert 8 <= kept.sum() <= count - 8 and not found["separated"][~kept].any()
+    for i in np.flatnonzero(kept & found["separated"]):
+        given = dict(zip(names, (stiffness[i], other[i]), strict=True))
+        impulse, peak = by_ode(type(law)(**given), mass[i], 2.0, speed[i])
+        assert found["impulse"][i] == pytest.approx(impulse, rel=accuracy)
+        assert found["peak_force"][i] == pytest.approx(peak, rel=max(accuracy, 1e-3))
+    with pytest.raises(InputError, match=r"too long to follow this contact|unstable"):
+        i = int(np.flatnonzero(~kept)[0])
+        model.collide([0.0], [speed[i]], [0.0], **{name: x[i] for name, x in settings.items()})

@@ -169,7 +169,7 @@ class Course:
 
     def _handed_on(self, y: Any) -> Any:
         """The state at the begin of a stretch, from that at the end of the one before."""
-        kept = ("penetration", "target", "peak", "deviation")
+        kept = ("penetration", "target", "peak", "left_out", "deviation")
         parts = {name: self.model.part(y, name) for name in self.model.layout}
         return self.model.join({k: x if k in kept else ca.MX.zeros(*x.shape) for k, x in parts.items()})
 

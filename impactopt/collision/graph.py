@@ -51,6 +51,7 @@ def joint_space_model(
         settings=collision.settings,
         transition=collision.joint_friction.transition,
         peak="peak_force" in outputs,
+        error="step_error" in outputs,
         second_integrals="configuration" in outputs or freezes > 0,
         refrozen=freezes > 0,
         horizon=collision.horizon,
@@ -135,7 +136,9 @@ def _expressions(
     )
     gives_way = target_yield(model.target, model.target_numbers(inputs))
     stretches = course.run(inputs, gives_way)
-    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"])
+    method, length = collision.of_graph
+    pulls = length if method == "events" else 0.0
+    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"], pulls)
     return inputs, [ca.densify(getattr(made, output)) for output in outputs]
 
 

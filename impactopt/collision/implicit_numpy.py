@@ -1,6 +1,6 @@
-"""The implicit steps of native/implicit.h in NumPy, for machines without a C compiler: the same method, events
-and error control, a hundred times slower. The loop is a CasADi callback, so that all before and after it, the
-freezes and the outputs, is the graph that the other methods have.
+"""The implicit steps of native/implicit.h in NumPy, for machines without a C compiler: the same method,
+events and error control, a hundred times slower. The loop is a CasADi callback, so that all before and after
+it, the freezes and the outputs, is the graph that the other methods have.
 """
 
 from __future__ import annotations
@@ -325,7 +325,7 @@ class _Run:
             )
             terms = s.states[:, self.parts["target"]] @ by_z.T + np.outer(s.force, by_force.ravel())
             terms[0] = values.ravel()
-            for b in (terms.T @ _HULL if terms.size else ()):
+            for b in terms.T @ _HULL if terms.size else ():
                 side = b[0] if b[0] != 0.0 else b[1]
                 falling.append(-b if side < 0.0 else b)
         places = [place for b in falling if (place := first_negative(b)) is not None and place < end]

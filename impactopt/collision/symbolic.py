@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -28,7 +27,6 @@ from .graph import (
 )
 from .implicit import is_linear
 from .interface import CollisionModel
-from .model import JointSpaceModel
 from .native import native_collision, native_gradient, native_jacobian
 from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_jacobian, check_outputs
 from .result import Collision
@@ -182,6 +180,8 @@ class SymbolicModel(CollisionModel):
             missing.add("hand_wrench")
         if not self.target.results:
             missing.add("target_result")
+        if self.stepping not in METHODS:
+            missing.add("step_error")
         return tuple(name for name in OUTPUTS if name not in missing)
 
     # ------------------------------------------------------------ functions
@@ -224,8 +224,9 @@ class SymbolicModel(CollisionModel):
         Returns (value, d/dq (nv), d/dv (nv)): q's gradient is in the basis of v, as `pin.integrate` moves q.
         """
         self._check_outputs((output,), 1)
-        if output not in SCALARS:
-            raise InputError(f"gradient of {output!r}: only of a number: {', '.join(SCALARS)}")
+        numbers = [name for name in SCALARS if name != "step_error"]
+        if output not in numbers:
+            raise InputError(f"gradient of {output!r}: only of a number: {', '.join(numbers)}")
         return self._with_parameters(self._gradient(output), parameters)
 
     def _gradient(self, output: str) -> Any:
@@ -294,8 +295,9 @@ class SymbolicModel(CollisionModel):
         -------
         Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
         frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool,
-        False also where there came out no number. That the step is stable is checked in the first collision
-        only.
+        False also where there came out no number. With explicit steps also `step_error` (N), what they left
+        out of each impulse, as an estimate: collisions that it is too large of, as `collide` refuses them,
+        have no numbers. That the step is stable for the servos is checked in the first collision only.
 
         Raises
         ------
@@ -351,6 +353,8 @@ class SymbolicModel(CollisionModel):
                 why = "a point mass knows nothing of it"
             elif name == "target_result":
                 why = f"a {type(self.target).__name__} has none"
+            elif name == "step_error":
+                why = "implicit steps keep it below `tolerance`"
             elif name == "hand_wrench":
                 why = "no hand is held"
             else:
@@ -394,14 +398,10 @@ class SymbolicModel(CollisionModel):
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
         check_finite(outputs, self.step_length)
+        error = float(outputs.pop("step_error", np.zeros(1)).item())
         result = Collision.from_outputs(outputs, self.target)
-        check_course(self, result, frozen | values, self._point_mass)
+        check_course(self, result, error)
         return result
-
-    @cached_property
-    def _point_mass(self) -> tuple[JointSpaceModel, Any]:
-        model = dataclasses.replace(joint_space_model(self), n=0, terms=Terms.none())
-        return model, slope_function(model)
 
     @cached_property
     def _exact(self) -> ExactCollision:

@@ -15,7 +15,8 @@ from ..implicit import STAGES, gamma, tables
 from ..loop import BLOCK
 from ..model import shape_of
 from ..outputs import HISTORIES, OF_SOLES, frozen_for
-from ..taylor import ORDER
+from ..runge_kutta import LEFT_OUT_BY_RK4
+from ..taylor import LEFT_OUT_BY_TAYLOR, ORDER
 from .generated import Tree, gamma_of
 
 if TYPE_CHECKING:
@@ -134,6 +135,10 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),
         "KP_MATRIX": int(n > 0 and terms.stiffness and settings["kp"].ndim == 2),
         "PEAK": int(model.peak),
+        "STEP_ERROR": int(model.error),
+        "PULLS": int(collision.stepping == "events"),
+        "LEFT_OUT_BY_TAYLOR": repr(LEFT_OUT_BY_TAYLOR),
+        "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),
         "SECOND_INTEGRALS": int(model.second_integrals),
         "FREEZES": freezes,
         "WRENCHES": int(bool(frozen_for(outputs)) or freezes > 0),

@@ -39,8 +39,8 @@ _TREE = (
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
 _NEEDS_COMPILER = (
-    "{}: derivatives of implicit steps need a C compiler that works: install gcc or clang, or name one in the "
-    "environment variable CC{}"
+    "{}: derivatives of implicit steps need a C compiler that works: install gcc or clang, or name one in "
+    "the environment variable CC{}"
 )
 # with a direction a lane, without anything but sums and products: there only the time to compile it counts
 _LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")

@@ -84,7 +84,7 @@ def check_course(collision: SymbolicModel, result: Collision, error: float) -> N
                 "give one that approaches faster"
             )
         return
-    if result.impulse < 0 or result.duration < length:
+    if result.impulse < 0:
         raise InputError(
             f"step [s]: the contact ends within {result.duration:.2g} s, too soon for steps of "
             f"{length:g}: give a shorter step, or a v that approaches faster"

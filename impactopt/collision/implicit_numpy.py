@@ -49,7 +49,7 @@ def implicit_loop(
     return loop
 
 
-class _Loop(ca.Callback):  # type: ignore[misc]
+class _Loop(ca.Callback):
     def __init__(
         self, model: JointSpaceModel, tolerance: float, most_steps: int, spacing: float, columns: int
     ) -> None:
@@ -198,7 +198,7 @@ class _Run:
         force = f_0 + k * self.number(y, "penetration") + d * now.rate
         Z, G, at = (np.array(x) for x in self.loop.contact[1](z, force, self.of_target))
         rates = np.array([float(x) for x in self.model.target.derivative([*z], force, self.target)])
-        inverse = np.linalg.inv(np.eye(nz) - g * Z)
+        inverse: Array = np.asarray(np.linalg.inv(np.eye(nz) - g * Z), dtype=float)
         moved = inverse @ G.ravel()
         return _Contact(f_0, k, d, rates, at.ravel(), inverse, moved, mobility + float(at.ravel() @ moved))
 
@@ -213,7 +213,7 @@ class _Run:
         if self.kept is None or self.kept[0] != h or not np.array_equal(self.kept[1], D):
             damped = np.eye(n + 1)
             damped[:, :n] += g * self.Q[:, :n] * D
-            self.kept = (h, D, np.linalg.solve(damped, self.Q))
+            self.kept = (h, D, np.asarray(np.linalg.solve(damped, self.Q), dtype=float))
         X = self.kept[2]
         c = self.contact_here(y, now, g, float(X[n, n]))
         slope = c.k * g + c.d

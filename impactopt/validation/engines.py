@@ -7,6 +7,7 @@ from typing import Any
 
 from impactopt.errors import InputError, did_you_mean
 from impactopt.problem import ImpactProblem
+from impactopt.validation.accuracy import with_step_error
 from impactopt.validation.clearing import with_clearance
 from impactopt.validation.mujoco_engine import simulate_mujoco
 from impactopt.validation.pinocchio_engine import simulate_pinocchio
@@ -46,4 +47,5 @@ def simulate(
                 f"engine {engine!r} has no option {name!r}{did_you_mean(name, known)}: there are "
                 f"{', '.join(sorted(known))}"
             )
-    return with_clearance(problem, run(problem.robot, reference, scene_of(problem), **options))
+    found = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
+    return with_clearance(problem, found)

@@ -291,7 +291,8 @@ def _build_entry(
         write_atomically(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
     except (CompileError, OSError) as error:
         warnings.warn(
-            f"{name}: {error}; its functions run in CasADi's virtual machine, 10 to 20 times slower",
+            f"{name}: {error}; its functions run in CasADi's virtual machine or in NumPy, 10 to 100 times "
+            "slower",
             NoCompilerWarning,
             stacklevel=4,
         )
@@ -367,7 +368,7 @@ def _graphs(functions: dict[str, Buildable]) -> dict[str, ca.Function]:
 @functools.cache
 def _warn_no_compiler() -> None:
     warnings.warn(
-        f"no C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower; "
+        "no C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower; "
         f"{why_no_compiler()}",
         NoCompilerWarning,
         stacklevel=3,

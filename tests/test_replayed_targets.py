@@ -139,7 +139,7 @@ def test_the_blow_is_that_of_an_independent_integration(
 
 @ENGINES
 def test_switches_cost_no_accuracy(engine: Engine) -> None:
-    """A nail slips and sticks, a board breaks, within steps of the engine, which the contact is followed in."""
+    """A nail slips and sticks, a board breaks, within steps of the engine: the contact has its own."""
     law = HuntCrossley(stiffness=3e6, dissipation=0.1)
     for target in (NAIL, BOARD):
         exact, _ = integrated(law, target)
@@ -183,9 +183,9 @@ def test_steps_that_leave_the_impulse_uncertain_are_found_out(engine: Engine) ->
     assert fine.impulse == pytest.approx(integrated(there[2].law, there[2].target)[0], rel=1e-2)
     with pytest.raises(InputError, match="longer than its motion"):
         with_step_error(engine, *there, settle=0.0, step=1.0)
-    coarse = with_step_error(engine, *there, settle=0.0, step=0.06)  # it misses the contact
-    assert coarse.impulse == 0 and coarse.step_error == 1.0
-    with pytest.raises(InputError, match=r"steps of 0.06 s leave 1e\+02 % of its impulse, 0 N s, uncertain"):
+    coarse = with_step_error(engine, *there, settle=0.0, step=0.06)  # one step, away over the contact
+    assert coarse.step_error > 0.5
+    with pytest.raises(InputError, match=r"steps of 0\.06 s leave .* % of its impulse, .* uncertain"):
         check_steps(coarse, 0.06)
 
 

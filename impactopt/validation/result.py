@@ -77,7 +77,8 @@ class Simulation:
     the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
     integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
-    outcome: what the target has of it, as its last touch has left it, by name and unit (``speed_m_s``, ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
+    outcome: what the target has of it, as its last touch has left it, by name and unit (``speed_m_s``,
+    ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
     than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
     engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
     that ends farthest from the reference's last posture.  touched: what touched that should not have, where

@@ -277,7 +277,7 @@ def simulate_mujoco(
             peak = max(peak, push.peak)
             data.qfrc_applied[:] = -force * replay.along
             data.qfrc_applied[replay.dof] += torque
-            touches.add(t, force, step)
+            touches.add(t, force, step, push.since)
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             replay.place_target()
             impulse += step * force

@@ -208,7 +208,10 @@ def simulate_pinocchio(
         first = world.rates(t, state, step=step)
         push = first.push
         saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
-        touches.add(t, 0.0 if push is None else push.force, step)
+        if push is None:
+            touches.add(t, 0.0, step)
+        else:
+            touches.add(t, push.force, step, push.since)
         peak = max(peak, first.force if push is None else push.peak)
         if touches.touching or k % record == 0:
             corners = world.corners()

@@ -28,7 +28,7 @@ class Push:
     """What a contact has come to within one step of an engine.
 
     force [N]: mean over the step, and over its first half (half); peak [N]; state, travel [m]: of the target
-    at the end; depth [m]: of the striking point in it, then.
+    at the end; depth [m]: of the striking point in it, then; since [s]: when in the step there was a force.
     """
 
     force: float
@@ -37,6 +37,7 @@ class Push:
     state: Array
     travel: float
     depth: float
+    since: float = 0.0
 
 
 class Struck:
@@ -109,13 +110,15 @@ class Struck:
                 "more mass"
             )
         end, impulse = found.y[:, -1], found.y[1]
+        values = np.array([forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)])
         return Push(
             force=float(impulse[-1]) / step,
             half=float(np.interp(step / 2, found.t, impulse)) / (step / 2),
-            peak=max(forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)),
+            peak=float(values.max()),
             state=np.array(end[3:]),
             travel=travel + float(end[2]),
             depth=float(end[0]),
+            since=float(found.t[np.argmax(values > 0)]),
         )
 
     def rates(self, state: Array, force: float) -> Array:

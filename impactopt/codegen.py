@@ -333,7 +333,8 @@ def _build_entry(
         _put(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
     except (CompileError, OSError) as error:
         warnings.warn(
-            f"{name}: {error}; its functions run in CasADi's virtual machine, 10 to 20 times slower",
+            f"{name}: {error}; its functions run in CasADi's virtual machine or in NumPy, 10 to 100 times "
+            "slower",
             NoCompilerWarning,
             stacklevel=4,
         )
@@ -435,7 +436,7 @@ def _no_nan(graph: ca.Function) -> ca.Function:
 @functools.cache
 def _warn_no_compiler() -> None:
     warnings.warn(
-        f"no C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower; "
+        "no C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower; "
         f"{why_no_compiler()}",
         NoCompilerWarning,
         stacklevel=3,

@@ -61,7 +61,7 @@ class Mistakes:
 
 
 class NoCompilerWarning(UserWarning):
-    """No C compiler: functions run in CasADi's virtual machine, 10 to 20 times slower."""
+    """No C compiler: functions run in CasADi's virtual machine or in NumPy, 10 to 100 times slower."""
 
 
 class CacheWarning(UserWarning):

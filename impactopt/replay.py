@@ -18,6 +18,7 @@ from impactopt.plan import Trajectory
 from impactopt.problem import ImpactProblem
 from impactopt.problem_file import parse_problem_file, read_problem_file
 from impactopt.validation import Conditions, Simulation, scene_of, simulate
+from impactopt.validation.accuracy import check_steps
 
 __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "replay"]
 
@@ -119,7 +120,8 @@ def replay(
 
     Raises
     ------
-    InputError : an unknown engine or option, a missing package, a simulation that diverges.
+    InputError : an unknown engine or option, a missing package, a simulation that diverges, or whose steps
+        leave more than 1 % of its impulse uncertain.
     """
     world = conditions if conditions is not None else Conditions()
     if world != Conditions():
@@ -128,6 +130,7 @@ def replay(
         options["missed"] = planned.missed
     problem = planned.problem
     simulation = simulate(problem, planned.reference, engine=engine, **options)
+    check_steps(simulation, options.get("step"))
     report = plain(
         simulation.report(
             torque_limit=world.torque_limit * problem.robot.torque_limit,

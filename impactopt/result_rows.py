@@ -79,6 +79,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("largest slip of a sole [mm]", "sole_slip_mm", 2),
         ("largest lift of a sole [mm]", "sole_lift_mm", 2),
         ("impulse error [%]", "impulse_error_pct", 2),
+        ("left uncertain by steps [%]", "step_error_pct", 3),
     ):
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
     stands = [None, *(source.get("standing") for source in sources[1:])]

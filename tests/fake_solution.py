@@ -121,6 +121,7 @@ def simulation_of(solution: Solution, *, touches: bool = True, peak: float = 0.9
         contact_start=start,
         contact_end=end,
         impulse=1.01 * IMPULSE if touches else 0.0,
+        peak_force=700.0 if touches else 0.0,
         outcome={"speed_m_s": 1.01 * IMPULSE / MASS if touches else 0.0},
         saturated=0.0,
         posture_error=0.0,

@@ -89,10 +89,13 @@ def test_what_it_cannot_do_has_another_method_or_is_refused(monkeypatch: pytest.
     for tolerance in (0.0, -1e-6, np.nan, 1.0):
         with pytest.raises(InputError, match="tolerance"):
             SDC(**given, law=LAW, tolerance=tolerance)
+    # what a machine has does not choose the method; what needs a compiler says so
     monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
-    assert SDC(**given, law=LAW).stepping == "events"
-    with pytest.raises(InputError, match="no C compiler"):
-        SDC(**given, law=LAW, method="implicit")
+    without = SDC(**given, law=LAW)
+    assert without.stepping == "implicit"
+    for derivatives in (without.gradient_function, lambda: without.jacobian_function(("impulse",))):
+        with pytest.raises(InputError, match=r"need a C compiler that works: install gcc or clang"):
+            derivatives()
 
 
 # ------------------------------------------------------------ collisions

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -208,3 +212,34 @@ def test_hands_that_part_are_moved_by_nothing():
 def test_other_models_are_refused(options, output, why):
     with pytest.raises(InputError, match=why):
         implicit("arm", **options).jacobian_function((output,))
+
+
+def test_tangents_stay_within_the_bounds_of_their_arrays(tmp_path: Path) -> None:
+    """Under the compiler's sanitizer of undefined behaviour, which ends the process."""
+    script = (
+        "import small_robots, numpy as np\n"
+        "from impactopt.collision import SDC\n"
+        "from impactopt.contact import FreeMass, SpringDamper\n"
+        "law = SpringDamper(stiffness=1e4, damping=300.0)\n"
+        "model = SDC(robot=small_robots.slider(2.0), striker='tip', normal=[1, 0, 0], law=law,\n"
+        "            target=FreeMass(mass=5.0), horizon=0.1)\n"
+        "print(float(model.jacobian_function(('impulse',))([0.0], [1.0], [0.0])[0]))\n"
+    )
+    environment = {
+        **os.environ,
+        "CC": "cc -fsanitize=undefined -fno-sanitize-recover=undefined",
+        "IMPACTOPT_CACHE": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+    }
+    command = [sys.executable, "-W", "error::impactopt.errors.NoCompilerWarning", "-c", script]
+    if find_compiler() is None or "ubsan" not in _libraries_of_cc():
+        pytest.skip("no compiler with that sanitizer")
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) > 1.0
+
+
+def _libraries_of_cc() -> str:
+    asked = ["cc", "-print-file-name=libubsan.so"]
+    found = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    return found if os.path.isabs(found) else ""

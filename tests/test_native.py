@@ -119,7 +119,9 @@ def assert_same(model: Any, values: list[Any], outputs: tuple[str, ...], every: 
     for name, value in true.items():
         assert found[name].shape == value.shape, name
         scale = max(float(np.abs(value).max()), 1e-9)
-        assert np.abs(found[name] - value).max() <= 1e-11 * scale, name
+        # sixth derivatives keep fewer digits
+        digits = 1e-6 if name == "step_error" else 1e-11
+        assert np.abs(found[name] - value).max() <= digits * scale, name
     return found
 
 

@@ -217,7 +217,8 @@ def test_a_blow_has_three_phases_and_a_summary(blow: tuple[Robot, Scene, Simulat
     out = sim.summary(torque_limit=robot.torque_limit, polygon=there.polygon, planned_impulse=impulse / 1.1)
     assert out["impulse_Ns"] == pytest.approx(impulse)
     assert out["impulse_error_pct"] == pytest.approx(10.0)
-    assert out["peak_force_N"] == sim.force.max()
+    # which may lie between two steps
+    assert sim.force.max() <= out["peak_force_N"] < 1.01 * sim.force.max()
     assert out["contact_ms"] == pytest.approx(1e3 * (sim.contact_end - sim.contact_start))
     names = ("swing", "collision", "follow")
     zmp = np.stack([-sim.ground[:, 4], sim.ground[:, 3]], axis=1) / sim.ground[:, 2:3]

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..codegen import cached, library_path
 from ..errors import InputError, check_array
+from .checks import ACCURACY, too_large
 from .native import native_collision
 from .outputs import HISTORIES, SCALARS
 from .settings import NO_LIMIT
@@ -45,8 +46,9 @@ class Batch:
     """
 
     def __init__(self, model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> None:
-        # one of them says which contacts have not ended
-        self.model, self.outputs = model, tuple(dict.fromkeys((*outputs, "separated")))
+        # these say which contacts have not ended, and which steps were too long
+        judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
+        self.model, self.outputs = model, tuple(dict.fromkeys((*outputs, *judges)))
         recipe = (*model._recipe, *self.outputs, every)
 
         def build() -> list[Any]:
@@ -83,6 +85,12 @@ class Batch:
         else:
             _in_threads(self._loop, function.sz_w(), rows, found, cores)
         names = function.name_out()
+        if "step_error" in names:
+            # a contact that never was has left nothing out
+            wrong = too_large(self.model.stepping, found[names.index("step_error")][:, 0])
+            for name, x in zip(names, found, strict=True):
+                if name != "step_error":
+                    x[wrong] = np.nan
         return {
             name: self._shaped(name, x, shape) for name, x, shape in zip(names, found, shapes, strict=True)
         }

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .model import JointSpaceModel
 from .result import Collision
-from .stability import contact_rate, servo_modes, step_error
 
 if TYPE_CHECKING:
     from .symbolic import SymbolicModel
 
-__all__ = ["check_course", "check_finite", "check_frozen"]
+__all__ = ["ACCURACY", "check_course", "check_finite", "check_frozen", "too_large"]
 
 Array = NDArray[np.float64]
 
-# error of the impulse beyond which the step is refused, relative (see `SymbolicModel`)
-_ACCURACY = {"events": 1e-5, "rk4": 1e-2}
+# error of the impulse beyond which the step is refused, relative (see `SymbolicModel`); and the power of the
+# step that it goes with
+ACCURACY = {"events": 1e-5, "rk4": 1e-2}
+_ORDERS = {"events": 6, "rk4": 2}
 # of a factorization's pivot, and of the hand's mobility, relative: with less, rounding reaches 1e-7
 _LEAST_PIVOT = 1e-9
-# force that pulls at separation, of the peak's; steps that find their events leave 1e-5 of a step's change
-_OVERSHOT = 1e-4
 
 
 def check_frozen(frozen: dict[str, Array]) -> None:
@@ -57,16 +54,15 @@ def check_finite(outputs: dict[str, Array], step: float) -> None:
         )
 
 
-def check_course(
-    collision: SymbolicModel,
-    result: Collision,
-    data: dict[str, Array],
-    point_mass: tuple[JointSpaceModel, Any],
-) -> None:
+def too_large(method: str, error: Array) -> Any:
+    """Whether what explicit steps are estimated to have left out of impulses is more than a method may."""
+    return ~(error <= ACCURACY[method])
+
+
+def check_course(collision: SymbolicModel, result: Collision, error: float) -> None:
     """InputError where the steps were too few, or too long for the contact's own modes.
 
-    data : what is frozen, and the settings.
-    point_mass : the robot as one, and its slope (`slope_function`).
+    error : what explicit steps left out of the impulse, relative, as an estimate.
     """
     length, method = collision.step_length, collision.stepping
     if not result.separated and result.duration < collision.horizon * (1 - 1e-9):
@@ -88,33 +84,14 @@ def check_course(
                 "give one that approaches faster"
             )
         return
-    if result.impulse < 0 or (method == "events" and _overshot(collision, result, data) > _OVERSHOT):
+    if result.impulse < 0:
         raise InputError(
             f"step [s]: the contact ends within {result.duration:.2g} s, too soon for steps of "
             f"{length:g}: give a shorter step, or a v that approaches faster"
         )
-    model, slope = point_mass
-    rate = result.hand_speed - result.target_speed
-    contact = contact_rate(model, slope, data, result.penetration, rate)
-    modes = servo_modes(data, length) if collision.n_servos else (np.zeros(0), np.zeros(0))
-    if step_error(method, length, contact, *modes) <= _ACCURACY[method]:
-        return
-    step = length
-    while step_error(method, step, contact, *modes) > _ACCURACY[method]:
-        step *= 0.9
-    raise InputError(
-        f"step [s]: {length:g} is too long to follow this contact, whose rate is {contact:.2g} 1/s, within "
-        f"{_ACCURACY[method]:g} of its impulse: give a step below {step:.2g}"
-    )
-
-
-def _overshot(collision: SymbolicModel, result: Collision, data: dict[str, Array]) -> float:
-    """How far below zero the force is at separation, of its peak: the search for events starts from a whole
-    step, and may miss a separation that comes after a small part of it."""
-    if not result.separated:
-        return 0.0
-    law = collision.law
-    numbers = {name: float(data[f"contact_{name}"].item()) for name in law.parameters}
-    rate = float(result.hand_speed[-1] - result.target_speed[-1])
-    left = ca.DM(law.branch(float(result.penetration[-1]), rate, False, numbers))
-    return max(0.0, -float(left)) / max(result.peak_force, 1e-300)
+    if too_large(method, np.array(error)):
+        shorter = 0.8 * length * (ACCURACY[method] / error) ** (1 / _ORDERS[method])
+        raise InputError(
+            f"step [s]: {length:g} is too long to follow this contact within {ACCURACY[method]:g} of its "
+            f"impulse, of which it leaves out {error:.2g}: give a step below {shorter:.2g}"
+        )

@@ -13,7 +13,7 @@ then those relative to it: du/dt = A tau - s f + d - phiddot_ref.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -21,13 +21,15 @@ from typing import Any
 import casadi as ca
 
 from .frozen import FrozenDynamics
-from .loop import run
 from .model import JointSpaceModel
 
-__all__ = ["GIVES_WAY", "Course", "Stretch", "cuts", "relative_to"]
+__all__ = ["GIVES_WAY", "Course", "Loop", "Stretch", "cuts", "relative_to"]
 
 # [1/kg] of a target that takes no impulse: drifts are frozen at the velocity given, see frozen.py
 GIVES_WAY = 1e30
+
+# (start, fraction of the horizon, data, whether states are wanted) -> (final state, states or None)
+Loop = Callable[[Any, float, Sequence[Any], bool], tuple[Any, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +82,10 @@ class Course:
     Parameters
     ----------
     model, frozen : the collision in joint space, and what is frozen.
-    step : one step of the time loop.
-    steps : number of steps for a fraction of the horizon.
+    loop : the time loop.
     horizon : [s] at which everything ends.
     freezes : on the way, besides the one at contact.
     wanted : outputs of FrozenDynamics that are wanted besides what the model needs.
-    record : keep every so many of the states, and the last; 0: none.
     """
 
     def __init__(
@@ -93,15 +93,13 @@ class Course:
         model: JointSpaceModel,
         frozen: FrozenDynamics,
         *,
-        step: Any,
-        steps: Callable[[float], int],
+        loop: Loop,
         horizon: float,
         freezes: int,
         wanted: tuple[str, ...],
-        record: int,
     ) -> None:
-        self.model, self.frozen, self.record = model, frozen, record
-        self.step, self.steps, self.horizon, self.freezes = step, steps, horizon, freezes
+        self.model, self.frozen, self.loop = model, frozen, loop
+        self.horizon, self.freezes = horizon, freezes
         whole = ("L_tau", "L_f", "L_0", "drift_velocity") if freezes else ()
         self._names = tuple(dict.fromkeys((*model.frozen, *wanted, *whole)))
         self._freeze = frozen.function("frozen", self._names)
@@ -116,14 +114,14 @@ class Course:
         n = self.model.n
         data |= {"velocity_before": ca.MX.zeros(n), "until": ca.MX(self.horizon)}
         start = ca.MX(self.model.start())
-        duration = self._time(self._loop(data, start, 1.0, record=False)[0])
+        duration = self._time(self._loop(data, start, 1.0)[0])
         stretches: list[Stretch] = []
         reached, frozen_at, contact = start, q, ca.MX(1.0)
         for i, (a, b) in enumerate(pairwise(cuts(self.freezes))):
             last = i == self.freezes - 1
             # what was frozen before goes on to the middle of this stretch
             ahead = data | {"until": self._time(reached) + duration * (b - a) / 2}
-            middle = self._loop(ahead, reached, (b - a) / 2, record=False)[0]
+            middle = self._loop(ahead, reached, (b - a) / 2)[0]
             q_middle, v_middle = self._moved(data, frozen_at, q, v, middle)
             if stretches:
                 q, v = stretches[-1].q_after(), stretches[-1].v_after()
@@ -151,10 +149,7 @@ class Course:
     def _stretch(
         self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, start: Any, fraction: float, since: Any
     ) -> Stretch:
-        final, states = self._loop(data, start, fraction, record=self.record > 0)
-        if states is not None and self.record > 1:
-            last = states.size2() - 1
-            states = states[:, [*range(0, last, self.record), last]]
+        final, states = self._loop(data, start, fraction, record=True)
         return Stretch(
             data=data,
             since=since,
@@ -164,16 +159,17 @@ class Course:
             q_after=lambda: self._moved(data, frozen_at, q, v, final)[0],
         )
 
-    def _loop(self, data: dict[str, Any], start: Any, fraction: float, *, record: bool) -> tuple[Any, Any]:
-        constants = [data[key] for key in self.model.data]
-        return run(self.model, self.step, start, self.steps(fraction), constants, record=record)
+    def _loop(
+        self, data: dict[str, Any], start: Any, fraction: float, *, record: bool = False
+    ) -> tuple[Any, Any]:
+        return self.loop(start, fraction, [data[key] for key in self.model.data], record)
 
     def _time(self, y: Any) -> Any:
         return self.model.part(y, "time")
 
     def _handed_on(self, y: Any) -> Any:
         """The state at the begin of a stretch, from that at the end of the one before."""
-        kept = ("penetration", "target", "peak", "deviation")
+        kept = ("penetration", "target", "peak", "left_out", "deviation")
         parts = {name: self.model.part(y, name) for name in self.model.layout}
         return self.model.join({k: x if k in kept else ca.MX.zeros(*x.shape) for k, x in parts.items()})
 

@@ -9,7 +9,7 @@ import casadi as ca
 
 from .jets import Jet, value_at
 
-__all__ = ["BEYOND", "first_event", "level_jet", "refine"]
+__all__ = ["BEYOND", "first_event", "level_jet", "newton", "refine"]
 
 # a step that ends on an event goes on by this fraction of its full length, so that the next one starts in
 # the new phase
@@ -36,7 +36,7 @@ def first_event(jets: Sequence[Jet], length: Any) -> tuple[Any, Any]:
         time = length * jet[0] / ca.if_else(crosses, jet[0] - end, 1.0)
         time = ca.if_else(crosses, time, 0.0)
         for _ in range(2):
-            time = ca.fmin(ca.fmax(_newton(jet, time), 0.0), length)
+            time = ca.fmin(ca.fmax(newton(jet, time), 0.0), length)
         earlier = ca.logic_and(crosses, time < first)
         first = ca.if_else(earlier, time, first)
         which = ca.if_else(earlier, float(i), which)
@@ -52,10 +52,11 @@ def refine(jets: Sequence[Jet], length: Any, first: Any, at: Any) -> Any:
     size = max(len(jet) for jet in jets)
     padded = [[*jet, *[ca.SX(0.0)] * (size - len(jet))] for jet in jets]
     chosen = [ca.dot(at, ca.vertcat(*[jet[k] for jet in padded])) for k in range(size)]
-    time = ca.fmax(_newton(chosen, first), 0.0) + BEYOND * length
+    time = ca.fmax(newton(chosen, first), 0.0) + BEYOND * length
     return ca.if_else(ca.sum1(at) > 0, ca.fmin(time, length), length)
 
 
-def _newton(jet: Jet, t: Any) -> Any:
+def newton(jet: Jet, t: Any) -> Any:
+    """A root's next guess, by Newton's iteration."""
     value, slope = value_at(jet, t), value_at(jet[1:], t)
     return t - value / ca.if_else(slope == 0, 1.0, slope)

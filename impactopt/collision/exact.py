@@ -126,7 +126,7 @@ class ExactCollision:
         known = {"peak_force": path.peak_force, "separated": float(path.separated)}
         out = {name: np.array([[x]]) for name, x in known.items()}
         for name in collision.available:
-            if name not in out:
+            if name not in out and name != "step_error":
                 out[name] = np.array(ca.evalf(ca.densify(ca.MX(getattr(made, name)))))
         if path.separated:  # there the force is zero, and not what rounding has left of it
             out["force"].ravel()[-1] = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +10,10 @@ import casadi as ca
 
 from ..contact import Target
 from ..rigid_body import RigidBody
-from .course import Course
+from .course import Course, Loop
 from .frozen import FrozenDynamics
+from .implicit_numpy import implicit_loop
+from .loop import run
 from .model import JointSpaceModel, shape_of
 from .outputs import HISTORIES, Outputs, frozen_for
 from .runge_kutta import rk4_step
@@ -21,7 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METHODS",
+    "MOST_STEPS",
     "collision_graph",
+    "columns_of",
     "frozen_dynamics",
     "gradient_graph",
     "joint_space_model",
@@ -30,6 +35,8 @@ __all__ = [
 ]
 
 METHODS = {"events": taylor_step, "rk4": rk4_step}
+# where steps find their own length
+MOST_STEPS = 5000
 
 
 def joint_space_model(
@@ -44,6 +51,7 @@ def joint_space_model(
         settings=collision.settings,
         transition=collision.joint_friction.transition,
         peak="peak_force" in outputs,
+        error="step_error" in outputs,
         second_integrals="configuration" in outputs or freezes > 0,
         refrozen=freezes > 0,
         horizon=collision.horizon,
@@ -77,9 +85,20 @@ def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
     return function(ca.DM.zeros(target.n_states), 0.0, *numbers.values())
 
 
-def collision_graph(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> Any:
-    """ca.Function (q, v[, feedforward], *settings) -> outputs, differentiable, not compiled."""
-    inputs, out = _expressions(collision, outputs, every)
+def columns_of(collision: SymbolicModel, fraction: float, every: int) -> int:
+    """Instants of the histories for a fraction of the horizon, where steps find their own length."""
+    return ceil(fraction * collision.horizon / (every * collision.step_length) - 1e-9) + 1
+
+
+def collision_graph(
+    collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1, as_compiled: bool = False
+) -> Any:
+    """ca.Function (q, v[, feedforward], *settings) -> outputs, differentiable, not compiled.
+
+    as_compiled : by implicit steps where the compiled function has them; then without derivatives.
+    """
+    implicit = as_compiled and collision.stepping == "implicit"
+    inputs, out = _expressions(collision, outputs, every, implicit=implicit)
     return ca.Function("collision", list(inputs.values()), out, list(inputs), list(outputs))
 
 
@@ -96,7 +115,7 @@ def gradient_graph(collision: SymbolicModel, output: str) -> Any:
 
 
 def _expressions(
-    collision: SymbolicModel, outputs: tuple[str, ...], every: int
+    collision: SymbolicModel, outputs: tuple[str, ...], every: int, *, implicit: bool = False
 ) -> tuple[dict[str, Any], list[Any]]:
     """Inputs by name, and the outputs, MX."""
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
@@ -106,18 +125,52 @@ def _expressions(
         inputs["feedforward"] = ca.MX.sym("feedforward", collision.robot.n)
     inputs |= {key: ca.MX.sym(key, *shape_of(value)) for key, value in collision.settings.items()}
     inputs["normal"] = frozen.normal
-    method, length = collision.of_graph
+    record = every if any(output in HISTORIES for output in outputs) else 0
     course = Course(
         model,
         frozen,
-        step=METHODS[method](model, length),
-        steps=lambda fraction: number_of_steps(collision, fraction),
+        loop=(_implicit if implicit else _explicit)(collision, model, record),
         horizon=collision.horizon,
         freezes=collision.n_freezes,
         wanted=frozen_for(outputs),
-        record=every if any(output in HISTORIES for output in outputs) else 0,
     )
     gives_way = target_yield(model.target, model.target_numbers(inputs))
     stretches = course.run(inputs, gives_way)
-    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"])
+    method, length = collision.of_graph
+    pulls = length if method == "events" else 0.0
+    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"], pulls)
     return inputs, [ca.densify(getattr(made, output)) for output in outputs]
+
+
+def _explicit(collision: SymbolicModel, model: JointSpaceModel, every: int) -> Loop:
+    """The time loop as a graph; `every`: keep every so many of the states, and the last; 0: none."""
+    method, length = collision.of_graph
+    step = METHODS[method](model, length)
+
+    def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
+        steps = number_of_steps(collision, fraction)
+        final, states = run(model, step, start, steps, data, record=record and every > 0)
+        if states is not None and every > 1:
+            last = states.size2() - 1
+            states = states[:, [*range(0, last, every), last]]
+        return final, states
+
+    return loop
+
+
+def _implicit(collision: SymbolicModel, model: JointSpaceModel, every: int) -> Loop:
+    """The time loop as a call of NumPy."""
+
+    def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
+        wanted = record and every > 0
+        function = implicit_loop(
+            model,
+            tolerance=collision.tolerance,
+            most_steps=MOST_STEPS,
+            spacing=max(every, 1) * collision.step_length,
+            columns=columns_of(collision, fraction, every) if wanted else 1,
+        )
+        final, states = function(start, *data)
+        return final, states if wanted else None
+
+    return loop

@@ -25,8 +25,8 @@ class JointSpaceModel:
     constraints) is kept exactly by any Runge-Kutta or Taylor method:
 
         time [s]; penetration [m]; impulse [N s] = integral of f; target's state; and, where they are asked
-        for or needed, peak force [N], torque (n) [N m s] = integral of tau - F, deviation (n) [rad] =
-        phi_ref - phi, torque2 (n), impulse2: second integrals.
+        for or needed, peak force [N], what steps left out [N s], torque (n) [N m s] = integral of tau - F,
+        deviation (n) [rad] = phi_ref - phi, torque2 (n), impulse2: second integrals.
 
     Attributes
     ----------
@@ -34,6 +34,7 @@ class JointSpaceModel:
     terms, law, target, settings : as in `SDC`.
     transition : [rad/s], of the joint friction.
     peak : keep the largest force in the state.
+    error : keep in the state what the steps are estimated to leave out of the impulse, `left_out` [N s].
     second_integrals : keep torque2 and impulse2 in the state.
     refrozen : whether there are several freezes. Then `velocity_before` (n), the change of the joint velocity
         from contact to the freeze, and `until` [s], when the freeze ends, are among the data.
@@ -47,6 +48,7 @@ class JointSpaceModel:
     settings: Settings
     transition: float
     peak: bool = False
+    error: bool = False
     second_integrals: bool = False
     refrozen: bool = False
     horizon: float = np.inf
@@ -58,6 +60,8 @@ class JointSpaceModel:
         sizes = {"time": 1, "penetration": 1, "impulse": 1, "target": self.target.n_states}
         if self.peak:
             sizes["peak"] = 1
+        if self.error:
+            sizes["left_out"] = 1
         sizes["torque"] = self.n
         if self.terms.stiffness:
             sizes["deviation"] = self.n

@@ -26,9 +26,10 @@ __all__ = [
 # name: what it is
 OUTPUTS = {
     "impulse": "[N s] delivered to the target",
-    "peak_force": "[N] largest contact force at the steps",
+    "peak_force": "[N] largest contact force; of 'rk4' at the steps",
     "duration": "[s] from contact to separation",
     "energy": "[J] given to the target",
+    "step_error": "what the steps of 'events' and 'rk4' left out of the impulse, relative, as an estimate",
     "separated": "1 where the contact ended within the horizon, else 0",
     "velocity": "(nv) after the collision, Pinocchio's v",
     "configuration": "(nq) after the collision, Pinocchio's q",
@@ -46,7 +47,7 @@ OUTPUTS = {
     "ground_wrench": "(6, k) [N, N m] of the ground on the robot, world axes, about the world's origin",
     "zmp": "(2, k) [m] x and y of the zero-moment point on the ground z = 0",
 }
-SCALARS = ("impulse", "peak_force", "duration", "energy", "separated")
+SCALARS = ("impulse", "peak_force", "duration", "energy", "step_error", "separated")
 HISTORIES = tuple(OUTPUTS)[tuple(OUTPUTS).index("time") :]
 OF_SOLES = ("sole_wrench", "ground_wrench", "zmp")
 # what a point mass knows nothing of
@@ -97,12 +98,19 @@ class Outputs:
     stretches : what each freeze has led to.
     soles, held : number of held soles, and of all that is held, the soles first.
     v : velocity at contact (nv).
+    pulls : [s] how long a separation may stay unseen.
     """
 
     def __init__(
-        self, model: JointSpaceModel, stretches: list[Stretch], soles: int, held: int, v: Any
+        self,
+        model: JointSpaceModel,
+        stretches: list[Stretch],
+        soles: int,
+        held: int,
+        v: Any,
+        pulls: float = 0.0,
     ) -> None:
-        self._model, self._stretches, self._last = model, stretches, stretches[-1]
+        self._model, self._stretches, self._last, self._pulls = model, stretches, stretches[-1], pulls
         self._instants = [Instants(model, stretch, soles, held, v) for stretch in stretches]
 
     def __getattr__(self, name: str) -> Any:
@@ -121,6 +129,16 @@ class Outputs:
     @cached_property
     def peak_force(self) -> Any:
         return self._model.part(self._last.final, "peak")
+
+    @cached_property
+    def step_error(self) -> Any:
+        model, y, data = self._model, self._last.final, self._last.data
+        left_out = model.part(y, "left_out")
+        if self._pulls:
+            depth, rate = model.part(y, "penetration"), model.rate(y, data)
+            force = model.law.branch(depth, rate, False, model.law_numbers(data))
+            left_out += self._pulls * ca.fmax(0.0, -force) * (1 - model.phase(y, data)[1])
+        return left_out / ca.fmax(self.impulse, 1e-300)
 
     @cached_property
     def duration(self) -> Any:

@@ -24,7 +24,7 @@ class Collision:
     Attributes
     ----------
     impulse : [N s] delivered to the target.
-    peak_force : [N] largest contact force at the steps.
+    peak_force : [N] largest contact force; of 'rk4' at the steps.
     duration : [s] from contact to separation.
     energy : [J] given to the target.
     separated : whether the contact ended within the horizon.

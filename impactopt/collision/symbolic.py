@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +12,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._compiler import find_compiler
 from ..codegen import cached, model_hash
 from ..errors import InputError, check_array, did_you_mean
 from .batch import Batch
@@ -29,7 +27,6 @@ from .graph import (
 )
 from .implicit import is_linear
 from .interface import CollisionModel
-from .model import JointSpaceModel
 from .native import native_collision, native_gradient, native_jacobian
 from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_jacobian, check_outputs
 from .result import Collision
@@ -54,7 +51,8 @@ class SymbolicModel(CollisionModel):
     terms : effects that are taken into account.
     method : how the frozen system is integrated; None: the first of these that law, target and gains allow.
         "implicit": A-stable steps of order eight that end on events and find their own length, for laws and
-        targets that are linear between events and gains that are one number a joint, with a C compiler.
+        targets that are linear between events and gains that are one number a joint. Without a C compiler
+        they are done in NumPy: the same numbers, a hundred times slower, and without derivatives.
         "events": Taylor steps of order six that end on events, with the impulse within 1e-5 of the exact
         solution, most often within 1e-9. "rk4": the paper's fixed Runge-Kutta steps, for laws that have no
         such derivatives, within 1e-2. The last two are of the impulse, or of a plastic blow's where contact
@@ -162,7 +160,7 @@ class SymbolicModel(CollisionModel):
             return f"{type(self.law).__name__} and {type(self.target).__name__} are not linear between events"
         if any(self.settings[name].ndim == 2 for name in {"kp", "kd"} & {*self.settings}):
             return "kp and kd have to be one number a joint"
-        return "" if find_compiler() else "there is no C compiler"
+        return ""
 
     @cached_property
     def settings(self) -> Settings:
@@ -182,6 +180,8 @@ class SymbolicModel(CollisionModel):
             missing.add("hand_wrench")
         if not self.target.results:
             missing.add("target_result")
+        if self.stepping not in METHODS:
+            missing.add("step_error")
         return tuple(name for name in OUTPUTS if name not in missing)
 
     # ------------------------------------------------------------ functions
@@ -224,8 +224,9 @@ class SymbolicModel(CollisionModel):
         Returns (value, d/dq (nv), d/dv (nv)): q's gradient is in the basis of v, as `pin.integrate` moves q.
         """
         self._check_outputs((output,), 1)
-        if output not in SCALARS:
-            raise InputError(f"gradient of {output!r}: only of a number: {', '.join(SCALARS)}")
+        numbers = [name for name in SCALARS if name != "step_error"]
+        if output not in numbers:
+            raise InputError(f"gradient of {output!r}: only of a number: {', '.join(numbers)}")
         return self._with_parameters(self._gradient(output), parameters)
 
     def _gradient(self, output: str) -> Any:
@@ -294,8 +295,9 @@ class SymbolicModel(CollisionModel):
         -------
         Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
         frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool,
-        False also where there came out no number. That the step is stable is checked in the first collision
-        only.
+        False also where there came out no number. With explicit steps also `step_error` (N), what they left
+        out of each impulse, as an estimate: collisions that it is too large of, as `collide` refuses them,
+        have no numbers. That the step is stable for the servos is checked in the first collision only.
 
         Raises
         ------
@@ -351,6 +353,8 @@ class SymbolicModel(CollisionModel):
                 why = "a point mass knows nothing of it"
             elif name == "target_result":
                 why = f"a {type(self.target).__name__} has none"
+            elif name == "step_error":
+                why = "implicit steps keep it below `tolerance`"
             elif name == "hand_wrench":
                 why = "no hand is held"
             else:
@@ -394,14 +398,10 @@ class SymbolicModel(CollisionModel):
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
         check_finite(outputs, self.step_length)
+        error = float(outputs.pop("step_error", np.zeros(1)).item())
         result = Collision.from_outputs(outputs, self.target)
-        check_course(self, result, frozen | values, self._point_mass)
+        check_course(self, result, error)
         return result
-
-    @cached_property
-    def _point_mass(self) -> tuple[JointSpaceModel, Any]:
-        model = dataclasses.replace(joint_space_model(self), n=0, terms=Terms.none())
-        return model, slope_function(model)
 
     @cached_property
     def _exact(self) -> ExactCollision:

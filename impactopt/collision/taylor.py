@@ -10,18 +10,22 @@ the classical one.
 
 from __future__ import annotations
 
+from math import factorial, pi
 from typing import Any
 
 import casadi as ca
 
-from .events import first_event, level_jet, refine
+from .events import first_event, level_jet, newton, refine
 from .jets import Jet, derivative, value_at
 from .model import JointSpaceModel
 
-__all__ = ["taylor_step"]
+__all__ = ["LEFT_OUT_BY_TAYLOR", "taylor_step"]
 
 # with steps of 0.25 ms the sixth order is worth 200 times the accuracy of the fourth, for half as much again
 ORDER = 6
+# of |f^(6)| h^7, summed over steps, what is left out of the impulse: the next term of its polynomial, and as
+# much again for the errors of the motion that come with it
+LEFT_OUT_BY_TAYLOR = pi / factorial(ORDER + 1)
 
 
 def taylor_step(model: JointSpaceModel, length: float) -> Any:
@@ -32,15 +36,21 @@ def taylor_step(model: JointSpaceModel, length: float) -> Any:
     events = motion.events(longest)
     time, at = ca.SX.sym("time"), ca.SX.sym("at", len(events))
     h = model.running(y, data) * refine(events, longest, time, at)
-    y_next = model.join({name: value_at(jet, h) for name, jet in motion.jets.items()})
+    top = ca.SX.sym("top")
+    parts = {name: value_at(jet, h) for name, jet in motion.jets.items()}
+    if model.peak:
+        parts["peak"] = ca.fmax(parts["peak"], value_at(motion.forces, top))
+    if model.error:
+        parts["left_out"] += LEFT_OUT_BY_TAYLOR * ca.fabs(motion.forces[ORDER]) * h ** (ORDER + 1)
+    y_next = model.join(parts)
 
     # A tau stays one product in the code, between functions for all that is done joint by joint; and the
     # search for events, whose result `refine` makes differentiable, is kept out of derivatives
     known = [y, *data.values()]
-    search = ca.Function(
-        "search", [*known, *motion.symbols], [*first_event(events, longest)], {"is_diff_out": [False, False]}
-    )
-    finish = ca.Function("finish", [*known, *motion.symbols, time, at], [y_next])
+    first = first_event(events, longest)
+    found = [*first, _top(motion.forces, model.running(y, data) * refine(events, longest, *first))]
+    search = ca.Function("search", [*known, *motion.symbols], found, {"is_diff_out": [False] * 3})
+    finish = ca.Function("finish", [*known, *motion.symbols, time, at, top], [y_next])
     Y, D = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
     given = [Y, *[D[name] for name in data]]
     torque, impulse, time_passed = (model.part(Y, name) for name in ("torque", "impulse", "time"))
@@ -55,6 +65,17 @@ def taylor_step(model: JointSpaceModel, length: float) -> Any:
     return ca.Function(
         "step", [Y, *D.values()], [finish(*given, *made, *search(*given, *made))], ["y", *D], ["y_next"]
     )
+
+
+def _top(forces: Jet, length: Any) -> Any:
+    """[s] where within a step the force is largest; 0 where that is at an end: the next step begins there."""
+    rate = forces[1:]
+    rise, fall = rate[0], value_at(rate, length)
+    inside = ca.logic_and(rise > 0, fall < 0)
+    time = length * rise / ca.if_else(inside, rise - fall, 1.0)
+    for _ in range(3):
+        time = ca.fmin(ca.fmax(newton(rate, time), 0.0), length)
+    return ca.if_else(inside, time, 0.0)
 
 
 class _Motion:
@@ -84,8 +105,6 @@ class _Motion:
         for k in range(ORDER):
             self._order(k)
         self.forces.append(self._force(ORDER))
-        if model.peak:
-            self.jets["peak"] = [ca.fmax(self.jets["peak"][0], self.forces[0])]
 
     def _order(self, k: int) -> None:
         """The state's derivatives of order k + 1."""

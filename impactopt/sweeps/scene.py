@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision import Collision, CollisionModel
+from impactopt.collision.checks import too_large
 from impactopt.collision.outputs import HISTORIES
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
@@ -31,6 +32,7 @@ _ROWS, _WITH_HISTORIES = 8192, 512  # rows at a time: histories are large
 _TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
 NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
 NO_NUMBER = "the collision has no finite numbers: its steps are unstable here"
+TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,6 +179,10 @@ def batch(
     for name in outputs:
         finite &= np.isfinite(found[name]).reshape(len(reason), -1).all(axis=1)
     reason[~finite] = NO_NUMBER
+    if "step_error" in found:
+        error = found["step_error"]
+        for row in np.flatnonzero(np.isfinite(error) & too_large(model.stepping, error)):
+            reason[row] = TOO_STIFF.format(error[row])
     return found, reason
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.problem import ImpactProblem
+from impactopt.validation.accuracy import with_step_error
 from impactopt.validation.clearing import with_clearance
 from impactopt.validation.mujoco_engine import simulate_mujoco
 from impactopt.validation.pinocchio_engine import simulate_pinocchio
@@ -52,7 +53,8 @@ def simulate(
                 f"{', '.join(sorted(known))}"
             )
     _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
-    return with_clearance(problem, run(problem.robot, reference, scene_of(problem), **options))
+    found = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
+    return with_clearance(problem, found)
 
 
 def _check_times(options: Mapping[str, Any], end: float) -> None:

@@ -46,6 +46,8 @@ def simulation_of(
     """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
     wrench of each sole, slip and lift of each; ``rest``: the other fields.
     """
+    if not rows:
+        raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*rows, strict=True)]
     time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, slip, lift = columns
     contact_start, contact_end = touches.blow()
@@ -65,5 +67,6 @@ def simulation_of(
         lift=lift.reshape(len(time), -1),
         contact_start=contact_start,
         contact_end=contact_end,
+        touches=tuple((start, end, impulse) for start, end, impulse in touches.intervals),
         **rest,
     )

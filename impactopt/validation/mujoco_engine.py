@@ -23,7 +23,7 @@ from impactopt.validation.mujoco_world import Solver, build_world, mujoco_module
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
 from impactopt.validation.soles import BEARS, sole_names, weight_of
-from impactopt.validation.struck import Struck
+from impactopt.validation.struck import Push, Struck
 from impactopt.validation.touch import Touches
 
 Array = NDArray[np.float64]
@@ -51,6 +51,9 @@ class _Replay:
         self.site = self.world.site("striker").id
         self.struck = Struck(self.scene)
         self.target, self.travel = self.struck.at_rest, 0.0  # the target's state, and how far it has gone [m]
+        # its depth at the end of a step in contact; of the step before, hand speed and force
+        self.kept: float | None = None
+        self.before: tuple[float, float] | None = None
         self.row = np.zeros((3, self.world.nv))
         self.held = {name: k for k, name in enumerate(scene.soles)}
         self.geom_sole = np.full(self.world.ngeom, -1)
@@ -83,18 +86,37 @@ class _Replay:
     def hand_speed(self) -> float:
         """Speed of the striking point along the normal [m/s]; leaves its Jacobian in ``row``."""
         self.mujoco.mj_jacSite(self.world, self.data, self.row, None, self.site)
-        self.push = self.scene.normal @ self.row
-        return float(self.push @ self.data.qvel)
+        self.along = self.scene.normal @ self.row
+        return float(self.along @ self.data.qvel)
 
-    def contact_force(self, speed: float) -> float:
-        if self.conditions.missing:
-            return 0.0
-        return self.struck.force(self.data.site_xpos[self.site], speed, self.travel, self.target)
+    def push(self, speed: float, step: float) -> Push:
+        """The contact in the step that begins now; moves the target.
 
-    def move_target(self, force: float, step: float) -> None:
-        """Semi-implicitly, as MuJoCo moves the robot: by the speed that it has after the step."""
-        self.target = self.struck.moved(self.target, force, step)
-        self.travel += step * self.struck.speed(self.target)
+        The hand gains speed as in the step before, where its soles and servos had the same to say.
+        """
+        struck, d = self.struck, self.data
+        place = d.site_xpos[self.site]
+        if self.kept is not None:
+            # the depth is the contact's: it is followed more exactly there than the arm is
+            along = struck.depth(place, 0.0)
+            self.travel = along - self.kept if np.isfinite(along) else self.travel
+        depth = -np.inf if self.conditions.missing else struck.depth(place, self.travel)
+        self.kept = None
+        if struck.near(depth, speed, self.target, step):
+            answer = np.zeros((1, self.world.nv))
+            self.mujoco.mj_solveM(self.world, d, answer, self.along[None])
+            yields = float(self.along @ answer[0])
+            gain = 0.0 if self.before is None else (speed - self.before[0]) / step
+            gain += 0.0 if self.before is None else self.before[1] * yields
+            push = struck.pushed(depth, speed, gain, yields, self.target, self.travel, step)
+            self.kept = push.depth
+        else:
+            state = struck.moved(self.target, 0.0, step)
+            travel = self.travel + step * struck.speed(state)
+            push = Push(force=0.0, half=0.0, peak=0.0, state=state, travel=travel, depth=depth)
+        self.before = (speed, push.force)
+        self.target, self.travel = push.state, push.travel
+        return push
 
     def place_target(self) -> None:
         """Its body goes with it; what a blow has broken is put away."""
@@ -204,6 +226,7 @@ def simulate_mujoco(
     record: int = 5,
     conditions: Conditions | None = None,
     missed: Any = None,
+    until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
 
@@ -213,6 +236,7 @@ def simulate_mujoco(
     conditions : where the world differs from what was planned; default: nowhere.
     missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
         default: it does not notice.
+    until [s] : it ends, if that is earlier.
 
     A fall ends the simulation early; the result says so.
 
@@ -231,10 +255,10 @@ def simulate_mujoco(
     demand = torque = np.zeros(robot.n)
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
-    touches, saturated, fall = Touches(), 0.0, ""
+    touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
     impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
     with no_log_file():
-        for k in range(round((float(reference.end) + settle) / step)):
+        for k in range(round(min(float(reference.end) + settle, until) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
             if missed is not None and t >= missed.contact_end and not touches.intervals:
@@ -247,13 +271,14 @@ def simulate_mujoco(
             while waiting and waiting[0][0] <= k:
                 demand, torque = waiting.popleft()[1]
             speed = replay.hand_speed()
-            force = replay.contact_force(speed)
-            data.qfrc_applied[:] = -force * replay.push
-            data.qfrc_applied[replay.dof] += torque
-            touches.add(t, force, step)
-            saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             target_speed = replay.struck.speed(replay.target)
-            replay.move_target(force, step)
+            push = replay.push(speed, step)
+            force = push.force
+            peak = max(peak, push.peak)
+            data.qfrc_applied[:] = -force * replay.along
+            data.qfrc_applied[replay.dof] += torque
+            touches.add(t, force, step, push.since)
+            saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             replay.place_target()
             impulse += step * force
             left = replay.target if force > 0 else left
@@ -278,6 +303,7 @@ def simulate_mujoco(
         touches,
         engine="mujoco",
         impulse=impulse,
+        peak_force=peak,
         outcome=replay.scene.target.outcome(left),
         saturated=saturated,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),

@@ -7,7 +7,7 @@ numbers and the scene's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from impactopt.robot import Robot
 from impactopt.validation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.validation.result import Scene, Simulation
 from impactopt.validation.servo import Servo
-from impactopt.validation.struck import Move, Struck, smooth_steps
+from impactopt.validation.struck import Push, Struck
 from impactopt.validation.touch import Touches
 
 Array = NDArray[np.float64]
@@ -38,11 +38,11 @@ class _Rates:
     v: Array
     a: Array
     vt: float  # the target's speed [m/s]
-    target: Array
     force: float
     hand_speed: float
     demand: Array
     torque: Array
+    push: Push | None  # what the contact comes to in the step that begins here
 
 
 class _World:
@@ -74,39 +74,53 @@ class _World:
         self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
 
     def contact(self, s: _State) -> tuple[float, float, Array]:
-        """Force [N] and hand speed [m/s] along the normal, and the row (nv,) of the Jacobian."""
+        """Depth [m] and hand speed [m/s] along the normal, and the row (nv,) of the Jacobian."""
         model, data = self.model, self.data
         pin.computeJointJacobians(model, data, s.q)
         jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)
         jac = np.reshape(jac, (6, model.nv))[:3]  # pin drops an axis where nv is 1
         point = pin.updateFramePlacement(model, data, self.hand).translation
         row = self.scene.normal @ jac
-        speed = float(row @ s.v)
-        return self.struck.force(point, speed, s.x, s.target), speed, row
+        return self.struck.depth(point, s.x), float(row @ s.v), row
 
-    def rates(self, t: float, s: _State) -> _Rates:
-        model, data = self.model, self.data
-        force, speed, row = self.contact(s)
-        demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
+    def accelerate(self, s: _State, torque: Array, row: Array, force: float) -> Array:
         tau = -row * force
         tau[self.base :] += torque
-        if self.sole_ids:
-            a = pin.constraintDynamics(
-                model, data, s.q, s.v, tau, self.contacts, self.contact_data, self.proximal
+        if not self.sole_ids:
+            return np.array(pin.aba(self.model, self.data, s.q, s.v, tau))
+        return np.array(
+            pin.constraintDynamics(
+                self.model, self.data, s.q, s.v, tau, self.contacts, self.contact_data, self.proximal
             )
-        else:
-            a = pin.aba(model, data, s.q, s.v, tau)
-        struck = self.struck
+        )
+
+    def rates(self, t: float, s: _State, *, force: float | None = None, step: float = 0.0) -> _Rates:
+        """At a state under the force [N] of its step, or that of the step [s] that begins here."""
+        depth, speed, row = self.contact(s)
+        demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
+        push, struck = None, self.struck
+        if force is None:
+            force = struck.force(depth, speed, s.target)
+            if struck.near(depth, speed, s.target, step):
+                a = self.accelerate(s, torque, row, 0.0)
+                yields = float(row @ (a - self.accelerate(s, torque, row, 1.0)))
+                push = struck.pushed(depth, speed, self.drift(s, a), yields, s.target, s.x, step)
         return _Rates(
             v=s.v.copy(),
-            a=np.array(a),
+            a=self.accelerate(s, torque, row, force),
             vt=struck.speed(s.target),
-            target=struck.rates(s.target, force),
             force=force,
             hand_speed=speed,
             demand=demand,
             torque=torque,
+            push=push,
         )
+
+    def drift(self, s: _State, a: Array) -> float:
+        """[m/s2] of the striking point along the normal, at these accelerations (nv,)."""
+        pin.forwardKinematics(self.model, self.data, s.q, s.v, a)
+        drift = pin.getFrameClassicalAcceleration(self.model, self.data, self.hand, pin.LOCAL_WORLD_ALIGNED)
+        return float(self.scene.normal @ drift.linear)
 
     def ground(self) -> Array:
         """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
@@ -128,45 +142,52 @@ class _World:
             for m, c in zip(placements, self.scene.corners, strict=True)
         ]
 
-    def advance(self, s: _State, r: _Rates, h: float) -> _State:
-        return _State(
-            q=pin.integrate(self.model, s.q, h * r.v),
-            v=s.v + h * r.a,
-            x=s.x + h * r.vt,
-            target=s.target + h * r.target,
-            impulse=s.impulse + h * r.force,
-        )
-
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
-        """A step of the midpoint rule from a state with its rates; several, where the target switches."""
-        struck = self.struck
-
-        def begin(done: float, at: _State) -> Move[_State]:
-            now = first if done == 0 else self.rates(t + done, at)
-            before = struck.side(at.target, now.force)
-
-            def move(length: float) -> tuple[_State, bool]:
-                half = self.advance(at, now, length / 2)
-                middle = self.rates(t + done + length / 2, half)
-                after = self.advance(at, middle, length)
-                if not struck.switching:
-                    return after, True
-                stays = struck.side(half.target, middle.force) == before
-                return after, stays and struck.side(after.target, self.contact(after)[0]) == before
-
-            return move
-
-        return smooth_steps(begin, s, h)
+        """A step of the midpoint rule from a state with its rates, under the contact's mean force in it."""
+        push = first.push
+        a = first.a
+        if push is not None and push.half != first.force:
+            depth_row = self.contact(s)[2]
+            a = self.accelerate(s, first.torque, depth_row, push.half)
+        half = _State(
+            q=pin.integrate(self.model, s.q, h / 2 * s.v),
+            v=s.v + h / 2 * a,
+            x=s.x,
+            target=s.target,
+            impulse=s.impulse,
+        )
+        middle = self.rates(t + h / 2, half, force=push.force if push is not None else 0.0)
+        after = _State(
+            q=pin.integrate(self.model, s.q, h * middle.v),
+            v=s.v + h * middle.a,
+            x=s.x + h * first.vt,
+            target=self.struck.moved(s.target, 0.0, h) if push is None else push.state,
+            impulse=s.impulse + h * middle.force,
+        )
+        if push is None:
+            return after
+        # the depth is the contact's: it is followed more exactly there than the arm is
+        placed = replace(after, x=0.0)
+        along = self.contact(placed)[0]
+        return replace(after, x=along - push.depth if np.isfinite(along) else push.travel)
 
 
 def simulate_pinocchio(
-    robot: Robot, reference: Any, scene: Scene, *, step: float = 1e-4, settle: float = 0.3, record: int = 5
+    robot: Robot,
+    reference: Any,
+    scene: Scene,
+    *,
+    step: float = 1e-4,
+    settle: float = 0.3,
+    record: int = 5,
+    until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, in constrained forward dynamics.
 
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of :class:`impactopt.plan.Trajectory`.
     step [s] : of the explicit midpoint rule (second order).  settle [s] : simulated beyond the end of the
         reference's motion.
+    until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
 
     Raises
@@ -177,17 +198,22 @@ def simulate_pinocchio(
     struck = world.struck
     state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, struck.at_rest, 0.0)
     left = state.target  # as the last touch has left it
-    end = float(reference.end) + settle
+    end = min(float(reference.end) + settle, until)
     rows: list[tuple[Any, ...]] = []
-    saturated = 0.0
+    saturated = peak = 0.0
     start: list[Array] | None = None
     touches = Touches()
     for k in range(round(end / step)):
         t = k * step
-        first = world.rates(t, state)
+        first = world.rates(t, state, step=step)
+        push = first.push
         saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
-        touches.add(t, first.force, step)
-        if first.force > 0 or k % record == 0:
+        if push is None:
+            touches.add(t, 0.0, step)
+        else:
+            touches.add(t, push.force, step, push.since)
+        peak = max(peak, first.force if push is None else push.peak)
+        if touches.touching or k % record == 0:
             corners = world.corners()
             start = corners if start is None else start
             motion = (state.q, state.v, first.force, first.vt, first.hand_speed)
@@ -203,6 +229,7 @@ def simulate_pinocchio(
         touches,
         engine="pinocchio",
         impulse=state.impulse,
+        peak_force=peak,
         outcome=scene.target.outcome(left),
         saturated=saturated,
         posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),

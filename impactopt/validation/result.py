@@ -21,6 +21,7 @@ REPORT = (
     "reason",
     "impulse_Ns",
     "impulse_error_pct",
+    "step_error_pct",
     "peak_force_N",
     "contact_ms",
     "zmp_margin_m",
@@ -75,13 +76,16 @@ class Simulation:
     where it bears no load; slip, lift (k, soles) [m]: how far the corner of a sole that moved most went along
     the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
-    integral over the whole motion.  outcome: what the target has of it, as its last touch has left it, by
-    name and unit (``speed_m_s``, ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
+    integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
+    outcome: what the target has of it, as its last touch has left it, by name and unit (``speed_m_s``,
+    ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
     than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
     engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
     that ends farthest from the reference's last posture.  touched: what touched that should not have, where
     the engine's solids push back.  clearance [m], nearest: the least distance of any two bodies that are not
-    to touch, by exact geometry, and which two.  missed: there was no target.
+    to touch, by exact geometry, and which two.  missed: there was no target.  touches: start and end [s] and
+    impulse [N s] of each.  step_error: relative, of the impulse, what the engine's steps leave uncertain, as
+    an estimate; nan where it was not asked for, or nothing was hit.
     """
 
     engine: str
@@ -101,6 +105,7 @@ class Simulation:
     contact_start: float
     contact_end: float
     impulse: float
+    peak_force: float
     outcome: dict[str, float]
     saturated: float
     posture_error: float
@@ -109,6 +114,8 @@ class Simulation:
     clearance: float = np.nan
     nearest: tuple[str, ...] = ()
     missed: bool = False
+    touches: tuple[tuple[float, float, float], ...] = ()
+    step_error: float = np.nan
 
     @property
     def ground(self) -> Array:
@@ -154,7 +161,8 @@ class Simulation:
             "impulse_Ns": self.impulse,
             "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1),
             "target": self.outcome,
-            "peak_force_N": float(self.force.max()),
+            "step_error_pct": None if np.isnan(self.step_error) else 100 * self.step_error,
+            "peak_force_N": self.peak_force,
             "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
             # a target that comes early may touch at once
             "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]),

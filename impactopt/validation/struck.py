@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
+from impactopt.errors import InputError
 from impactopt.validation.result import Scene
 
 Array = NDArray[np.float64]
@@ -15,6 +18,26 @@ State = TypeVar("State")
 Move = Callable[[float], tuple[State, bool]]
 FACE = 0.2  # [m] how far from the hit point, across the normal, there is something to hit
 PIECES, HALVINGS = 20, 30  # of one step: switches that it ends on; how exactly each is found
+RELATIVE, ABSOLUTE = 1e-6, 1e-10  # errors of the contact within a step; [m], [N s], and of the target's state
+NEAR = 2.0  # steps before a touch from which on the contact is followed within them
+MOST = 20_000  # places within one step: a contact that needs more is no contact to be followed
+
+
+@dataclass(frozen=True)
+class Push:
+    """What a contact has come to within one step of an engine.
+
+    force [N]: mean over the step, and over its first half (half); peak [N]; state, travel [m]: of the target
+    at the end; depth [m]: of the striking point in it, then; since [s]: when in the step there was a force.
+    """
+
+    force: float
+    half: float
+    peak: float
+    state: Array
+    travel: float
+    depth: float
+    since: float = 0.0
 
 
 class Struck:
@@ -32,17 +55,71 @@ class Struck:
         """[m/s] of the hit surface along the normal."""
         return float(self.target.velocity(state))
 
-    def force(self, place: Array, speed: float, travel: float, state: Array) -> float:
-        """Contact force [N] on a target that has gone so far [m], of a striking point at a place (3,) [m]
-        with a speed along the normal [m/s].
+    def depth(self, place: Array, travel: float) -> float:
+        """[m] of a striking point at a place (3,) [m] in a target that has gone so far [m]; beside its face
+        minus infinity.
         """
         normal = self.scene.normal
         way = place - self.scene.point
         along = float(normal @ way)
-        depth = along - travel
-        if depth <= 0 or np.linalg.norm(way - along * normal) > FACE:
-            return 0.0
-        return float(self.law.force(depth, speed - self.speed(state)))
+        return -np.inf if np.linalg.norm(way - along * normal) > FACE else along - travel
+
+    def force(self, depth: float, speed: float, state: Array) -> float:
+        """Contact force [N] of a striking point so deep in the target [m], with a speed along the normal
+        [m/s].
+        """
+        return float(self.law.force(depth, speed - self.speed(state))) if depth > 0 else 0.0
+
+    def near(self, depth: float, speed: float, state: Array, step: float) -> bool:
+        """Whether the two may touch within a step [s]."""
+        return depth + NEAR * step * (abs(speed - self.speed(state)) + 1.0) > 0
+
+    def pushed(
+        self, depth: float, speed: float, gain: float, yields: float, state: Array, travel: float, step: float
+    ) -> Push:
+        """The contact over one step [s] of the engine: hand and target alone, with errors of their own.
+
+        The hand is a point whose speed [m/s] gains so much [m/s2] without the contact, and loses `yields`
+        [1/kg] times the impulse. A light target behind a stiff contact moves a thousand times within a step,
+        which an engine could not follow.
+        """
+
+        def forces(t: float, y: Array) -> tuple[float, float, float]:
+            """Force, and the speeds of hand and target."""
+            hand, target = speed + gain * t - yields * y[1], self.speed(y[3:])
+            force = float(self.law.force(y[0], hand - target)) if y[0] > 0 else 0.0
+            return force, hand, target
+
+        def rates(t: float, y: Array) -> list[float]:
+            force, hand, target = forces(t, y)
+            return [hand - target, force, target, *self.target.derivative(y[3:], force)]
+
+        begin = np.concatenate([[depth, 0.0, 0.0], state])
+        found = solve_ivp(
+            rates,
+            (0.0, step),
+            begin,
+            method="RK45",  # an implicit method's Newton steps do not get over a target's switches
+            rtol=RELATIVE,
+            atol=ABSOLUTE,
+            max_step=0.5 * step,
+        )
+        if not found.success or found.t.size > MOST or not np.isfinite(found.y).all():
+            raise InputError(
+                f"the contact cannot be followed within a step of {step:g} s: soften it, or give the target "
+                "more mass"
+            )
+        end, impulse = found.y[:, -1], found.y[1]
+        values = np.array([forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)])
+        return Push(
+            force=float(impulse[-1]) / step,
+            half=float(np.interp(step / 2, found.t, impulse)) / (step / 2),
+            peak=float(values.max()),
+            state=np.array(end[3:]),
+            travel=travel + float(end[2]),
+            depth=float(end[0]),
+            since=float(found.t[np.argmax(values > 0)]),
+        )
 
     def rates(self, state: Array, force: float) -> Array:
         """d(state)/dt (n_states,)."""

@@ -12,14 +12,15 @@ class Touches:
         self.intervals: list[list[float]] = []  # start [s], end [s], impulse [N s]
         self.touching = False
 
-    def add(self, t: float, force: float, step: float) -> None:
-        """The contact force [N] at time t [s]."""
+    def add(self, t: float, force: float, step: float, since: float = 0.0) -> None:
+        """The contact's mean force [N] in the step that begins at time t [s]; since [s]: when in it there was
+        one first."""
         if force > 0:
             if not self.touching:
-                self.intervals.append([t, t, 0.0])
+                self.intervals.append([t + since, t + since, 0.0])
             self.intervals[-1][2] += force * step
         if self.touching or force > 0:
-            self.intervals[-1][1] = t
+            self.intervals[-1][1] = max(t, self.intervals[-1][0])
         self.touching = force > 0
 
     def blow(self) -> tuple[float, float]:

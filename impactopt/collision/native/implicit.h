@@ -187,7 +187,8 @@ static double largest(const double *w, double end, double most, double *where) {
     for (int k = STAGES - 1; k >= 0; k--) x = x * t + c[k];
     if (x > high) high = x, best = t;
   }
-  FOR(tries, best > 0.0 && best < end ? 5 : 0) {
+  /* from an end too: the largest may lie between it and its neighbour */
+  FOR(tries, 5) {
     double slope = 0.0, bend = 0.0;
     for (int k = STAGES; k >= 1; k--) slope = slope * best + k * c[k];
     for (int k = STAGES; k >= 2; k--) bend = bend * best + k * (k - 1) * c[k];

@@ -31,14 +31,14 @@ typedef struct {
 
 /* dQ times the terms' (T, -p), which are columns of x */
 static void times_Q(const FrozenTangent *t, const double (*x)[STAGES], vec (*out)[N + 1][VD]) {
-  FOR(m, (N + 1) * VD) {
+  FOR(i, N + 1) FOR_EACH(k) {
     vec s[STAGES];
     FOR(a, STAGES) s[a] = (vec){0};
     FOR(j, N + 1) {
-      const vec of = t->Q[j][0][m];
+      const vec of = t->Q[j][i][k];
       FOR(a, STAGES) s[a] += x[j][a] * of;
     }
-    FOR(a, STAGES) out[a][0][m] = s[a];
+    FOR(a, STAGES) out[a][i][k] = s[a];
   }
 }
 

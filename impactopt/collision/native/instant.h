@@ -2,7 +2,7 @@
 
 typedef struct {
   vec torque[V], deviation[V], torque2[V];
-  double time, penetration, impulse, peak, impulse2;
+  double time, penetration, impulse, peak, impulse2, left_out;
   double target[NZ1];
 } State;
 
@@ -135,7 +135,7 @@ INLINE void look(const Data *d, const State *y, Instant *now) {
 /* no number in, none out */
 static void no_number(const Data *d, State *y, Instant *now) {
   if (now->rate == now->rate) return;
-  y->impulse = y->time = y->penetration = y->peak = NAN;
+  y->impulse = y->time = y->penetration = y->peak = y->left_out = NAN;
   FOR(i, V) y->torque[i] = y->torque2[i] = (vec){0} + NAN;
   FOR(i, NZ) y->target[i] = NAN;
   y->impulse2 = NAN;

@@ -6,6 +6,9 @@ static void outputs_of(const Course *c, Work *w, double **res) {
 #ifdef OUT_impulse
   if (res[OUT_impulse]) *res[OUT_impulse] = c->impulse;
 #endif
+#ifdef OUT_step_error
+  if (res[OUT_step_error]) *res[OUT_step_error] = y->left_out / fmax(c->impulse, 1e-300);
+#endif
 #ifdef OUT_peak_force
   if (res[OUT_peak_force]) *res[OUT_peak_force] = y->peak;
 #endif

@@ -51,6 +51,9 @@ INLINE void advance(const Data *d, State *y, const Instant *now, double h) {
 #if PEAK
   y->peak = y->peak < k1.impulse ? k1.impulse : y->peak;
 #endif
+#if STEP_ERROR
+  y->left_out += LEFT_OUT_BY_RK4 * fabs(k2.impulse - k3.impulse) * h;
+#endif
   k1.penetration = MEAN(penetration);
   k1.impulse = MEAN(impulse);
   k1.impulse2 = MEAN(impulse2);

@@ -4,29 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import pairwise
-from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..course import GIVES_WAY, cuts
 from ..events import BEYOND
-from ..graph import joint_space_model, number_of_steps
+from ..graph import MOST_STEPS, columns_of, joint_space_model, number_of_steps
 from ..implicit import STAGES, gamma, tables
 from ..loop import BLOCK
 from ..model import shape_of
 from ..outputs import HISTORIES, OF_SOLES, frozen_for
-from ..taylor import ORDER
+from ..runge_kutta import LEFT_OUT_BY_RK4
+from ..taylor import LEFT_OUT_BY_TAYLOR, ORDER
 from .generated import Tree, gamma_of
 
 if TYPE_CHECKING:
     from ..symbolic import SymbolicModel
 
 __all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_jacobians"]
-
-
-# where steps find their own length
-_MOST_STEPS = 5000
 
 
 def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:
@@ -77,7 +73,7 @@ def _ends(collision: SymbolicModel) -> list[float]:
 def _blocks(collision: SymbolicModel, fraction: float) -> int:
     """Steps for a fraction of the horizon, in whole blocks; or the most, where they find their own length."""
     if collision.stepping == "implicit":
-        return _MOST_STEPS
+        return MOST_STEPS
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 
@@ -90,8 +86,7 @@ def _steps(collision: SymbolicModel) -> list[int]:
 def _columns(collision: SymbolicModel, every: int) -> list[int]:
     if collision.stepping == "implicit":
         shares = [b - a for a, b in pairwise(_ends(collision))]
-        spacing = every * collision.step_length
-        return [ceil(share * collision.horizon / spacing - 1e-9) + 1 for share in (*shares[:-1], 1.0)]
+        return [columns_of(collision, share, every) for share in (*shares[:-1], 1.0)]
     return [-(-count // every) + 1 for count in _steps(collision)]
 
 
@@ -140,6 +135,10 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),
         "KP_MATRIX": int(n > 0 and terms.stiffness and settings["kp"].ndim == 2),
         "PEAK": int(model.peak),
+        "STEP_ERROR": int(model.error),
+        "PULLS": int(collision.stepping == "events"),
+        "LEFT_OUT_BY_TAYLOR": repr(LEFT_OUT_BY_TAYLOR),
+        "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),
         "SECOND_INTEGRALS": int(model.second_integrals),
         "FREEZES": freezes,
         "WRENCHES": int(bool(frozen_for(outputs)) or freezes > 0),

@@ -38,6 +38,10 @@ _TREE = (
     + files(__package__).joinpath("angles.h").read_text(encoding="utf-8"),
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
+_NEEDS_COMPILER = (
+    "{}: derivatives of implicit steps need a C compiler that works: install gcc or clang, or name one in "
+    "the environment variable CC{}"
+)
 # with a direction a lane, without anything but sums and products: there only the time to compile it counts
 _LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
@@ -46,22 +50,34 @@ def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, ever
     """C code of the function that `collision_graph` gives, with the same inputs and outputs.
 
     Its numbers agree with the graph's to rounding, but for implicit steps, which the graph has not. It has no
-    derivatives. Where there is no compiler, the graph takes its place.
+    derivatives. Where there is no compiler, the graph takes its place; for implicit steps, one that has them.
     """
     code = _code(collision, "collision", outputs, every)
     return NativeCode(
-        name="collision", code=code, graph=lambda: collision_graph(collision, outputs, every=every)
+        name="collision",
+        code=code,
+        graph=lambda: collision_graph(collision, outputs, every=every, as_compiled=True),
     )
 
 
 def native_gradient(collision: SymbolicModel, output: str) -> Any:
-    """C code of the function that `gradient_graph` gives; with several freezes, that graph itself."""
+    """C code of the function that `gradient_graph` gives; with several freezes, that graph itself.
+
+    Where there is no compiler, the graph takes its place, but not that of implicit steps: its own are
+    Taylor's, which a stiff contact or servo spoils without a word.
+    """
     if collision.n_freezes:
         return gradient_graph(collision, output)
+
+    def graph() -> Any:
+        if collision.stepping == "implicit":
+            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'events'"))
+        return gradient_graph(collision, output)
+
     return NativeCode(
         name="collision_gradient",
         code=_code(collision, "collision_gradient", (output,), 1),
-        graph=lambda: gradient_graph(collision, output),
+        graph=graph,
     )
 
 
@@ -69,7 +85,7 @@ def native_jacobian(collision: SymbolicModel, outputs: tuple[str, ...], *, every
     """C code of what `SymbolicModel.jacobian_function` gives, for implicit steps and one freeze."""
 
     def none() -> Any:
-        raise InputError("jacobian_function: the C compiler failed, and nothing else computes it")
+        raise InputError(_NEEDS_COMPILER.format("jacobian_function", ""))
 
     return NativeCode(
         name="collision_jacobian", code=_code(collision, "collision_jacobian", outputs, every), graph=none

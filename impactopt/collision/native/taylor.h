@@ -17,6 +17,19 @@ INLINE double newton(const double *jet, int size, double t) {
   return t - value / (slope == 0.0 ? 1.0 : slope);
 }
 
+/* where within a step the force is largest; at the begin, where that is at an end: the next step begins there */
+INLINE double top_of(const double *forces, double h) {
+  const double rise = forces[1], fall = value_at(forces + 1, ORDER, h);
+  if (!(rise > 0.0 && fall < 0.0)) return 0.0;
+  double t = h * rise / (rise - fall);
+  FOR(k, 3) {
+    t = newton(forces + 1, ORDER, t);
+    t = t < 0.0 ? 0.0 : t;
+    t = t > h ? h : t;
+  }
+  return t;
+}
+
 typedef struct {
   double first;
   int found;
@@ -198,7 +211,11 @@ INLINE void move(State *y, const Jets *j, double h) {
   FOR(i, NZ) y->target[i] = value_at(j->target + i * SIZE, SIZE, h);
   y->time += h;
 #if PEAK
-  y->peak = y->peak < j->forces[0] ? j->forces[0] : y->peak;
+  const double most = value_at(j->forces, SIZE, top_of(j->forces, h));
+  y->peak = y->peak < most ? most : y->peak;
+#endif
+#if STEP_ERROR
+  y->left_out += LEFT_OUT_BY_TAYLOR * fabs(j->forces[ORDER]) * pow(h, SIZE);
 #endif
 }
 

@@ -85,7 +85,12 @@ static void step_back(const Data *d, const State *y, int moves, State *y_, Back 
     if (k) h_ += y_->target[i] * j.target[i * SIZE + k] * power[k - 1];
   }
 #if PEAK
-  if (y->peak < j.forces[0]) forces_[0] += y_->peak, y_->peak = 0.0;
+  const double top = top_of(j.forces, h); /* it stays where it is: there the force has no slope */
+  if (y->peak < value_at(j.forces, SIZE, top)) {
+    double by = y_->peak;
+    FOR(k, SIZE) forces_[k] += by, by *= top / (k + 1);
+    y_->peak = 0.0;
+  }
 #endif
 
   /* from the length back to the event, as Newton's last iteration has it */

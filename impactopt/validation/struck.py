@@ -28,7 +28,8 @@ class Push:
     """What a contact has come to within one step of an engine.
 
     force [N]: mean over the step, and over its first half (half); peak [N]; state, travel [m]: of the target
-    at the end; depth [m]: of the striking point in it, then; since [s]: up to when in the step there was no force.
+    at the end; depth [m]: of the striking point in it, then; since [s]: up to when in the step there was no
+    force.
     """
 
     force: float

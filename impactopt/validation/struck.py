@@ -28,7 +28,8 @@ class Push:
     """What a contact has come to within one step of an engine.
 
     force [N]: mean over the step, and over its first half (half); peak [N]; state, travel [m]: of the target
-    at the end; depth [m]: of the striking point in it, then; since [s]: when in the step there was a force.
+    at the end; depth [m]: of the striking point in it, then; since [s]: up to when in the step there was no
+    force.
     """
 
     force: float
@@ -118,7 +119,7 @@ class Struck:
             state=np.array(end[3:]),
             travel=travel + float(end[2]),
             depth=float(end[0]),
-            since=float(found.t[np.argmax(values > 0)]),
+            since=float(found.t[max(int(np.argmax(values > 0)) - 1, 0)]),
         )
 
     def rates(self, state: Array, force: float) -> Array:

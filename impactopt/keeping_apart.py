@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +51,6 @@ class Margins:
             problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp)
         )
         self._least: dict[Pair, float] = {}
-        self._reach: dict[tuple[int, Pair], float] = {}
 
     def term(self, pair: Pair) -> SelfCollision | KeepOut:
         """The one that asks for it."""
@@ -67,12 +67,16 @@ class Margins:
         """Radius and margin [m] of a sphere of a link: less where it would be too near at the start, as
         spheres and planes are about bodies that are nearer to each other than their hulls.
         """
-        if (sphere, pair) not in self._reach:
-            near = self.bodies.near(self._start, FAR, only={pair})
-            gap = float(near.gap[near.sphere == sphere].min(initial=FAR))
-            radius = float(self.bodies.links.radius[sphere])
-            self._reach[sphere, pair] = radius + min(self.of(pair), OF_START * gap if gap > 0 else gap - SLIP)
-        return self._reach[sphere, pair]
+        gap = self._gaps.get((sphere, pair), FAR)
+        margin = min(self.of(pair), OF_START * gap if gap > 0 else gap - SLIP)
+        return float(self.bodies.links.radius[sphere]) + margin
+
+    @cached_property
+    def _gaps(self) -> dict[tuple[int, Pair], float]:
+        """[m] at the start, by spheres and planes."""
+        bodies, near = self.bodies, self.bodies.near(self._start, FAR)
+        of_all = zip(near.sphere, near.joint, near.other, near.gap, strict=True)
+        return {(int(s), bodies.known(int(j), int(o))): float(gap) for s, j, o, gap in of_all}
 
     def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
         """A row that knows what it keeps apart exactly as it is at instant k, where the two are nearest.
@@ -152,9 +156,8 @@ def _rows_of(margins: Margins, spots: Spots, near: Near) -> Rows:
         if -DEEP < gap < EXACT:
             out[ApartRow(spots.names[k], *pair)] = margins.held(spots.at, int(k), pair)
         else:
-            links = bodies.links
-            reach = float(links.radius[sphere]) + margins.of(pair)
-            held = Held(tuple(links.centre[sphere].tolist()), reach, None, float(spots.at.travel[k]))
+            centre = tuple(bodies.links.centre[sphere].tolist())
+            held = Held(centre, margins.reach(int(sphere), pair), None, float(spots.at.travel[k]))
             out[ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))] = held
     return out
 

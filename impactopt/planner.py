@@ -40,6 +40,7 @@ _EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 _LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
 _BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
 _BARRIER_DEEP = 1e-3  # and breaks by far
+_STUCK = (Status.INFEASIBLE, Status.FAILED)
 _ROUNDS, _NODE_ROUNDS, _DEEP_ROUNDS = 12, 3, 7  # at most: of all, with more nodes, from the start again
 
 
@@ -195,9 +196,30 @@ class _Refining:
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
-        t, result = self.first(t, start)
-        t, result, _ = self.rounds(t, result, start.x if isinstance(start, SolverResult) else start)
+        x0 = start.x if isinstance(start, SolverResult) else start
+        free = t
+        t, result = self.first(free, start)
+        if result.status in _STUCK and t.apart_rows and self.budget.left != 0:
+            return self._led_out(free, t, result, x0)
+        t, result, _ = self.rounds(t, result, x0)
         return t, self._judged(t, result)
+
+    def _led_out(
+        self, free: Transcription, t: Transcription, stuck: SolverResult, x0: Array
+    ) -> tuple[Transcription, SolverResult]:
+        """What comes of a start that leads nowhere with the first rows between bodies of a program ``t``.
+
+        That is where a solver stopped, not that there is no motion: the rows know the bodies as they are at
+        the start. So the motion without them is led out of what it is in; where that fails too, the rows say
+        what is in the way.
+        """
+        if self.report is not None:
+            self.report("no motion was found from there with rows between bodies: first without them")
+        last, result, _ = self.rounds(free, self.budget.run(free.program, x0), x0)
+        result = self._judged(last, result)
+        if result.status.usable:
+            return last, _one_after_the_other(stuck, result)
+        return t, _one_after_the_other(result, stuck)
 
     def rounds(
         self, t: Transcription, result: SolverResult, x0: Array

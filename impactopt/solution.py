@@ -112,8 +112,10 @@ class Solution(Solved):
         """What the prices on motion, sole wrenches and a rest away from the start take of the objective [%].
 
         They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
-        ``wrench_price`` and ``return_price``.
+        ``wrench_price`` and ``return_price``.  nan where the objectives are worth nothing, or not known.
         """
+        if any(o.name not in self.objectives for o in self.problem.objectives):
+            return np.nan
         worth = sum(
             (-o.weight if o.cost else o.weight) * self.objectives[o.name] for o in self.problem.objectives
         )

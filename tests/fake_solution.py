@@ -11,6 +11,7 @@ from small_robots import biped
 
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.motion import CubicSpline
+from impactopt.objectives import Impulse
 from impactopt.plan import Plan, PlannedCollision
 from impactopt.problem import ImpactProblem, Phase
 from impactopt.program import IterationRecord, SolverResult, Status, Violation
@@ -184,5 +185,6 @@ def still_solution(
         build_seconds=0.2,
         solve_seconds=0.3,
         violations=violations,
+        objectives={o.name: IMPULSE for o in problem.objectives if isinstance(o, Impulse)},
         attempts=attempts,
     )

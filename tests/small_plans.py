@@ -29,11 +29,14 @@ from impactopt.problem import ImpactProblem, Phase
 from impactopt.program import SolverResult
 from impactopt.stance import FixedBase
 from impactopt.support import support_polygon
+from impactopt.terms import KeepOut, SelfCollision, Term
 from impactopt.validation import Scene, Simulation, scene_of, simulate_pinocchio
 
 Array = NDArray[np.float64]
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
 OPTIONS: dict[str, Any] = {"tol": 1e-4}  # of IPOPT, on the biped
+# for tests of something else, where a robot's boxes are in the way or cost time
+BODILESS: tuple[Term, ...] = (SelfCollision(enabled=False), KeepOut(enabled=False))
 
 
 def biped_problem() -> ImpactProblem:

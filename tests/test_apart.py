@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 from derivative_checks import check_derivatives
 from numpy.typing import NDArray
-from small_plans import changed
+from small_plans import BODILESS, changed
 from small_robots import arm, biped, table
 
 from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
@@ -271,21 +271,36 @@ def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: 
         assert margins.of((j, -1 - w)) <= KeepOut().margin
 
 
-def test_only_who_asks_is_kept_apart(arm_transcription: Transcription) -> None:
-    x = first_iterate(arm_transcription)
-    free = (SelfCollision(enabled=False), KeepOut(enabled=False))
+def test_rows_of_spheres_are_met_at_the_start(biped_transcription: Transcription) -> None:
+    """Its back stands 2 mm before a wall, and the spheres of the trunk stick out by centimetres."""
+    free = biped_transcription.problem
+    root = free.robot.model.getJointId("root")
+    at = Places.of(free.robot, free.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    back = at.translation[0, root] + at.rotation[0, root] @ (-0.092 - 0.05, -0.01, 0.25)
+    wall = Obstacle(name="wall", size=(0.1, 1.0, 0.1), position=tuple(back))
+    t = changed(biped_transcription, obstacles=(wall,))
+    margins, pair = margins_of(t), (root, -1 - [body.name for body in t.problem.world].index("wall"))
+    assert 0 < margins.bodies.exact(at, 0, pair) < 3e-3
+    spheres = {r: h for r, h in rows_near(t, first_iterate(t), margins).items() if h.facing is None}
+    assert any(row[1:3] == pair for row in spheres)
+    for row, held in spheres.items():
+        assert value_of(margins.bodies, at, 0, row, held) > 0, row
+
+
+def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transcription) -> None:
+    x = first_iterate(biped_transcription)
     for terms, own, world in (
-        ((), False, False),
-        (APART[:1], True, False),
-        (APART[1:], False, True),
+        ((), True, True),
         (APART, True, True),
-        (free, False, False),
+        (BODILESS[:1], False, True),
+        (BODILESS[1:], True, False),
+        (BODILESS, False, False),
     ):
-        problem = dataclasses.replace(arm_transcription.problem, terms=terms)
+        problem = dataclasses.replace(biped_transcription.problem, terms=terms)
         assert problem.keeps_apart == (own or world)
-        rows = rows_near(arm_transcription, x, Margins(problem), 1.0)
+        rows = rows_near(biped_transcription, x, Margins(problem), 1.0)
         assert any(row.other < 0 for row in rows) == world
-        assert own or not any(row.other >= 0 for row in rows)
+        assert any(row.other >= 0 for row in rows) == own
 
 
 # ---- plans
@@ -321,8 +336,7 @@ BAR = Obstacle(name="bar", start=(0.6, -0.2, 1.04), end=(0.6, 0.2, 1.04), radius
 
 @pytest.fixture(scope="module")
 def free() -> Solution:
-    problem = load_problem("arm_planar")
-    return solve(dataclasses.replace(problem, terms=(*problem.terms, *APART)))
+    return solve(load_problem("arm_planar"))
 
 
 @pytest.fixture(scope="module")
@@ -337,8 +351,7 @@ def test_a_plan_goes_around_what_is_in_its_way(free: Solution, barred: Solution)
     assert passing(barred.problem, free.plan) < -0.02
     assert passing(barred.problem, barred.plan) > 0
     assert barred.apart and barred.problem.hash != free.problem.hash
-    terms = tuple(term for term in barred.problem.terms if term not in APART)
-    ignoring = solve(dataclasses.replace(barred.problem, terms=terms))
+    ignoring = solve(dataclasses.replace(barred.problem, terms=(*barred.problem.terms, *BODILESS)))
     assert ignoring.status is Status.SOLVED
     assert not ignoring.apart
     assert passing(barred.problem, ignoring.plan) < -0.02

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
-from small_plans import Planned, changed
+from small_plans import BODILESS, Planned, changed
 
 from impactopt import between, planner
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
@@ -37,6 +37,7 @@ from impactopt.plan import Plan
 from impactopt.problem import Phase
 from impactopt.program import Status
 from impactopt.scenario import Scenario
+from impactopt.shapes import Obstacle, TargetBody
 from impactopt.sqp import solve_sqp
 from impactopt.terms import ContactWrenchCone, Term, TorqueLimit
 from impactopt.validation.result import distance_inside
@@ -251,7 +252,7 @@ def coarse(arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch) ->
         arm_transcription.problem,
         swing=Phase(duration=0.4, intervals=6),
         follow=Phase(duration=0.35, intervals=6),
-        terms=(TorqueLimit(fraction=0.15, collision=0.15),),
+        terms=(TorqueLimit(fraction=0.15, collision=0.15), *BODILESS),
     )
 
 
@@ -286,6 +287,37 @@ def test_nodes_are_added_where_effort_counts(
     solution = planner.solve(dataclasses.replace(coarse, objectives=objectives))
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert len(solution.attempts) > 1 and solution.attempts[-1].kept
+
+
+def test_nodes_and_rows_between_bodies_are_added_together(coarse: Any) -> None:
+    """In one attempt, as a motion whose bodies are in each other is no answer yet."""
+    post = Obstacle(name="post", start=(-0.1, -0.1, 0.6), end=(-0.1, -0.1, 0.9), radius=0.03)
+    none = TargetBody(shape="none")  # before it the arm is nowhere over its limits
+    near = dataclasses.replace(coarse, terms=coarse.terms[:1], body=none, obstacles=(post,))
+    solution = planner.solve(near)
+    assert solution.status is Status.SOLVED and solution.nodes.total > 0 and solution.apart
+    assert [attempt.kept for attempt in solution.attempts] == [True]
+
+
+def test_a_start_that_leads_nowhere_is_tried_without_the_bodies_first(
+    coarse: Any, arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the rows that its start needs, the solver stops where it cannot meet them; a clean motion is there
+    all the same.
+    """
+    objectives = (Impulse(), Effort(weight=0.1))
+    functions = changed(arm_transcription, objectives=objectives).functions
+    monkeypatch.setattr(planner, "block_functions", lambda *_: functions)
+    told: list[str] = []
+    problem = dataclasses.replace(coarse, objectives=objectives, terms=coarse.terms[:1])
+    solution = planner.solve(problem, report=told.append)
+    assert solution.status is Status.SOLVED and solution.clearance()["contacts_besides"] == []
+    assert any("first without them" in line for line in told)
+    assert solution.result.iterations == solution.result.history[-1].iteration
+    # what no way leads out of says what is in the way
+    post = Obstacle(name="post", size=(0.1, 0.1, 0.1), position=tuple(problem.point))
+    barred = planner.solve(dataclasses.replace(problem, obstacles=(post,)))
+    assert barred.status is Status.INFEASIBLE and "post" in barred.result.message
 
 
 def test_a_solution_that_keeps_its_limits_is_the_plain_one(coarse: Any) -> None:

@@ -587,12 +587,12 @@ def test_a_start_in_something_is_refused() -> None:
     pin.forwardKinematics(model, data, problem.start_posture)
     elbow = tuple(data.oMi[3].translation.tolist())
     post = Obstacle(name="post", start=elbow, radius=0.05)
-    inside = dataclasses.replace(problem, obstacles=(post,), terms=(KeepOut(),))
+    inside = dataclasses.replace(problem, obstacles=(post,))
     with pytest.raises(InputError, match=r"at the start the link '\w+' is in the body 'post'"):
         _ = inside.bodies
-    free = dataclasses.replace(inside, terms=())
-    assert len(free.bodies.world) == len(inside.obstacles) + 3, "who does not ask is not told"
-    large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)), terms=(KeepOut(),))
+    free = dataclasses.replace(inside, terms=(KeepOut(enabled=False),))
+    assert len(free.bodies.world) == len(inside.obstacles) + 3, "who switches it off is not told"
+    large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)))
     moved = dataclasses.replace(large, point=np.array(problem.point) - np.array([0.0, 0.4, 0.0]))
     with pytest.raises(InputError, match="is in the body 'target"):
         _ = moved.bodies

@@ -10,15 +10,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import pytest
+from small_plans import BODILESS
 
-from impactopt import KeepOut, SelfCollision, Solution, load_problem, solve
-
-
-@pytest.fixture(scope="module")
-def punch() -> Solution:
-    problem = load_problem("punch")
-    return solve(dataclasses.replace(problem, terms=(*problem.terms, SelfCollision(), KeepOut())))
+from impactopt import Solution, solve
 
 
 def meshes(solution: Solution) -> tuple[Any, Any]:
@@ -56,10 +50,10 @@ def test_the_summary_says_so(punch: Solution) -> None:
     assert np.isfinite(said["clearance_mm"]) and len(punch.apart) > 0
 
 
-def test_what_is_not_asked_for_is_told() -> None:
+def test_what_is_switched_off_is_told(punch: Solution) -> None:
     """The same punch without these terms: another's count of the pairs that pass through each other was
     29.
     """
-    said = solve(load_problem("punch")).clearance()
+    said = solve(dataclasses.replace(punch.problem, terms=(*punch.problem.terms, *BODILESS))).clearance()
     assert said["clearance_mm"] < -50
     assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 20

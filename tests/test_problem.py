@@ -25,8 +25,10 @@ from impactopt.terms import (
     Balance,
     ContactWrenchCone,
     Incidence,
+    KeepOut,
     LegExtension,
     PositionLimit,
+    SelfCollision,
     Term,
     TorqueLimit,
     VelocityLimit,
@@ -306,7 +308,7 @@ def test_terms_of_a_problem_come_before_the_defaults(robot: Robot) -> None:
 
 def test_every_term_has_a_name_and_a_unit() -> None:
     kinds = {TorqueLimit, VelocityLimit, PositionLimit, ContactWrenchCone, Balance, Incidence, LegExtension}
-    assert {type(t) for t in DEFAULT_TERMS} == kinds
+    assert {type(t) for t in DEFAULT_TERMS} == kinds | {SelfCollision, KeepOut}
     assert len({t.name for t in DEFAULT_TERMS}) == len(DEFAULT_TERMS)
     assert all(t.name and t.unit for t in DEFAULT_TERMS)
 

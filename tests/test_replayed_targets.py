@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from small_motions import reference, scene
-from small_plans import arm_problem, transcribed
+from small_plans import BODILESS, arm_problem, transcribed
 from small_robots import arm, slider
 
 from impactopt.contact import (
@@ -243,14 +243,16 @@ def test_a_nail_that_is_not_there_stays_as_it_was() -> None:
     ids=lambda x: type(x).__name__ if isinstance(x, Target) else "",
 )
 def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[str, Any]) -> None:
-    """An arm: impulse, force, duration, depth.
+    """An arm: impulse, force, duration, depth. Its elbow goes where the target's body is.
 
     MuJoCo's steps are of first order, and a contact that ends with hardly any force ends a little early: by
     0.42, 0.32, 0.22 ms with steps of 100, 50, 25 us.
     """
     law = KelvinVoigt(stiffness=5e4, damping=100.0)
     robot = arm(kp=300.0, kd=10.0)
-    problem = dataclasses.replace(arm_problem(), robot=robot, law=law, target=target, **changes)
+    problem = dataclasses.replace(
+        arm_problem(), robot=robot, law=law, target=target, terms=BODILESS, **changes
+    )
     transcription = transcribed(problem)
     result = solve_ipopt(transcription.program, first_iterate(transcription))
     assert result.status is Status.SOLVED, result.message

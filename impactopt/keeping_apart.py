@@ -182,10 +182,13 @@ def _rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
 
 
 class Violated(NamedTuple):
-    """Rows that a solution needs beside its own, and how deep [m] bodies are in each other without them."""
+    """Rows that a solution needs beside its own, how deep [m] bodies are in each other without them, and
+    which pairs of them are deeper than `DEEP`.
+    """
 
     rows: Rows
     depth: float
+    deep: frozenset[Pair] = frozenset()
 
 
 def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
@@ -227,11 +230,11 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         found_here = margins.held_around(spots.at, spot, pair, min(more, DEEP))
         for k, held in enumerate(found_here if known else found_here[:1], len(known)):
             rows[ApartRow(spots.names[spot], *pair, k)] = held
-    if deepest > DEEP:
-        pairs = {pair for (_, pair), apart in found.items() if apart < -DEEP}
-        own = bodies.near(spots.at, -DEEP, BETWEEN, pairs).least()
+    deep = frozenset(pair for (_, pair), apart in found.items() if apart < -DEEP)
+    if deep:
+        own = bodies.near(spots.at, -DEEP, BETWEEN, set(deep)).least()
         rows = {**_rows_all_along(margins, spots, own), **rows}
-    return Violated({key: held for key, held in rows.items() if key not in t.apart_rows}, deepest)
+    return Violated({key: held for key, held in rows.items() if key not in t.apart_rows}, deepest, deep)
 
 
 def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:

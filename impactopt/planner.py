@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.bodies.robot_bodies import Pair
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.keeping_apart import DEEP, Margins, Violated, rows_near, rows_to_add, same_bodies
 from impactopt.nlp.apart import ApartRow, Held
@@ -176,7 +177,7 @@ class _Refining:
     ) -> None:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
-        self._out = _LOST  # [m] as deep as bodies may be in each other for a way out from there
+        self._led_out: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
         """Of a program's contact at its solution; the last one that was asked for is known."""
@@ -308,10 +309,10 @@ class _Refining:
         program = t.with_apart({**t.apart_rows, **violated.rows})
         words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
         round_of = partial(_Round, program=program, name="rows between bodies")
-        lost, self._out = violated.depth > self._out, violated.depth / 2
-        if lost:
-            self._out = _LOST
+        if violated.depth > _LOST or violated.deep & self._led_out:
+            self._led_out = frozenset()
             return round_of(starts=(x0, old.x), why=f"{words}: from the start again, with rows between them")
+        self._led_out |= violated.deep
         x, y, z = carried_over(program, t, old.x, old.multipliers, old.bound_multipliers)
         warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
         why = f"{words}: on with rows between them"

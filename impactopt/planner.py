@@ -177,7 +177,8 @@ class _Refining:
     ) -> None:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
-        self._led_out: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
+        self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
+        self._refined = 0  # rounds with more nodes or elements
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
         """Of a program's contact at its solution; the last one that was asked for is known."""
@@ -229,6 +230,7 @@ class _Refining:
         round.
         """
         found: list[tuple[Transcription, str, SolverResult]] = []
+        self._tried, self._refined = frozenset(), 0
         for again in range(_ROUNDS if self.margins is not None else _NODE_ROUNDS):
             if not result.status.usable or self.budget.left == 0:
                 break
@@ -271,7 +273,7 @@ class _Refining:
             violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
         if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
             return self._apart_again(t, old, x0, violated)
-        if again < _NODE_ROUNDS:
+        if self._refined < _NODE_ROUNDS:
             with contextlib.suppress(InputError):
                 nodes = nodes_to_add(t.decode(old.x), t.nodes)
             error = self.error(t, old.x)
@@ -281,6 +283,7 @@ class _Refining:
         rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
         finer = t
         if nodes != t.nodes or elements is not None:
+            self._refined += 1
             finer_elements = elements or (t.elements if t.guarded else ())
             functions = block_functions(t.problem, t.coordinates, self.report, finer_elements)
             finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements)
@@ -292,7 +295,7 @@ class _Refining:
             x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
             starts = (replace(old, x=x, multipliers=y, bound_multipliers=z),)
         if violated is not None and finer.layout.n == len(old.x):
-            starts = (*starts, old.x)
+            starts = (*starts, old.x, x0)
         name = _more(nodes, elements, len(rows) - len(t.apart_rows))
         return _Round(
             program=finer,
@@ -309,10 +312,10 @@ class _Refining:
         program = t.with_apart({**t.apart_rows, **violated.rows})
         words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
         round_of = partial(_Round, program=program, name="rows between bodies")
-        if violated.depth > _LOST or violated.deep & self._led_out:
-            self._led_out = frozenset()
+        if violated.depth > _LOST or violated.deep & self._tried:
+            self._tried = frozenset()
             return round_of(starts=(x0, old.x), why=f"{words}: from the start again, with rows between them")
-        self._led_out |= violated.deep
+        self._tried |= violated.deep
         x, y, z = carried_over(program, t, old.x, old.multipliers, old.bound_multipliers)
         warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
         why = f"{words}: on with rows between them"

@@ -49,12 +49,16 @@ HELD = (
     ("ZMP mm", "zmp_margin_mm", 1),
     ("torque", "torque_ratio", 2),
     ("force N", "min_normal_force_N", 0),
+    ("apart mm", "clearance_mm", 1),
+    ("touches", "touches", 0),
 )
 FREE = (
     ("problem", "problem", 0),
     ("error %", "replay_impulse_error_pct", 2),
     ("slip mm", "replay_slip_mm", 1),
     ("lift mm", "replay_lift_collision_mm", 2),
+    ("apart mm", "replay_clearance_mm", 1),
+    ("touches", "replay_touches", 0),
     ("stands", "standing", 0),
 )
 
@@ -97,15 +101,21 @@ def _variant(name: str, changes: dict[str, Any], say: Say) -> Solution:
 
 
 def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
-    """What one problem gives; an error is its status, and ends what can be said of it."""
+    """What one problem gives; an error is its status, and ends what can be said of it.
+
+    clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
+    """
     out: dict[str, Any] = {"problem": name}
     try:
         solution = plan()
         summary = solution.outcome()
         out |= {key: summary[key] for key in ("status", "iterations", "solve_seconds")}
         out["impulse_planned_Ns"] = solution.impulse
-        held = solution.summary(solution.validate())["simulated"]
+        told = solution.summary(solution.validate())
+        held = told["simulated"]
         out |= {
+            "clearance_mm": min(told["clearance_mm"], held["clearance_mm"]),
+            "touches": len(told["contacts_besides"]) + len(held["contacts_besides"]),
             "impulse_error_pct": held["impulse_error_pct"],
             "zmp_margin_m": min(held.get("zmp_margin_m", {}).values(), default=None),
             "torque_ratio": max(held["torque_ratio"].values()),
@@ -125,6 +135,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         "replay_impulse_error_pct": free["impulse_error_pct"],
         "replay_slip_mm": free.get("sole_slip_mm"),
         "replay_lift_collision_mm": free.get("sole_lift_collision_mm"),
+        "replay_clearance_mm": free["clearance_mm"],
+        "replay_touches": len(free["contacts_besides"] or ()),
         "standing": free["standing"],
         "reason": free["reason"],
     }

@@ -26,6 +26,7 @@ from impactopt.problem import ImpactProblem
 from impactopt.program import Callback, SolverResult, Status
 from impactopt.solution import Solution
 from impactopt.starts import (
+    VIOLATED,
     Budget,
     Starts,
     attempt_of,
@@ -34,6 +35,7 @@ from impactopt.starts import (
     solve_from,
     violations_of,
 )
+from impactopt.strike import clear_strike
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
@@ -103,6 +105,8 @@ def solve(
     functions = block_functions(problem, problem.coordinates, report, elements)
     budget = budget.started()
     t = Transcription(problem, problem.coordinates, functions, nodes, elements)
+    if not isinstance(given, str):
+        check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
@@ -110,7 +114,8 @@ def solve(
     # limbs that are in each other say nothing of what a start is worth: each is led to its end before they
     # compare
     each = refining.solve if margins is not None and between else refining.first
-    t, fields = solve_from(t, _starts(t, given, starts, seed, budget), budget, began, each)
+    of_start = _starts(t, given, starts, seed, partial(clear_strike, budget, margins))
+    t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and between and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
     result = fields["result"]
@@ -261,7 +266,9 @@ class _Refining:
                     f"Bodies are {1e3 * left.depth:.1f} mm in each other, and no solution was found where "
                     f"they are not: {'; '.join(names[:3])}."
                 )
-                return replace(result, status=Status.FAILED, message=message)
+                # where nothing else is found it is still told, but goes before no start that is clean
+                worst = max(result.max_violation, left.depth, 2 * VIOLATED)
+                return replace(result, status=Status.FAILED, max_violation=worst, message=message)
         return result
 
     def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> _Round | None:
@@ -341,9 +348,13 @@ def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
 
 
 def _starts(
-    t: Transcription, start: str | Array | SolverResult, starts: int, seed: int, budget: Budget
+    t: Transcription,
+    start: str | Array | SolverResult,
+    starts: int,
+    seed: int,
+    hit: Callable[[StrikeTranscription, Array], tuple[StrikeTranscription, SolverResult]],
 ) -> Starts:
-    """Names of the starts, and what makes them."""
+    """Names of the starts, and what makes them; ``hit`` solves a strike."""
     if not isinstance(start, str):
         yield "given", lambda: start
         return
@@ -355,7 +366,7 @@ def _starts(
         def make(draw: dict[str, Any] = draw) -> Array:
             if strike is None:
                 return first_iterate(t, **draw)
-            hit = budget.run(strike.program, strike_iterate(strike, **draw))
-            return iterate_from_strike(t, strike, hit.x)
+            found, result = hit(strike, strike_iterate(strike, **draw))
+            return iterate_from_strike(t, found, result.x)
 
         yield f"{start} {k + 1}", make

@@ -90,21 +90,21 @@ def optimize_strike(
     check_starts(starts, seed, given=start is not None)
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
-    given = None if start is None else check_array("start", start, (None,))
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report)
     budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions)
+    given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     t, fields = solve_from(
-        t, _starts(t, given, starts, seed), budget, began, partial(_clear, budget, margins)
+        t, _starts(t, given, starts, seed), budget, began, partial(clear_strike, budget, margins)
     )
     return StrikeSolution(strike=t.decode(fields["result"].x), **fields)
 
 
-def _clear(
+def clear_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart: with rows between those that come near, more of them where they do

@@ -13,7 +13,7 @@ import pytest
 from derivative_checks import check_derivatives
 from fake_solution import PROBLEM_FILE
 from numpy.typing import NDArray
-from small_plans import Planned, changed
+from small_plans import BODILESS, Planned, changed
 from typer.testing import CliRunner
 
 from impactopt.cli import app
@@ -248,7 +248,8 @@ def test_a_motions_state_at_contact_is_a_strike_and_the_strike_brings_more(
     assert off <= 10 * robot_plan.result.max_violation + 1e-5
     assert strike.impulse(x) == pytest.approx(robot_plan.plan.impulse)
     assert program.objective(x) <= robot_plan.result.objective + 1e-4, "its prices are no higher"
-    found = optimized(robot_plan.transcription, monkeypatch, start=x)
+    # that motion has no rows between bodies
+    found = optimized(changed(robot_plan.transcription, terms=BODILESS), monkeypatch, start=x)
     assert found.impulse >= robot_plan.plan.impulse - 1e-3
     assert found.result.objective <= robot_plan.result.objective + 1e-3
     assert [attempt.start for attempt in found.attempts] == ["given"]
@@ -378,15 +379,28 @@ def test_a_motion_is_solved_from_several_starts(
     assert found.status is Status.SOLVED
     assert [attempt.start for attempt in found.attempts] == [f"{start} 1", f"{start} 2"]
     assert found.result.objective == min(a.objective for a in found.attempts if a.status.usable)
+    assert found.clearance()["contacts_besides"] == []
     told = found.summary()["starts"]
     assert [a["kept"] for a in told].count(True) == 1
     json.dumps(told)
 
 
+def test_a_start_whose_bodies_are_in_each_other_goes_before_no_clean_one(
+    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of these three hits harder, with the elbow in the target."""
+    t = arm_transcription
+    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: t.functions)
+    problem = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
+    found = solve(problem, starts=3)
+    assert found.status is Status.SOLVED and found.clearance()["contacts_besides"] == []
+    assert any(not a.status.usable and a.objective < found.result.objective for a in found.attempts)
+
+
 def test_a_solution_starts_its_neighbour(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    t = arm_transcription
+    t = changed(arm_transcription, terms=BODILESS)  # whose rows know them as they were at the first one's
     monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: t.functions)
     first = solve(t.problem)
     assert solve(t.problem, start=first).result.iterations == 0
@@ -396,11 +410,16 @@ def test_a_solution_starts_its_neighbour(
     assert found.result.objective <= plain.result.objective + 1e-4 * abs(plain.result.objective)
 
 
-def test_a_start_that_is_none_is_refused(arm_transcription: Transcription) -> None:
+def test_a_start_that_is_none_is_refused(
+    arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match="did you mean 'strike'"):
         solve(arm_transcription.problem, start="strik")
     with pytest.raises(InputError, match="leave one of the two out"):
         solve(arm_transcription.problem, start=np.zeros(3), starts=2)
+    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: arm_transcription.functions)
+    with pytest.raises(InputError, match="start: expected shape"):
+        solve(arm_transcription.problem, start=np.zeros(3))
 
 
 # ---- the command

@@ -169,19 +169,21 @@ def judge(robot: Robot, case: Drawn, freezes: Sequence[int] = FREEZES) -> dict[s
     """True and said errors [%] by number of freezes; None of a contact that does not end, or that full
     dynamics cannot follow."""
     said: dict[str, Any] = {}
+    outputs: tuple[str, ...] = ("impulse", "freeze_error", "duration")
     for n in freezes:
         found = _model(robot, case.kind, n).batch(
             case.q[None],
             case.v[None],
             case.torque,
-            outputs=("impulse", "freeze_error"),
+            outputs=outputs,
             threads=1,
             **case.settings,
         )
+        outputs = ("impulse", "freeze_error")
         if not np.isfinite(found["impulse"][0]):
             return None
         said[str(n)] = {name: x[0].item() for name, x in found.items()}
-    truth = _truth(robot, case)
+    truth = _truth(robot, case, said[str(freezes[0])]["duration"])
     if truth is None:
         return None
     impulse, duration = truth
@@ -196,9 +198,9 @@ def judge(robot: Robot, case: Drawn, freezes: Sequence[int] = FREEZES) -> dict[s
     return {"kind": case.kind, "duration_s": duration, "impulse_Ns": impulse, "freezes": errors}
 
 
-def _truth(robot: Robot, case: Drawn) -> tuple[float, float] | None:
-    """Impulse [N s] and duration [s]."""
-    step = _FIRST_STEP
+def _truth(robot: Robot, case: Drawn, lasts: float) -> tuple[float, float] | None:
+    """Impulse [N s] and duration [s] of a contact that lasts about so long [s]."""
+    step = min(_FIRST_STEP, max(lasts, 1e-6) / 20)
     for _ in range(_SHORTER):
         model = FullDynamics(**_options(robot, case.kind), step=step, form="pinocchio")
         options: dict[str, Any] = {"tolerance": _TOLERANCE, "require_separation": False, **case.settings}
@@ -252,7 +254,10 @@ def _job(_shared: None, job: tuple[str, str, int, int]) -> dict[str, Any] | None
     robot, rng = _robot(name), np.random.default_rng([seed, number, *map(ord, name)])
     for _ in range(_TRIES):
         case = draw(robot, kind, rng)
-        row = None if case is None else judge(robot, case)
+        try:
+            row = None if case is None else judge(robot, case)
+        except InputError:  # a step that is too long for the servos: refused, with its reason
+            continue
         if row is not None:
             return row
     return None

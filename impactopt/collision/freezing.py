@@ -27,7 +27,7 @@ _SAFETY = 2.0
 def more_often(freezes: int) -> int:
     """Freezes on the way of the collision that one is compared with: 4, 8, or twice as many.
 
-    Fewer are too like it: of 228 drawn collisions, those frozen at contact only were off by more than was
+    Fewer are too like it: of 204 drawn collisions, those frozen at contact only were off by more than was
     said in four beside two freezes, and in none beside four; those frozen twice in two beside four, and in
     none beside eight.
     """

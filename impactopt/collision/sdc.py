@@ -32,11 +32,11 @@ class SDC(SymbolicModel):
     kp, kd : servo stiffness [N m/rad] and damping [N m s/rad]: one number a joint (n), one for all, or
         matrices (n, n) (paper, eq. 10); None: the robot's.
     freezes : how often H, J and the bias are frozen anew on the way; 0: only at contact, as in the paper.
-        The error falls with 1/freezes^2; a few take some three times as long as none.
+        The error falls with 1/freezes^2; four take some five times as long as none.
     accuracy : relative, of the impulse. `collide` estimates what freezing costs by a collision that is frozen
         four times or more often, `Collision.freeze_error`, and says in `Collision.caution` where that is more
-        than this. It takes three to four times as long as the collision itself, and its function is compiled
-        once; None: not estimated. Of terms that are left out it knows nothing.
+        than this. It takes some six times as long as the impulse alone of one freeze, 1.4 times of four, and
+        a function more is compiled; None: not estimated. Of terms that are left out it knows nothing.
 
     Raises
     ------

@@ -288,7 +288,7 @@ class SymbolicModel(CollisionModel):
         q, v : (N, nq), (N, nv) at contact.
         torque : (N, n), or (n) for all [N m]; needed with terms.feedforward.
         outputs : names out of `impactopt.collision.OUTPUTS`; or "freeze_error", which is not computed unless
-            it is named: it takes three to four times as long as the impulse.
+            it is named: of one freeze it takes some six times as long as the impulse.
         every : keep every so many steps, and the last, of the histories.
         threads : cores to use; None: all.
         settings : other values of any of `settings`, for all, or with a first axis of N, one each.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,6 +56,10 @@ def collide(
             metavar="N", min=0, help=f"Of the sdc, on the way; left out: {OFTEN} of a result, else none."
         ),
     ] = None,
+    accuracy: Annotated[
+        float,
+        typer.Option(metavar="PCT", help="Of the impulse: freezing that may cost more of it is told."),
+    ] = 1.0,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -62,10 +67,11 @@ def collide(
 ) -> None:
     """Let the robot hit at a posture, or as a saved plan or strike does: the collision alone, no motion.
 
-    Impulse, peak force, duration, ZMP margin and torques. With a posture, the striking point moves along the
-    normal at --speed with the least kinetic energy, soles at rest, and the servo's reference keeps the joint
-    velocities. A result has a reference of its own, whose soles stay in place, and its numbers stand beside
-    the model's. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a limit, no
+    Impulse, peak force, duration, ZMP margin and torques; of the sdc also what freezing may have cost of the
+    impulse, and where that is more than --accuracy what to do. With a posture, the striking point moves along
+    the normal at --speed with the least kinetic energy, soles at rest, and the servo's reference keeps the
+    joint velocities. A result has a reference of its own, whose soles stay in place, and its numbers stand
+    beside the model's. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a limit, no
     separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
@@ -74,6 +80,8 @@ def collide(
         from impactopt.sweeps.single import collide_once, problem_of_result
 
         check_loudness(quiet, verbose)
+        if not 0 < accuracy < math.inf:
+            raise typer.BadParameter(f"{accuracy:g}; give a number > 0", param_hint="--accuracy")
         saved = what.is_dir()
         if not saved and speed is None:
             raise typer.BadParameter("missing; only a result has a speed of its own", param_hint="--speed")
@@ -89,7 +97,8 @@ def collide(
         at_contact |= {} if posture is None else {"posture": posture}
         with Progress(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; colliding (compiles for a minute the first time)")
-            found = collide_once(read, {**at_contact, **({} if speed is None else {"speed_m_s": speed})})
+            at_contact |= {} if speed is None else {"speed_m_s": speed}
+            found = collide_once(read, at_contact, accuracy=accuracy / 100)
         if as_json:
             typer.echo(json.dumps(found, indent=2))
         else:

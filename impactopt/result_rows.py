@@ -89,12 +89,14 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     """One collision, and what a saved result says of it; `found` as in `impactopt collide --json`."""
     sources = [found, *(found.get("saved") or {}).values()]
+    most_uncertain = -np.inf if found.get("caution") else np.inf
     rows = [
         number_row(label, [x.get(key) for x in sources], digits, scale=scale, least=least, most=most)
         for label, key, digits, scale, least, most in (
             ("speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
             ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
             ("impulse [N s]", "impulse_Ns", 3, 1.0, -np.inf, np.inf),
+            ("left uncertain by freezing [%]", "freeze_error_pct", 1, 1.0, -np.inf, most_uncertain),
             ("peak force [N]", "peak_force_N", 1, 1.0, -np.inf, np.inf),
             ("contact time [ms]", "contact_ms", 2, 1.0, -np.inf, np.inf),
             ("energy to the target [J]", "energy_J", 3, 1.0, -np.inf, np.inf),

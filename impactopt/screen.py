@@ -118,8 +118,10 @@ def collision_table(found: Mapping[str, Any]) -> Table:
     """One collision, beside what a saved result says of it; `found` as in `impactopt collide --json`."""
     model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
     table = Table(title=_plain(f"{found['problem']}: {model}"), title_justify="left")
-    if "believe" in found:
-        table.caption, table.caption_justify = _plain(f"{found['model']}: {found['believe']}"), "left"
+    words = [f"caution: {found['caution']}"] if found.get("caution") else []
+    words += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
+    if words:
+        table.caption, table.caption_justify = _plain("\n".join(words)), "left"
     table.add_column("")
     for name in ("collision", *(found.get("saved") or {})):
         table.add_column(name, justify="right")

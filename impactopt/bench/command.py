@@ -105,6 +105,20 @@ def fidelity(
     _run(["fidelity"], {"fidelity": {"workers": workers, "quick": few}}, as_json, out, quiet)
 
 
+@app.command()
+def freezes(
+    count: Annotated[int, typer.Option(min=1, help="Collisions that end, on each of three robots.")] = 10,
+    seed: Seed = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")] = 2,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """What freezing costs in drawn collisions, over contact time, and whether its estimate holds."""
+    options = {"count": count, "seed": seed, "workers": workers}
+    _run(["freezes"], {"freezes": options}, as_json, out, quiet)
+
+
 @app.command("virtual-base")
 def virtual_base(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
     """The paper's mass M_g under the soles against soles held exactly: its error, and rounding's."""
@@ -227,6 +241,7 @@ def run_all(
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
         "fidelity": {"workers": workers, "quick": True},
+        "freezes": drawn,
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},

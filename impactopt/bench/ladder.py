@@ -61,7 +61,7 @@ class Rung:
             return VirtualMass(**options)
         if self.model == "sdc-paper":
             return SDC.paper(**options)
-        return SDC(**options, freezes=self.freezes or 0)
+        return SDC(**options, freezes=self.freezes or 0, accuracy=None)
 
 
 LADDER = (

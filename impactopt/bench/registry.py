@@ -20,6 +20,7 @@ BENCHES = {
     "baselines": "baselines",
     "margins": "margins",
     "fidelity": "fidelity",
+    "freezes": "freezes",
     "virtual-base": "virtual_base",
     "collision": "collision",
     "scaling": "scaling",

@@ -84,7 +84,7 @@ class Rig:
             return VirtualMass(**options, method=self.method, step=self.step)
         friction = JointFriction(viscous=0.5, coulomb=1.0, transition=0.05) if self.friction else None
         options |= {"method": self.method, "step": self.step}
-        return SDC(**options, terms=Terms(friction=self.friction), friction=friction)
+        return SDC(**options, terms=Terms(friction=self.friction), friction=friction, accuracy=None)
 
 
 # steps of a fixed length for slow contacts, for fast and for the fastest

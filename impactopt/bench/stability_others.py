@@ -75,7 +75,7 @@ def freezes_of(counts: tuple[int, ...]) -> list[Found]:
     for count in counts:
         what = f"{count} freezes"
         try:
-            model = SDC(**common, freezes=count, horizon=0.2)
+            model = SDC(**common, freezes=count, horizon=0.2, accuracy=None)
             if count <= COMPILED:
                 impulse = model.collide(q, v, torque).impulse
             else:

@@ -45,6 +45,10 @@ class Collision:
     ground_wrench : (k, 6) [N, N m] of the ground on the robot, world axes, about the world's origin; None
         on a fixed base.
     zmp : (k, 2) [m] x and y of the zero-moment point on the ground z = 0; None on a fixed base.
+    freeze_error : relative, what freezing may have cost of the impulse, as an estimate from the same
+        collision frozen more often (see `SDC`): infinite where that does not end by the horizon; 0 where
+        nothing is frozen, nan where it is not estimated, as of a point mass.
+    caution : what to do where freeze_error is above the accuracy that the model was asked for; else "".
     """
 
     impulse: float
@@ -67,6 +71,8 @@ class Collision:
     hand_wrench: Array | None
     ground_wrench: Array | None
     zmp: Array | None
+    freeze_error: float = np.nan
+    caution: str = ""
 
     @classmethod
     def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
 from typing import Any
@@ -18,6 +18,7 @@ from .batch import Batch
 from .checks import check_course, check_finite, check_frozen
 from .describe import Description, describe
 from .exact import ExactCollision
+from .freezing import FREEZE_ERROR, freeze_error
 from .graph import (
     METHODS,
     collision_graph,
@@ -287,7 +288,8 @@ class SymbolicModel(CollisionModel):
         ----------
         q, v : (N, nq), (N, nv) at contact.
         torque : (N, n), or (n) for all [N m]; needed with terms.feedforward.
-        outputs : names out of `impactopt.collision.OUTPUTS`.
+        outputs : names out of `impactopt.collision.OUTPUTS`; or "freeze_error", which is not computed unless
+            it is named: of one freeze it takes some six times as long as the impulse.
         every : keep every so many steps, and the last, of the histories.
         threads : cores to use; None: all.
         settings : other values of any of `settings`, for all, or with a first axis of N, one each.
@@ -299,17 +301,23 @@ class SymbolicModel(CollisionModel):
         False also where there came out no number. With explicit steps also `step_error` (N), what they left
         out of each impulse, as an estimate: collisions that it is too large of (more than 1e-5 of "events",
         1e-2 of "rk4") have no numbers. That the step is stable for the servos is checked in the first
-        collision only.
+        collision only. `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 
         Raises
         ------
         InputError : wrong shapes, NaN, or numbers out of their range; a step that is unstable.
         """
-        self._check_outputs(outputs, every)
-        key = ("batch", *outputs, every)
+        own = tuple(name for name in outputs if name != FREEZE_ERROR)
+        if len(own) < len(outputs):
+            own = tuple(dict.fromkeys((*own, "impulse")))
+        self._check_outputs(own, every)
+        key = ("batch", *own, every)
         if key not in self._functions:
-            self._functions[key] = Batch(self, tuple(outputs), every=every)
+            self._functions[key] = Batch(self, own, every=every)
         found: dict[str, NDArray[np.float64]] = self._functions[key](q, v, torque, settings, threads=threads)
+        if FREEZE_ERROR in outputs:
+            error = self._freeze_error(found["impulse"], q, v, torque, settings, threads)
+            found[FREEZE_ERROR] = np.where(found["separated"], error, np.nan)
         return found
 
     def _compiled(self, name: str, what: tuple[Any, ...], build: Callable[[], Any]) -> Any:
@@ -390,7 +398,36 @@ class SymbolicModel(CollisionModel):
             result = self._by_steps(arguments, values)
         if require_separation:
             self.check_separation(result)
-        return result
+        if self._more_often is None or not result.separated:
+            return result
+        impulse, one = np.array([result.impulse]), arguments[2] if self.terms.feedforward else None
+        (error,) = self._freeze_error(impulse, q[None], v[None], one, values, threads=1)
+        return replace(result, freeze_error=float(error), caution=self._caution(float(error)))
+
+    # ------------------------------------------------------------ what freezing costs
+    @property
+    def _more_often(self) -> SymbolicModel | None:
+        """The model that says what freezing costs, or None: not estimated."""
+        return None
+
+    def _caution(self, error: float) -> str:
+        """What is said of an error of the impulse, relative, that comes from freezing."""
+        return ""
+
+    def _freeze_error(
+        self,
+        impulse: NDArray[np.float64],
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None,
+        settings: Mapping[str, Any],
+        threads: int | None,
+    ) -> NDArray[np.float64]:
+        """What freezing may have cost of each impulse (N) [N s], relative; nan where it is not estimated."""
+        if self._more_often is None:
+            return np.full(len(impulse), np.nan)
+        better = self._more_often.batch(q, v, torque, outputs=("impulse",), threads=threads, **settings)
+        return freeze_error(impulse, better["impulse"], better["separated"])
 
     def _by_steps(self, arguments: list[Any], values: dict[str, NDArray[np.float64]]) -> Collision:
         frozen = self._frozen_at(arguments[0], values)

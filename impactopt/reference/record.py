@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,9 @@ def collision_from(
     separated: bool,
 ) -> Collision:
     """The result of a collision with that end; the first `soles` of the held frames are soles."""
-    columns = {name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields}
+    columns: dict[str, Any] = {
+        name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields
+    }
     k = len(instants)
     wrench, places = columns.pop("wrench").reshape(k, -1, 6), columns.pop("places")
     sole_wrench = ground = zmp = None
@@ -52,5 +55,6 @@ def collision_from(
         hand_wrench=wrench[:, soles:] if wrench.shape[1] > soles else None,
         ground_wrench=ground,
         zmp=zmp,
+        freeze_error=0.0,
         **columns,
     )

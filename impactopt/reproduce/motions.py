@@ -62,7 +62,7 @@ def _sdc_paper(robot: Robot) -> CollisionModel:
 
 
 def _sdc(freezes: int) -> Callable[[Robot], CollisionModel]:
-    return lambda robot: SDC(**setting(robot), freezes=freezes)
+    return lambda robot: SDC(**setting(robot), freezes=freezes, accuracy=None)
 
 
 LADDER = (

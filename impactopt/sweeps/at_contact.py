@@ -72,8 +72,10 @@ def check_at_contact(given: Mapping[str, Any], where: str) -> AtContact:
     return section
 
 
-def collision_model(content: File, robot: Robot, stance: Stance, section: AtContact) -> CollisionModel:
-    """The model that [at_contact] names, for a problem file's blow."""
+def collision_model(
+    content: File, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
+) -> CollisionModel:
+    """The model that [at_contact] names, for a problem file's blow; accuracy: as of `SDC`."""
     options: dict[str, Any] = {
         "robot": robot,
         "striker": content.problem.striker,
@@ -88,6 +90,6 @@ def collision_model(content: File, robot: Robot, stance: Stance, section: AtCont
     if section.model == "full dynamics":
         return FullDynamics(**options, step=_FIRST_STEP)
     if section.model == "sdc":
-        return SDC(**options, freezes=section.freezes)
+        return SDC(**options, freezes=section.freezes, accuracy=accuracy)
     soft: Any = stance if isinstance(stance, FixedBase) else replace(stance, **_VIRTUAL_BASE)  # type: ignore[type-var]
     return SDC.paper(**{**options, "stance": soft})

@@ -88,6 +88,12 @@ MEASURES: Mapping[str, Measure] = {
         what="least vertical force of the ground on one sole, at every millisecond of contact",
         of=lambda b: b.found["sole_wrench"][..., 2].min(axis=(1, 2)),
     ),
+    "freeze_error_pct": Measure(
+        outputs=("freeze_error",),
+        what="what freezing may have cost of the impulse, as an estimate; 0 of full dynamics, nan of models "
+        "whose error is another",
+        of=lambda b: 100 * b.found["freeze_error"],
+    ),
     "hand_speed_m_s": Measure(
         outputs=(), what="of the striking point along the normal, at contact", of=lambda b: b.states.speed
     ),

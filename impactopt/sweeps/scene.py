@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.checks import too_large
+from impactopt.collision.freezing import FREEZE_ERROR
 from impactopt.collision.outputs import HISTORIES
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
@@ -177,6 +178,8 @@ def batch(
     reason = np.where(found["separated"], "", NOT_ENDED).astype(object)
     finite = np.ones(len(reason), dtype=bool)
     for name in outputs:
+        if name == FREEZE_ERROR:  # may be infinite, and says so
+            continue
         finite &= np.isfinite(found[name]).reshape(len(reason), -1).all(axis=1)
     reason[~finite] = NO_NUMBER
     if "step_error" in found:

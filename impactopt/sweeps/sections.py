@@ -30,7 +30,8 @@ class SweepSection(Section):
     time_limit: Positive = optional("of the solver in each case [s]", "time_limit_s")
     trajectories: bool = Field(default=False, description="keep the result of each case whole")
     outputs: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        default=("impulse_Ns", "peak_force_N"), description="of collisions: the columns of the table"
+        default=("impulse_Ns", "peak_force_N", "freeze_error_pct"),
+        description="of collisions: the columns of the table",
     )
 
 

@@ -85,13 +85,17 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
     return out
 
 
-def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, Any]:
+def collide_once(
+    file: ProblemFile, at_contact: Mapping[str, Any], *, accuracy: float = 1e-2
+) -> dict[str, Any]:
     """One collision of a problem's robot with its target, as plain numbers with units in their names.
 
     at_contact : the state at contact and the model, by the keys of docs/sweeps.md.
+    accuracy : relative, of the impulse: freezing that may have cost more is told.
 
     Returns the measures of docs/sweeps.md; ``target``, what it says after the blow; ``joints``, the largest
     torque demand [N m] and the limit of each, hardest first; or ``reason``, why there is no such collision.
+    ``caution`` says what to do where freezing may have cost more of the impulse than was asked for.
     Of a result whose contact is as it was saved also ``saved`` (`planned_numbers`), and ``believe``: which of
     its numbers and the model's are right where they differ.
 
@@ -108,7 +112,7 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
     states = ContactStates(
         robot=robot, striker=striker, stance=stance, start=content.make_start(robot), folder=Path()
     )
-    model = collision_model(content, robot, stance, section)
+    model = collision_model(content, robot, stance, section, accuracy)
     told: dict[str, Any] = {"problem": content.problem.name or file.path.stem, "robot": robot.name}
     told |= {"model": section.model}
     told |= {"freezes": section.freezes} if section.model == "sdc" else {}
@@ -139,6 +143,7 @@ def collide_once(file: ProblemFile, at_contact: Mapping[str, Any]) -> dict[str, 
     numbers = {name: float(measure.of(blow)[0]) for name, measure in there.items()}
     target = {_with_unit(name): x for name, x in collision.target_result.items()}
     found = {**told, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
+    found |= {"caution": collision.caution} if collision.caution else {}
     return plain(found | ({} if record is None else _saved(file, section, record)))
 
 

@@ -3,6 +3,10 @@
 typedef struct {
   Frozen frozen;
   Data data;
+#if FREEZES
+  Frozen frozen_at_contact;
+  Data data_at_contact;
+#endif
   Tape tape;
   double q[NQ], v[NV], normal[3];
 } Work;
@@ -95,41 +99,27 @@ typedef struct {
   double q[NQ], v[NV]; /* at the begin of the last stretch */
 } Course;
 
-static void collide(const double **arg, double **res, Work *w, Course *c) {
+#if FREEZES
+/* from contact, over n stretches of about that duration at all; the freeze at contact is in w */
+static void stretches(const double **arg, Work *w, Course *c, double duration, int n, Record *recorded) {
   Frozen *F = &w->frozen;
   Data *d = &w->data;
   const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
   const double *normal = filled(arg[ARG_normal], w->normal, 3);
-  Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
-  const Record *record = HISTORIES ? &recorded : 0;
-  load_data(arg, d);
-  freeze(q, v, normal, call(target_yield, d->target, 0, 0), F);
-  follow(arg, 0.0, 0.0, w);
-  d->frozen = F;
-  d->hand_speed = F->hand_speed;
-  memset(&c->final, 0, sizeof c->final);
-  memcpy(c->q, q, sizeof c->q);
-  memcpy(c->v, v, sizeof c->v);
-  d->until = HORIZON;
-#if !FREEZES
-  c->in_contact = run(d, &c->final, STEPS[0], record, &w->tape).contact;
-  c->impulse = c->final.impulse;
-  c->duration = c->final.time;
-#else
+  const int whole = n == FREEZES; /* else the one stretch of a trial */
   State start = {0}, reached = {0}, middle;
   double q_middle[NQ], v_middle[NV], q_then[NQ], v_then[NV];
+  memcpy(c->q, q, sizeof c->q);
+  memcpy(c->v, v, sizeof c->v);
   FOR(i, V) d->before[i] = (vec){0};
-  run(d, &reached, STEPS_AT_ALL, 0, &w->tape);
-  const double duration = reached.time;
-  memset(&reached, 0, sizeof reached);
   c->impulse = c->duration = 0.0;
   c->in_contact = 1.0;
-  FOR(i, FREEZES) {
-    const double share = ENDS[i + 1] - ENDS[i];
-    const int last = i == FREEZES - 1;
+  FOR(i, n) {
+    const double begin = whole ? ENDS[i] : 0.0, end = whole ? ENDS[i + 1] : 1.0, share = end - begin;
+    const int last = i == n - 1;
     middle = reached;
     d->until = reached.time + duration * share / 2;
-    run(d, &middle, STEPS_TO_MIDDLE[i], 0, &w->tape);
+    run(d, &middle, whole ? STEPS_TO_MIDDLE[i] : STEPS_AT_ALL, 0, &w->tape);
     moved(F, c->q, c->v, &middle, q_middle, v_middle);
     if (i) {
       moved(F, c->q, c->v, &reached, q_then, v_then);
@@ -137,7 +127,7 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
       memcpy(c->v, v_then, sizeof c->v);
     }
     freeze(q_middle, v_middle, normal, GIVES_WAY, F);
-    follow(arg, duration * (ENDS[i] + ENDS[i + 1]) / 2, duration * ENDS[i], w);
+    follow(arg, duration * (begin + end) / 2, duration * begin, w);
     const double *in[] = {c->q, c->v, normal};
     double *out[] = {&d->hand_speed};
     hand_speed_at(in, out, 0, 0, 0);
@@ -147,12 +137,14 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
 #if REFERENCE
     FOR(k, V) d->before[k] -= d->led[k];
 #endif
-    d->until = c->in_contact ? (last ? HORIZON - duration * ENDS[i] : duration * share) : -1.0;
-    recorded.since = duration * ENDS[i];
-    recorded.columns = N_COLUMNS[i];
+    d->until = c->in_contact ? (last ? HORIZON - duration * begin : duration * share) : -1.0;
+    if (recorded) {
+      recorded->since = duration * begin;
+      recorded->columns = N_COLUMNS[i];
+    }
     reached = start;
-    c->in_contact *= run(d, &reached, STEPS[i], record, &w->tape).contact;
-    recorded.column += N_COLUMNS[i];
+    c->in_contact *= run(d, &reached, whole ? STEPS[i] : STEPS_AT_ALL, recorded, &w->tape).contact;
+    if (recorded) recorded->column += N_COLUMNS[i];
     c->impulse += reached.impulse;
     c->duration += reached.time;
     c->final = reached;
@@ -161,5 +153,38 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
     memset(start.torque, 0, sizeof start.torque);
     memset(start.torque2, 0, sizeof start.torque2);
   }
+}
+#endif
+
+static void collide(const double **arg, double **res, Work *w, Course *c) {
+  Frozen *F = &w->frozen;
+  Data *d = &w->data;
+  const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
+  const double *normal = filled(arg[ARG_normal], w->normal, 3);
+  Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
+  Record *record = HISTORIES ? &recorded : 0;
+  load_data(arg, d);
+  freeze(q, v, normal, call(target_yield, d->target, 0, 0), F);
+  follow(arg, 0.0, 0.0, w);
+  d->frozen = F;
+  d->hand_speed = F->hand_speed;
+  memset(&c->final, 0, sizeof c->final);
+  d->until = HORIZON;
+#if !FREEZES
+  memcpy(c->q, q, sizeof c->q);
+  memcpy(c->v, v, sizeof c->v);
+  c->in_contact = run(d, &c->final, STEPS[0], record, &w->tape).contact;
+  c->impulse = c->final.impulse;
+  c->duration = c->final.time;
+#else
+  State reached = {0};
+  FOR(i, V) d->before[i] = (vec){0};
+  run(d, &reached, STEPS_AT_ALL, 0, &w->tape);
+  w->frozen_at_contact = *F;
+  w->data_at_contact = *d;
+  stretches(arg, w, c, reached.time, 1, 0);
+  *F = w->frozen_at_contact;
+  *d = w->data_at_contact;
+  stretches(arg, w, c, c->duration, FREEZES, record);
 #endif
 }

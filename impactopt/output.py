@@ -11,6 +11,7 @@ import dataclasses
 import io
 import json
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -329,6 +330,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except (
         zipfile.BadZipFile,
         zlib.error,
+        tokenize.TokenError,
         MemoryError,
         OverflowError,
         RecursionError,

@@ -25,6 +25,7 @@ BENCHES = {
     "scaling": "scaling",
     "skip": "skip",
     "stability": "stability",
+    "attack": "attack",
     "solve": "solve",
     "zoo": "zoo",
 }

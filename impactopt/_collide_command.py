@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import json
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -74,7 +75,7 @@ def collide(
         from impactopt.sweeps.single import collide_once, problem_of_result
 
         check_loudness(quiet, verbose)
-        saved = what.is_dir()
+        saved = os.path.isdir(what)  # also of names that are too long for one
         if not saved and speed is None:
             raise typer.BadParameter("missing; only a result has a speed of its own", param_hint="--speed")
         if saved and posture is not None:

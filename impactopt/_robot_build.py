@@ -22,7 +22,8 @@ from impactopt.files import is_plain_file
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools
-_ROUNDED = 1e-6  # of moments of inertia, relative: decimals in a URDF are rounded
+# [kg m2] of moments of inertia, and relative: in a URDF decimals are rounded, and antennas are guessed
+_ROUNDED = 1e-6
 
 
 def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
@@ -71,7 +72,7 @@ def _check_links(urdf: str) -> None:
                 f"{HEAVIEST:g}"
             )
         least = float(np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))[0])
-        if least < -_ROUNDED * np.abs(numbers[1:]).max():
+        if least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
             raise InputError(
                 f"{where} has a principal moment of inertia of {least:.3g} kg m2; correct its <inertia>, "
                 "which is about the centre of mass"

@@ -103,7 +103,7 @@ def _planar_arm() -> Call:
 
 
 def _problem() -> Call:
-    from impactopt import FreeMass, ImpactProblem, KelvinVoigt, Phase
+    from impactopt import FixedBase, FreeMass, ImpactProblem, KelvinVoigt, Phase
 
     given: Arguments = {"point": np.array([0.7, 0.0, 0.75]), "normal": NORMAL, "start": "ready"}
     given |= {"contact_duration": (5e-4, 0.015), "smoothness": 1e-3, "wrench_price": 0.0, "return_price": 0.0}
@@ -113,7 +113,7 @@ def _problem() -> Call:
         "coefficient_of_restitution": 0.0,
     }
     law, target = KelvinVoigt(stiffness=1e5, damping=10.0), FreeMass(mass=1.0)
-    fixed = {"robot": _arm(), "striker": "hammer", "law": law, "target": target}
+    fixed = {"robot": _arm(), "striker": "hammer", "law": law, "target": target, "stance": FixedBase()}
     return functools.partial(
         ImpactProblem, **fixed, swing=Phase(duration=0.5), follow=Phase(duration=0.5)
     ), given

@@ -179,6 +179,6 @@ def _links_of_no_matter(content: bytes, robot: Robot, floating: bool) -> str:
         least = np.linalg.eigvalsh(
             [[i["xx"], i["xy"], i["xz"]], [i["xy"], i["yy"], i["yz"]], [i["xz"], i["yz"], i["zz"]]]
         )[0]
-        if m < 0 or least < -1e-5 * max(map(abs, i.values())):
+        if m < 0 or least < -1e-5 * max(1.0, *map(abs, i.values())):
             return f"link {element.get('name')!r} has mass {m:g} kg and a least moment of {least:.3g} kg m2"
     return ""

@@ -71,7 +71,7 @@ class JointFriction:
             number = check_array(f"JointFriction: {name}", value, shape, most=MOST)
             if (number < 0).any():
                 raise InputError(f"JointFriction: {name} must be >= 0")
-        if not check_array("JointFriction: transition [rad/s]", self.transition, ()) > 0:
+        if not check_array("JointFriction: transition [rad/s]", self.transition, (), most=MOST) > 0:
             raise InputError(f"JointFriction: transition [rad/s]: {self.transition:g}; give a number > 0")
 
     def arrays(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -243,7 +243,9 @@ def _read(path: Path) -> str:
         return read_plain(path, LONGEST_TEXT).decode()
     except FileNotFoundError as error:
         folder = path.parent
-        near = did_you_mean(path.name, [p.name for p in folder.glob("*.toml")]) if folder.is_dir() else ""
+        near = (
+            did_you_mean(path.name, [p.name for p in folder.glob("*.toml")]) if os.path.isdir(folder) else ""
+        )
         raise InputError(f"there is no file {shortened(str(path), 300)}{near}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8: {error.reason} at byte {error.start}") from error

@@ -9,12 +9,12 @@ EXTRAS := robots,validate,qp,sweep,cluster,docs,notebooks,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint types format bench reproduce figures docs notebooks clean distclean
+.PHONY: help venv demo test lint types format bench attack reproduce figures docs notebooks clean distclean
 
 help: ## list the targets
 	@echo "make <target>"
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  \1|\2/p' $(firstword $(MAKEFILE_LIST)) | awk -F'|' '{printf "%-12s %s\n", $$1, $$2}'
-	@echo "Options: ARGS='...' for test, demo, bench and reproduce; PYTHON=... for the interpreter that makes .venv"
+	@echo "Options: ARGS='...' for test, demo, bench, attack and reproduce; PYTHON=... for the interpreter that makes .venv"
 
 venv: $(STAMP) ## make .venv with this project and what it needs
 
@@ -65,6 +65,9 @@ format: $(STAMP) ## rewrite the sources in the project's style
 
 bench: $(STAMP) ## run every benchmark, some minutes; tables, JSON and pictures in results/bench
 	@$(BIN)/impactopt bench all --out results/bench $(ARGS)
+
+attack: $(STAMP) ## attack it at length: files, URDFs, commands, calls, collisions (ARGS='--seed 7'); faults in results/attack
+	@$(BIN)/impactopt bench attack --out results/attack $(ARGS)
 
 reproduce: $(STAMP) ## the paper's tables and figures beside ours, some minutes; results/reproduce
 	@$(BIN)/impactopt reproduce all --out results/reproduce $(ARGS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import json
 import math
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,7 +83,7 @@ def collide(
         check_loudness(quiet, verbose)
         if not 0 < accuracy < math.inf:
             raise typer.BadParameter(f"{accuracy:g}; give a number > 0", param_hint="--accuracy")
-        saved = what.is_dir()
+        saved = os.path.isdir(what)  # also of names that are too long for one
         if not saved and speed is None:
             raise typer.BadParameter("missing; only a result has a speed of its own", param_hint="--speed")
         if saved and posture is not None:

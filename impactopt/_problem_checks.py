@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.coordinates import StanceCoordinates
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.robot import Robot
 from impactopt.support import margin, support_polygon
 from impactopt.terms import Term
@@ -69,7 +69,8 @@ def check_collision(problem: Any) -> None:
     if problem.collision not in COLLISIONS:
         near = did_you_mean(problem.collision, COLLISIONS)
         raise InputError(f"unknown collision {problem.collision!r}{near}: there are {', '.join(COLLISIONS)}")
-    e = problem.coefficient_of_restitution
+    e = check_number("coefficient_of_restitution", problem.coefficient_of_restitution)
+    object.__setattr__(problem, "coefficient_of_restitution", e)
     if not 0 <= e <= 1:
         raise InputError(f"coefficient_of_restitution must be between 0 and 1, not {e}")
     if e and problem.collision != "rigid":

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
+from xml.dom import expatbuilder
+from xml.parsers.expat import ExpatError
 
 import numpy as np
 import pinocchio as pin
@@ -15,11 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt._robot_checks import HEAVIEST, check_frame
 from impactopt._robot_parts import Striker, Tool
-from impactopt.errors import InputError, check_array, did_you_mean, shortened
+from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
 from impactopt.files import is_plain_file
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools
+# [kg m2] of moments of inertia, and relative: in a URDF decimals are rounded, and antennas are guessed
+_ROUNDED = 1e-6
 
 
 def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
@@ -30,6 +34,7 @@ def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, fl
         model = pin.buildModelFromUrdf(urdf, *root)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
+    _check_links(urdf)
     if srdf is not None:
         file = _existing(srdf, "SRDF")
         try:
@@ -38,6 +43,52 @@ def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, fl
         except (ValueError, RuntimeError) as error:
             raise InputError(f"SRDF {file}: {error}") from error
     return model
+
+
+def _check_links(urdf: str) -> None:
+    """InputError for a link that no matter is made of: what is fixed to another hides it in their sum.
+
+    Links without mass or inertia, as frames are, are none's trouble.
+    """
+    try:
+        # robots have tags of others with prefixes that no one declares: no trouble of theirs
+        root = expatbuilder.parse(urdf, namespaces=False).documentElement
+    except ExpatError as error:
+        raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+    for link in _children(root, "link"):
+        given = _children(link, "inertial")
+        masses = [mass for part in given for mass in _children(part, "mass")]
+        inertias = [inertia for part in given for inertia in _children(part, "inertia")]
+        if not masses or not inertias:
+            continue
+        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        entries = [_urdf_number(inertias[0].getAttribute(key)) for key in keys]
+        m, (xx, yy, zz, xy, xz, yz) = _urdf_number(masses[0].getAttribute("value")), entries
+        where = f"URDF {urdf}: the <inertial> of link {link.getAttribute('name')!r}"
+        numbers = np.array([m, *entries])
+        if not np.isfinite(numbers).all() or m < 0 or np.abs(numbers).max() > HEAVIEST:
+            raise InputError(
+                f"{where} has mass {m:g} kg and moments {xx:g}, {yy:g}, {zz:g} kg m2; give numbers from 0 to "
+                f"{HEAVIEST:g}"
+            )
+        least = float(np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))[0])
+        if least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
+            raise InputError(
+                f"{where} has a principal moment of inertia of {least:.3g} kg m2; correct its <inertia>, "
+                "which is about the centre of mass"
+            )
+
+
+def _children(element: Any, tag: str) -> list[Any]:
+    return [child for child in element.childNodes if getattr(child, "tagName", None) == tag]
+
+
+def _urdf_number(text: str) -> float:
+    """A number of a URDF; 0 for what its parser, which has read it before, has taken for none."""
+    try:
+        return float(text or 0.0)
+    except ValueError:
+        return 0.0
 
 
 def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
@@ -84,7 +135,7 @@ def per_joint(
         for name, number in value.items():
             result[joint_index(joints, name, what)] = check_array(f"{what} of joint {name!r}", number, ())
         return result
-    if np.ndim(value) == 0:
+    if raw_array(what, value).ndim == 0:
         result[:] = check_array(what, value, ())
         return result
     return check_array(what, value, (len(joints),))
@@ -273,7 +324,7 @@ def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
 
 def pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
     """The thing of that name, or an InputError that says what there is."""
-    if name not in options:
+    if not isinstance(name, str) or name not in options:
         known = ", ".join(map(repr, options)) or "none"
         raise InputError(
             f"robot {robot!r} has no {kind} {name!r}{did_you_mean(name, options)}; it has {known}"

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt import _robot_checks as checks
 from impactopt._robot_checks import HEAVIEST
-from impactopt.errors import FARTHEST, InputError, check_array
+from impactopt.errors import FARTHEST, InputError, check_array, raw_array
 
 Array = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ class Tool:
         what = f"tool {self.name!r}"
         if not check_array(f"{what}: mass [kg]", self.mass, (), most=HEAVIEST) > 0:
             raise InputError(f"{what}: mass is {self.mass:g} kg; give a number > 0")
-        inertia = np.asarray(self.inertia, dtype=float)
+        inertia = raw_array(f"{what}: inertia [kg m2]", self.inertia)
         inertia = check_array(
             f"{what}: inertia [kg m2]",
             np.diag(inertia) if inertia.shape == (3,) else inertia,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -63,7 +64,7 @@ def _is_robot(what: Path) -> bool:
     """A name of a robot that is no file's or directory's, or a problem file."""
     from impactopt.presets import robot_names
 
-    return what.suffix == ".toml" or (str(what) in robot_names() and not what.exists())
+    return what.suffix == ".toml" or (str(what) in robot_names() and not os.path.exists(what))
 
 
 def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
@@ -74,7 +75,7 @@ def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
     from impactopt.replay import load_planned
     from impactopt.report import report_of
 
-    if not result.exists():
+    if not os.path.exists(result):
         robots = robot_names()
         raise InputError(
             f"there is no result {str(result)!r}{did_you_mean(str(result), robots)}; give a directory that "
@@ -82,7 +83,7 @@ def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
         )
     record = load_record(result)
     about = load_planned(result, problem_file=problem).problem if record.completed else None
-    return report_of(record, about), (result if result.is_dir() else result.parent) / PAGE
+    return report_of(record, about), (result if os.path.isdir(result) else result.parent) / PAGE
 
 
 def _bodies(what: Path, problem: Path | None) -> tuple[Report, Path]:

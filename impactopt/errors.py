@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,6 +107,9 @@ def check_array(
     InputError : not numbers, another shape, or NaN, infinity or too large a number at a named place.
     """
     try:
+        # NumPy would read text as numbers, and leave out the imaginary part of complex ones
+        if np.asarray(value).dtype.kind in "USc":
+            raise TypeError
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name}: expected numbers, got {shortened(repr(value))}") from error
@@ -124,6 +128,27 @@ def check_array(
         allowed = "a finite number" if finite else "a number"
         raise InputError(f"{name}: {array[place]}{where}; give {allowed}{limit}")
     return array
+
+
+def raw_array(name: str, value: object) -> NDArray[Any]:
+    """What NumPy makes of a value, of any type; InputError where rows differ in length."""
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name}: expected an array, got {shortened(repr(value))}") from error
+
+
+def check_number(name: str, value: object, *, finite: bool = True, most: float | None = None) -> float:
+    """A single number as a float; InputError as of `check_array`."""
+    return float(check_array(name, value, (), finite=finite, most=most))  # type: ignore[arg-type]
+
+
+def check_whole(name: str, value: object, *, least: int, most: int) -> int:
+    """A whole number as an int; InputError if it is none, or out of its range."""
+    number = check_number(name, value)
+    if number != round(number) or not least <= number <= most:
+        raise InputError(f"{name}: {number:g}; give a whole number from {least} to {most:g}")
+    return round(number)
 
 
 def shortened(text: str, most: int = 80) -> str:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from impactopt.errors import InputError, check_array
+from impactopt.errors import MOST, InputError, check_array, check_number
 from impactopt.shapes import Vector
 from impactopt.terms import Term
 
@@ -31,7 +31,7 @@ class TorqueRate(Term):
     def __post_init__(self) -> None:
         limits = self.limit.values() if isinstance(self.limit, Mapping) else (self.limit,)
         for value in limits:
-            if not 0 < value < np.inf:
+            if not check_number("TorqueRate.limit [N m/s]", value, most=MOST) > 0:
                 raise InputError(f"TorqueRate.limit is {value:g} N m/s; give a number > 0")
 
     @property
@@ -53,7 +53,7 @@ class HandOrientation(Term):
     angle: float = 0.2
 
     def __post_init__(self) -> None:
-        self.check_angle(self.angle)
+        self.check_angle()
         self.make_axis("axis")
         if self.direction is not None:
             self.make_axis("direction")
@@ -74,9 +74,9 @@ class Gaze(Term):
     since: float = 0.5
 
     def __post_init__(self) -> None:
-        self.check_angle(self.angle)
+        self.check_angle()
         self.make_axis("axis")
-        if not 0 <= self.since <= 1:
+        if not 0 <= self.keep_number("since") <= 1:
             raise InputError(f"Gaze.since is {self.since:g}; give a fraction of the swing, from 0 to 1")
 
     @property
@@ -100,16 +100,16 @@ class HitRegion(Term):
     def __post_init__(self) -> None:
         if (self.radius is None) == (self.size is None):
             raise InputError("HitRegion: give either radius, of a disc, or size, of a rectangle [m]")
-        given: list[Any] = [self.radius] if self.size is None else list(self.size)
+        given: Any = self.size if self.radius is None else [check_number("HitRegion.radius [m]", self.radius)]
         lengths = check_array("HitRegion [m]", given, (None,))
-        reach = float(lengths[0]) if self.size is None else float(np.linalg.norm(lengths)) / 2
-        if len(lengths) != (1 if self.size is None else 2) or min(lengths) <= 0 or reach > REACH:
+        reach = float(lengths.sum()) if self.size is None else float(np.linalg.norm(lengths)) / 2
+        if len(lengths) != (1 if self.size is None else 2) or not (lengths > 0).all() or reach > REACH:
             raise InputError(
                 f"HitRegion of {lengths.tolist()} m: give lengths > 0 that reach no further than {REACH} m "
                 "from the point"
             )
         if self.size is not None:
-            object.__setattr__(self, "size", (float(self.size[0]), float(self.size[1])))
+            object.__setattr__(self, "size", (float(lengths[0]), float(lengths[1])))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,4 +124,4 @@ class HitCone(Term):
     angle: float = 0.1
 
     def __post_init__(self) -> None:
-        self.check_angle(self.angle)
+        self.check_angle()

@@ -11,6 +11,7 @@ import dataclasses
 import io
 import json
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -300,7 +301,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     InputError : there is none, it is damaged, or of a newer impactopt.
     """
     path = Path(directory)
-    path = path if path.name == NUMBERS and not path.is_dir() else path / NUMBERS
+    path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
     mend = "solve again with `impactopt solve`"
     try:
         # from memory: np.load leaves a damaged file open
@@ -329,6 +330,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     except (
         zipfile.BadZipFile,
         zlib.error,
+        tokenize.TokenError,
         MemoryError,
         OverflowError,
         RecursionError,

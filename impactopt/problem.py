@@ -16,7 +16,17 @@ from impactopt.bodies.world import WorldBody, ground, obstacle_bodies, target_bo
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.coordinates import StanceCoordinates
-from impactopt.errors import FARTHEST, MOST, InputError, Mistakes, check_array, shortened
+from impactopt.errors import (
+    FARTHEST,
+    MOST,
+    InputError,
+    Mistakes,
+    check_array,
+    check_number,
+    check_whole,
+    raw_array,
+    shortened,
+)
 from impactopt.extra_terms import HandOrientation, HitCone
 from impactopt.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem_hash import problem_hash
@@ -53,21 +63,25 @@ class Phase:
     grading: float = 3.0
 
     def __post_init__(self) -> None:
-        duration = (self.duration,) * 2 if isinstance(self.duration, (int, float)) else tuple(self.duration)
+        one = raw_array("a phase's duration [s]", self.duration).ndim == 0
+        given: Any = (self.duration,) * 2 if one else self.duration
+        duration = check_array("a phase's duration [s]", given, (None,)).tolist()
         if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
             raise InputError(
                 f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
                 f"not {shortened(str(self.duration))}"
             )
-        object.__setattr__(self, "duration", tuple(float(d) for d in duration))
+        object.__setattr__(self, "duration", tuple(duration))
+        object.__setattr__(self, "grading", check_number("a phase's grading", self.grading))
         if not 1 <= self.grading <= STEEPEST:
             raise InputError(f"a phase's grading must be 1 to {STEEPEST:g}, not {self.grading:g}")
-        if not 6 <= self.intervals <= FINEST or self.intervals != int(self.intervals):
+        intervals = check_number("a phase's intervals", self.intervals)
+        if not 6 <= intervals <= FINEST or intervals != round(intervals):
             raise InputError(
                 f"a phase needs 6 to {FINEST} spline intervals, a whole number, not "
                 f"{shortened(str(self.intervals))}"
             )
-        object.__setattr__(self, "intervals", int(self.intervals))
+        object.__setattr__(self, "intervals", round(intervals))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,12 +180,18 @@ class ImpactProblem:
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
 
     def _check_elements(self) -> None:
-        if len(self.collision_elements) != 2:
+        given: Any = self.collision_elements
+        given = given.tolist() if isinstance(given, np.ndarray) else given
+        if not isinstance(given, (list, tuple)) or len(given) != 2:
             raise InputError(
                 "collision_elements are those of compression and those of restitution, two tuples, not "
-                f"{self.collision_elements}"
+                f"{shortened(str(given))}"
             )
-        for lengths in self.collision_elements:
+        elements = tuple(tuple(check_array("collision_elements", x, (None,)).tolist()) for x in given)
+        object.__setattr__(self, "collision_elements", elements)
+        stages = check_whole("collision_stages", self.collision_stages, least=2, most=3)
+        object.__setattr__(self, "collision_stages", stages)
+        for lengths in elements:
             if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
                 raise InputError(
                     f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
@@ -185,7 +205,9 @@ class ImpactProblem:
 
     def _check_prices(self) -> None:
         for name in ("smoothness", "wrench_price", "return_price"):
-            if not 0 <= getattr(self, name) <= MOST:
+            number = check_number(name, getattr(self, name))
+            object.__setattr__(self, name, number)
+            if not 0 <= number <= MOST:
                 raise InputError(f"{name} must be a number of 0 to {MOST:g}, not {getattr(self, name)}")
 
     def _check_scenarios(self) -> None:

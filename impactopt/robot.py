@@ -265,7 +265,7 @@ class Robot:
 
     def joint_positions(self, q: ArrayLike) -> Array:
         """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""
-        return build.joint_positions(self.model, np.asarray(q, dtype=np.float64))
+        return build.joint_positions(self.model, check_array("q", q, (self.nq,), finite=False))
 
     def place(self, q: ArrayLike, soles: Sequence[Sole] | None = None) -> Array:
         """The configuration with the base moved: mean of the soles at the origin of the ground, at yaw 0.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt._workers import map_on_workers
-from impactopt.errors import InputError
+from impactopt.errors import InputError, check_array, check_whole, shortened
 from impactopt.problem import ImpactProblem
 from impactopt.robot import Robot
 from impactopt.validation import Conditions, Scene, scene_of, simulate_mujoco
@@ -24,6 +24,7 @@ __all__ = ["Robustness", "Spread", "draw_conditions", "robustness"]
 Array = NDArray[np.float64]
 Z95 = 1.959964  # of the normal distribution: 95 % lie within
 STEP = 5e-4  # [s]: tells who stands as 1e-4 does, and costs a fifth
+MOST_DRAWS = 1_000_000  # each is a replay of a second
 LOGARITHMIC = ("mass", "stiffness", "kp", "kd")  # factors: half is as far from 1 as twice
 
 
@@ -51,7 +52,9 @@ class Spread:
     period: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name, (low, high) in self.ranges().items():
+        for name, bounds in self.ranges().items():
+            low, high = check_array(f"spread: {name}", bounds, (2,)).tolist()
+            object.__setattr__(self, name, (low, high))
             if not low <= high:
                 raise InputError(f"spread: {name} is from {low:g} to {high:g}; give the lower bound first")
             if name in LOGARITHMIC and not low > 0:
@@ -78,10 +81,10 @@ def draw_conditions(n: int, seed: int = 0, spread: Spread | None = None) -> list
     ------
     InputError : n is not at least 1, or the seed is negative.
     """
-    if n < 1:
-        raise InputError(f"{n} draws; ask for at least 1")
-    if seed < 0:
-        raise InputError(f"the seed is {seed}; give a whole number >= 0")
+    n = check_whole("draws", n, least=1, most=MOST_DRAWS)
+    seed = check_whole("seed", seed, least=0, most=2**63)
+    if spread is not None and not isinstance(spread, Spread):
+        raise InputError(f"spread: {shortened(repr(spread))}; give a Spread")
     chosen = spread if spread is not None else Spread()
     ranges = chosen.ranges()
     unit = np.random.default_rng(seed).random((n, len(ranges)))

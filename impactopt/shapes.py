@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean
+from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean, shortened
 
 Vector = tuple[float, float, float]
 
@@ -37,9 +37,10 @@ class TargetBody:
     size: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.shape is not None and self.shape not in TARGET_SHAPES:
+        if self.shape is not None and not (isinstance(self.shape, str) and self.shape in TARGET_SHAPES):
+            near = did_you_mean(str(self.shape), TARGET_SHAPES)
             raise InputError(
-                f"TargetBody.shape is {self.shape!r}{did_you_mean(str(self.shape), TARGET_SHAPES)}; "
+                f"TargetBody.shape is {shortened(repr(self.shape))}{near}; "
                 f"give one of {', '.join(TARGET_SHAPES)}"
             )
         if self.size is None:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from impactopt.errors import InputError
+from impactopt.errors import MOST, InputError, check_number, shortened
 from impactopt.shapes import vector
 
 
@@ -23,12 +23,14 @@ class Term:
 
     whole_motion : it says nothing of a strike alone, which is planned without it.
     needs_torques : its rows take the torques at the nodes, which are variables then.
+    endless : fields that may be infinite, where anything is allowed.
     """
 
     name: ClassVar[str] = ""
     unit: ClassVar[str] = ""
     whole_motion: ClassVar[bool] = False
     needs_torques: ClassVar[bool] = False
+    endless: ClassVar[tuple[str, ...]] = ()
 
     def blocks(self, problem: Any, coordinates: Any) -> Mapping[str, Any]:
         """Nonlinear functions that the rows need, by name: :func:`impactopt.nlp.blocks.make_block`."""
@@ -43,14 +45,29 @@ class Term:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, (int, float)) and not value >= 0:
+            value, kind = getattr(self, f.name), str(f.type)
+            number = isinstance(value, (int, float)) or kind in ("float", "float | None")
+            if kind == "bool" or not number or (value is None and "None" in kind):
+                if kind == "bool" and not isinstance(value, (bool, np.bool_)):
+                    told = f"{type(self).__name__}.{f.name} is {shortened(repr(value))}"
+                    raise InputError(f"{told}; give True or False")
+                continue
+            if not self.keep_number(f.name) >= 0:
                 raise InputError(f"{type(self).__name__}.{f.name} must not be negative, it is {value}")
+
+    def keep_number(self, name: str) -> float:
+        """Field ``name`` as a float, which it is kept as; InputError if it is none, or larger than any."""
+        what, value = f"{type(self).__name__}.{name}", getattr(self, name)
+        number = check_number(what, value, finite=name not in self.endless)
+        if MOST < abs(number) < np.inf:
+            raise InputError(f"{what}: {number:g}; give a number of at most {MOST:g}")
+        object.__setattr__(self, name, number)
+        return number
 
     def check_fractions(self, *names: str) -> None:
         """InputError if one of these fields is no fraction, above 0 and at most 1."""
         for name in names:
-            value = getattr(self, name)
+            value = self.keep_number(name)
             if not 0 < value <= 1:
                 raise InputError(f"{type(self).__name__}.{name} is {value:g}; give a fraction > 0 and <= 1")
 
@@ -64,8 +81,9 @@ class Term:
         """Joints that the robot must have."""
         return ()
 
-    def check_angle(self, value: float) -> None:
-        """InputError if an angle [rad] is none between 0 and a right one."""
+    def check_angle(self) -> None:
+        """InputError if field ``angle`` [rad] is none between 0 and a right one."""
+        value = self.keep_number("angle")
         if not 0 < value < np.pi / 2:
             raise InputError(f"{type(self).__name__}.angle is {value:g} rad; give one between 0 and pi/2")
 
@@ -155,14 +173,15 @@ class Balance(Term):
 
     name: ClassVar[str] = "balance after impact"
     unit: ClassVar[str] = "m, m/s, N m s"
+    endless: ClassVar[tuple[str, ...]] = ("vertical_speed", "angular_momentum")
     capture_margin: float | None = 0.02
     vertical_speed: float = 0.2
     angular_momentum: float = 10.0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.capture_margin == float("inf"):
+        if isinstance(self.capture_margin, float) and self.capture_margin == np.inf:
             raise InputError("Balance.capture_margin is inf, which nothing can keep; give None for anywhere")
+        super().__post_init__()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,6 +193,7 @@ class Incidence(Term):
 
     name: ClassVar[str] = "incidence"
     unit: ClassVar[str] = "m/s"
+    endless: ClassVar[tuple[str, ...]] = ("speed",)
     speed: float = 0.05
 
 

@@ -140,6 +140,21 @@ def stability(
 
 
 @app.command()
+def attack(
+    seed: Seed = 0,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Processes; with 1 a case that hangs is not given up.")
+    ] = 2,
+    few: Annotated[bool, typer.Option("--quick", help="Some hundred cases, a minute.")] = False,
+    as_json: Json = False,
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Files, URDFs, commands and calls with something wrong; collisions by an equation of their own."""
+    _run(["attack"], {"attack": {"quick": few, "seed": seed, "workers": workers}}, as_json, out, quiet)
+
+
+@app.command()
 def collision(
     few: Annotated[bool, typer.Option("--quick", help="The stand-in only, with few settings.")] = False,
     as_json: Json = False,
@@ -245,6 +260,7 @@ def run_all(
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},
+        "attack": {"quick": True, **drawn},
         "solve": {"quick": True, "seed": seed},
         "zoo": {"random": FEW_PROBLEMS, "seed": seed},
     }

@@ -26,6 +26,7 @@ BENCHES = {
     "scaling": "scaling",
     "skip": "skip",
     "stability": "stability",
+    "attack": "attack",
     "solve": "solve",
     "zoo": "zoo",
 }

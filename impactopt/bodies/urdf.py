@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.bodies.solids import Solid, box, cylinder, sphere
+from impactopt.errors import FARTHEST
 
 __all__ = ["LinkShape", "numbers", "shapes_of", "urdf_root"]
 
@@ -57,6 +58,8 @@ def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> I
             if solid is not None and origin is not None:
                 place = frame.placement * origin
                 moved = solid.moved(place.rotation, place.translation)
+                if not (np.abs(moved.vertices) <= FARTHEST).all():
+                    continue  # it is nowhere, or no part of a robot
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
@@ -75,9 +78,9 @@ def _solid(geometry: ElementTree.Element | None, urdf: Path) -> Solid | None:
             if shape.tag == "box":
                 return box(numbers(shape.attrib["size"]))
             if shape.tag == "cylinder":
-                return cylinder(float(shape.attrib["radius"]), float(shape.attrib["length"]))
+                return cylinder(*(float(numbers(shape.attrib[key], 1)[0]) for key in ("radius", "length")))
             if shape.tag == "sphere":
-                return sphere(float(shape.attrib["radius"]))
+                return sphere(float(numbers(shape.attrib["radius"], 1)[0]))
             if shape.tag == "mesh":
                 scale = numbers(shape.get("scale", "1 1 1"))
                 return read_mesh(find_mesh(shape.attrib["filename"], urdf), scale)

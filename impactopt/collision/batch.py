@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..codegen import cached, library_path
-from ..errors import InputError, check_array
+from ..errors import InputError, check_array, raw_array
 from .checks import ACCURACY, too_large
 from .native import native_collision
 from .outputs import HISTORIES, SCALARS
@@ -185,7 +185,7 @@ def _inputs(
     if model.terms.feedforward:
         if torque is None:
             raise InputError("torque: give the feed-forward torque (N, n) [N m], or (n) for all")
-        one = np.ndim(torque) == 1
+        one = raw_array("torque", torque).ndim == 1
         given["feedforward"] = check_array("torque [N m]", torque, (robot.n,) if one else (count, robot.n))
         given["feedforward"] = given["feedforward"].reshape(-1, robot.n)
     return given | _settings(model, settings, count)
@@ -197,13 +197,13 @@ def _settings(model: SymbolicModel, settings: Mapping[str, Any], count: int) -> 
         {
             name: x
             for name, x in settings.items()
-            if name not in model.settings or np.ndim(x) <= model.settings[name].ndim
+            if name not in model.settings or raw_array(name, x).ndim <= model.settings[name].ndim
         }
     )
     out = {name: value[None] if value.ndim else value.reshape(1, 1) for name, value in alone.items()}
     for name, given in settings.items():
         usual = model.settings[name]
-        if np.ndim(given) > usual.ndim:
+        if raw_array(name, given).ndim > usual.ndim:
             value = check_array(name, given, (count, *usual.shape), finite=name != "torque_limit")
             # ranges are intervals: if least and largest are in it, all are
             whole = name == "normal" or (name in ("kp", "kd") and usual.ndim == 2)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..contact import ContactLaw, Target
-from ..errors import InputError, check_array, check_direction, did_you_mean
+from ..errors import InputError, check_array, check_direction, did_you_mean, raw_array
 from ..robot import Robot
 from .terms import JointFriction, Terms
 
@@ -75,8 +75,8 @@ class Settings(Mapping[str, Array]):
         if name == "normal":
             return check_direction(name, value)
         shape = self._values[name].shape
-        if len(shape) == 1 and np.ndim(value) == 0:
-            value = np.full(shape, value)
+        if len(shape) == 1 and raw_array(name, value).ndim == 0:
+            value = np.full(shape, check_array(name, value, (), finite=name != "torque_limit"))
         array = check_array(name, value, shape, finite=name != "torque_limit")
         if name == "torque_limit":
             array = np.minimum(array, NO_LIMIT)
@@ -134,7 +134,7 @@ def no_bend(n: int) -> dict[str, Array]:
 def _gain(name: str, given: ArrayLike | None, own: Array) -> Array:
     if given is None:
         return own
-    value, n = np.asarray(given, dtype=float), own.size
-    if value.ndim == 0:
-        value = np.full(n, float(value))
-    return check_array(name, value, (n,) * value.ndim)
+    n, ndim = own.size, raw_array(name, given).ndim
+    if ndim == 0:
+        return np.full(n, check_array(name, given, ()))
+    return check_array(name, given, (n,) * min(ndim, 2))

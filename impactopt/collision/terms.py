@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, check_array
+from ..errors import MOST, InputError, check_array, raw_array
 
 __all__ = ["JointFriction", "Terms"]
 
@@ -65,9 +66,12 @@ class JointFriction:
 
     def __post_init__(self) -> None:
         for name in ("viscous", "coulomb"):
-            if np.any(np.asarray(getattr(self, name), dtype=float) < 0):
+            value: Any = getattr(self, name)
+            shape = (None,) * min(raw_array(f"JointFriction: {name}", value).ndim, 1)
+            number = check_array(f"JointFriction: {name}", value, shape, most=MOST)
+            if (number < 0).any():
                 raise InputError(f"JointFriction: {name} must be >= 0")
-        if not check_array("JointFriction: transition [rad/s]", self.transition, ()) > 0:
+        if not check_array("JointFriction: transition [rad/s]", self.transition, (), most=MOST) > 0:
             raise InputError(f"JointFriction: transition [rad/s]: {self.transition:g}; give a number > 0")
 
     def arrays(self, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

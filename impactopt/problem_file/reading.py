@@ -79,9 +79,10 @@ class ProblemFile:
             return self
         try:
             data, places = change_and_place(self.data, settings)
-        except InputError as error:
+            text = write_toml(data)
+        except (InputError, TOMLError) as error:
             raise InputError(f"{self.path}: {error}") from error
-        return _checked(data, self.path, write_toml(data), {**self.lines, **dict.fromkeys(places, 0)})
+        return _checked(data, self.path, text, {**self.lines, **dict.fromkeys(places, 0)})
 
     def build(self) -> ImpactProblem:
         """The problem, with its robot.
@@ -141,10 +142,11 @@ def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[
     """Data checked like the text of a problem file, with that text; see `problem_from_data`."""
     try:
         check_plain(data)
+        data = plain_value(data)
+        text = write_toml(data)
     except TOMLError as error:
         raise InputError(f"{where}: {error}") from error
-    data = plain_value(data)
-    return _checked(data, Path(where), write_toml(data), {})
+    return _checked(data, Path(where), text, {})
 
 
 def read_problem_file(path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None) -> ProblemFile:
@@ -241,7 +243,9 @@ def _read(path: Path) -> str:
         return read_plain(path, LONGEST_TEXT).decode()
     except FileNotFoundError as error:
         folder = path.parent
-        near = did_you_mean(path.name, [p.name for p in folder.glob("*.toml")]) if folder.is_dir() else ""
+        near = (
+            did_you_mean(path.name, [p.name for p in folder.glob("*.toml")]) if os.path.isdir(folder) else ""
+        )
         raise InputError(f"there is no file {shortened(str(path), 300)}{near}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8: {error.reason} at byte {error.start}") from error

@@ -81,6 +81,10 @@ def write_toml(
 
     comment : of a key or a table at a place, "" for none; a key's stands behind it, a table's above.
     hidden : keys of the table at a place that are shown, but as comments.
+
+    Raises
+    ------
+    TOMLError : the data have something that is no table, list, number or text.
     """
     lines: list[str] = []
     _Writer(lines, comment, hidden).table(data, ())
@@ -177,4 +181,4 @@ def _value(value: Any) -> str:
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + "}"
-    raise TypeError(f"TOML has no {type(value).__name__}")
+    raise TOMLError(f"{value!r} is a {type(value).__name__}, which TOML does not have")

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.freezing import FREEZE_ERROR
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.errors import InputError
+from impactopt.errors import InputError, raw_array
 from impactopt.problem_file import ProblemFile, read_problem_file
 from impactopt.problem_file.toml import plain_value
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
@@ -59,9 +59,11 @@ def collide_many(
     """
     file = problem if isinstance(problem, ProblemFile) else read_problem_file(problem)
     whole = Collisions(file, at_contact or {}, outputs, keys=tuple(columns))
-    given = {key: np.atleast_1d(np.asarray(values)) for key, values in columns.items()}
+    given = {key: np.atleast_1d(raw_array(key, values)) for key, values in columns.items()}
     count = max((len(x) for x in given.values()), default=1)
     for key, values in given.items():
+        if not values.size:
+            raise InputError(f"{key}: has no values; give at least one")
         if len(values) not in (1, count):
             raise InputError(f"{key}: has {len(values)} values and other columns {count}; give as many")
     given = {key: np.repeat(x, count, axis=0) if len(x) != count else x for key, x in given.items()}
@@ -108,8 +110,8 @@ class Collisions:
                 if role_of(place) == "structure":
                     continue
                 values = np.asarray(columns[key])[rows]
-                whole = values.dtype == object or values.ndim > 1
-                for value in values[:1] if whole else (values.min(), values.max()):
+                numbers = values.dtype.kind in "fiu"  # NaN is among their least and their largest
+                for value in (values.min(axis=0), values.max(axis=0)) if numbers else values:
                     self._with({**structure, key: plain_value(value)})
             scene = self._scene(structure)
             for place in self.places.values():

@@ -1,0 +1,298 @@
+"""A small part of `impactopt bench attack`, and what its fuzzers have found: each fault with a test."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import impactopt
+from impactopt import (
+    Balance,
+    Incidence,
+    InputError,
+    JointFriction,
+    Phase,
+    Robot,
+    TargetBody,
+    collide_many,
+    draw_conditions,
+    load_robot,
+)
+from impactopt.bench import attack
+from impactopt.bench.attack_calls import CALLS, attack_call
+from impactopt.bench.attack_cases import FINE, REFUSED, Found, attempt
+from impactopt.bench.attack_collisions import strike, truth
+from impactopt.bench.attack_commands import make_result
+from impactopt.bench.attack_files import attack_file, texts
+from impactopt.bench.attack_sound import wrong_with_problem, wrong_with_robot
+from impactopt.bench.attack_urdfs import URDFS, attack_urdf
+from impactopt.cli import app
+from impactopt.problem_file import load_problem, read_problem_file
+
+SEED = 20
+# odd numbers overflow, and NumPy says so
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+
+
+def faults(found: list[Found]) -> list[Found]:
+    return [one for one in found if one.verdict not in (FINE, REFUSED)]
+
+
+# ------------------------------------------------------------ a small part of the attack
+def test_files_with_something_wrong(tmp_path: Path) -> None:
+    some = texts(("planar_arm", "arm7", "standin"))
+    rngs = [np.random.default_rng([SEED, 0, k]) for k in range(150)]
+    found = [attack_file(some[k % len(some)], tmp_path, rng) for k, rng in enumerate(rngs)]
+    assert not faults(found)
+    assert {one.verdict for one in found} == {FINE, REFUSED}
+
+
+def test_urdfs_with_something_wrong(tmp_path: Path) -> None:
+    rngs = [np.random.default_rng([SEED, 1, k]) for k in range(150)]
+    found = [attack_urdf(URDFS[k % len(URDFS)], tmp_path, rng) for k, rng in enumerate(rngs)]
+    assert not faults(found)
+    assert {one.verdict for one in found} == {FINE, REFUSED}
+
+
+def test_commands_with_something_wrong(tmp_path: Path) -> None:
+    result = make_result(tmp_path)
+    found = [attack.case("command", SEED, k, folder=tmp_path, result=result) for k in range(16)]
+    assert not faults(found)
+
+
+def test_calls_with_odd_numbers() -> None:
+    found = [attack_call(np.random.default_rng([SEED, 3, k])) for k in range(300)]
+    assert not faults(found)
+    assert {one.verdict for one in found} == {FINE, REFUSED}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_is_attacked_is_right_before(name: str) -> None:
+    function, given = CALLS[name]()
+    function(**given)
+
+
+def test_collisions_are_those_of_an_equation_of_their_own() -> None:
+    found = strike("planar_arm", "Kelvin-Voigt", "mass", 3, SEED)
+    assert (found.collisions, found.off, found.refused) == (3, 0, 0)
+    assert found.largest < 1e-6
+
+
+def test_a_collision_that_is_off_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def other(model: Any, blow: Any) -> Any:
+        true = truth(model, blow)
+        return type(true)(**{**vars(true), "impulse": 1.001 * true.impulse})
+
+    monkeypatch.setattr("impactopt.bench.attack_collisions.truth", other)
+    found = strike("planar_arm", "Kelvin-Voigt", "mass", 2, SEED)
+    assert found.off == found.collisions == len(found.faults) == 2
+
+
+def test_verdicts() -> None:
+    def refuse() -> str:
+        raise InputError("no")
+
+    def fail() -> str:
+        raise KeyError("x")
+
+    verdicts = [attempt("call", "", work).verdict for work in (lambda: "", lambda: "wrong", refuse, fail)]
+    assert verdicts == ["fine", "unsound", "refused", "traceback"]
+
+
+def test_unsound_problems_and_robots_are_told() -> None:
+    problem = load_problem("arm_planar")
+    assert wrong_with_problem(problem) == ""
+    for name, value in (
+        ("target", type(problem.target)(**problem.target.parameters)),
+        ("point", np.array([9.0, 0.0, 0.7])),
+        ("normal", np.array([0.0, 0.0, -2.0])),
+        ("smoothness", np.nan),
+    ):
+        other = load_problem("arm_planar")
+        object.__setattr__(other, name, value)
+        if name == "target":
+            object.__setattr__(other.target, "mass", -1.0)
+        assert wrong_with_problem(other), name
+    robot = load_robot("planar_arm")
+    robot.model.inertias[1].mass = -1.0
+    assert wrong_with_robot(robot)
+
+
+def test_the_bench_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = {"file": 3, "urdf": 3, "command": 0, "call": 3, "collision": 0}
+    monkeypatch.setattr(attack, "QUICK", few)
+    done = CliRunner().invoke(
+        app, ["bench", "attack", "--json", "--quick", "--quiet", "--seed", "1", "--workers", "1"]
+    )
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    names = ["files", "urdfs", "commands", "calls", "tracebacks", "slow", "unsound"]
+    assert [found[name] for name in names] == [3, 3, 0, 3, 0, 0, 0]
+    assert {"collisions", "off", "refused", "seconds"} <= found.keys()
+
+
+# ------------------------------------------------------------ what it has found
+@pytest.mark.parametrize(
+    "value", ["x", "1", None, [], [1.0, 2.0], {}, 1j, object(), np.array("x"), np.nan, -1.0, 1e300]
+)
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("TorqueLimit", "fraction"),
+        ("VelocityLimit", "fraction"),
+        ("PositionLimit", "margin"),
+        ("ContactWrenchCone", "friction"),
+        ("Balance", "vertical_speed"),
+        ("Incidence", "speed"),
+        ("LegExtension", "minimum"),
+        ("KeepOut", "margin"),
+        ("TorqueRate", "limit"),
+        ("HitCone", "angle"),
+        ("HitRegion", "radius"),
+        ("HitRegion", "size"),
+        ("Phase", "duration"),
+        ("JointFriction", "transition"),
+        ("JointFriction", "viscous"),
+        ("FreeMass", "mass"),
+        ("Spread", "mass"),
+        ("Spread", "payload"),
+        ("Scenario", "mass"),
+    ],
+)
+def test_numbers_that_are_none(name: str, key: str, value: Any) -> None:
+    needed: dict[str, Any] = {"Phase": {"intervals": 12}, "Scenario": {"name": "s"}}.get(name, {})
+    pair = isinstance(value, list) and len(value) == 2
+    if pair and (name, key) in (("Phase", "duration"), ("Spread", "mass"), ("Spread", "payload")):
+        pytest.skip("a range")
+    if isinstance(value, list) and key == "viscous":
+        pytest.skip("one a joint")
+    if isinstance(value, dict) and name == "TorqueRate":
+        pytest.skip("no joint has a limit")
+    with pytest.raises(InputError):
+        getattr(impactopt, name)(**{**needed, key: value})
+
+
+def test_what_may_be_any_is_without_end() -> None:
+    assert Balance(vertical_speed=np.inf).vertical_speed == Incidence(speed=np.inf).speed == np.inf
+    with pytest.raises(InputError, match="friction"):
+        impactopt.ContactWrenchCone(friction=np.inf)
+    with pytest.raises(InputError, match="enabled"):
+        impactopt.KeepOut(enabled="no")  # type: ignore[arg-type]
+
+
+def test_numbers_of_numpy_are_kept_as_numbers() -> None:
+    assert type(Balance(vertical_speed=np.float32(0.5)).vertical_speed) is float
+    assert Phase(duration=np.float64(0.5), intervals=np.int64(8)).duration == (0.5, 0.5)
+    assert JointFriction(viscous=np.ones(3)).arrays(3)[0].tolist() == [1.0] * 3
+
+
+@pytest.mark.parametrize("draws", [0, 1.5, "x", 2**40, None])
+def test_draws_are_a_number_of_them(draws: Any) -> None:
+    with pytest.raises(InputError, match="draws"):
+        draw_conditions(draws)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"collision_elements": np.array(1.0)}, "collision_elements"),
+        ({"collision_elements": ((0.5, "x"), (1.0,))}, "collision_elements"),
+        ({"collision_stages": 7}, "collision_stages"),
+        ({"coefficient_of_restitution": b"x"}, "coefficient_of_restitution"),
+        ({"smoothness": [1.0]}, "smoothness"),
+        ({"start": np.zeros(2)}, "start posture"),
+    ],
+)
+def test_problems_with_odd_numbers(changes: dict[str, Any], said: str) -> None:
+    function, given = CALLS["ImpactProblem"]()
+    with pytest.raises(InputError, match=said):
+        function(**{**given, **changes})
+
+
+def test_shapes_and_names_that_are_none() -> None:
+    with pytest.raises(InputError, match="shape"):
+        TargetBody(shape=np.zeros(2))  # type: ignore[arg-type]
+    robot = load_robot("planar_arm")
+    with pytest.raises(InputError, match="q: expected"):
+        robot.joint_positions("x")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="has no posture"):
+        robot.posture(np.zeros(3))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "values", [["x", "y"], [1e5, [1e5]], [], [1e5, np.nan], np.array([1e5, -1.0], dtype=object)]
+)
+def test_columns_that_are_no_numbers(values: Any) -> None:
+    with pytest.raises(InputError, match="stiffness"):
+        collide_many("arm_planar", {"contact.stiffness": values}, at_contact={"speed_m_s": 1.0})
+
+
+def test_points_one_of_which_is_none() -> None:
+    points = np.array([[0.7, 0.0, 0.75], ["a", 0.0, 0.0]], dtype=object)
+    with pytest.raises(InputError, match="point"):
+        collide_many("arm_planar", {"problem.point": points}, at_contact={"speed_m_s": 1.0})
+
+
+@pytest.mark.parametrize("value", [1j, object(), {1, 2}])
+def test_values_that_toml_does_not_have(value: Any) -> None:
+    with pytest.raises(InputError, match="TOML"):
+        read_problem_file("arm_planar", {"target.mass": value})
+
+
+def test_arrays_of_a_batch_with_rows_of_other_lengths() -> None:
+    function, given = CALLS["SDC.batch"]()
+    for name in ("torque", "contact_stiffness", "kd", "q"):
+        with pytest.raises(InputError, match=name):
+            function(**{**given, name: [[1.0], [1.0, 2.0]]})
+
+
+# a link of its own, and one that is fixed to it
+TWO = """<robot name="r"><link name="base"/><link name="arm">{0}</link><link name="hand">{1}</link>
+<joint name="j" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="f" type="fixed"><parent link="arm"/><child link="hand"/></joint></robot>"""
+INERTIAL = (
+    '<inertial><mass value="{0}"/><inertia ixx="{1}" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+@pytest.mark.parametrize(("mass", "moment"), [(-1, 1), (1, -0.1), ("inf", 1), ("1e300", 1), (1, "1e300")])
+def test_what_is_fixed_to_a_link_is_of_matter_too(tmp_path: Path, mass: Any, moment: Any) -> None:
+    path = tmp_path / "r.urdf"
+    path.write_text(TWO.format(INERTIAL.format(3, 1), INERTIAL.format(mass, moment)))
+    with pytest.raises(InputError, match="URDF"):
+        Robot.from_urdf(path, floating=False)
+    path.write_text(
+        TWO.format(INERTIAL.format(3, 1), INERTIAL.format(1, 1)).replace("<link", "<x:y/><link", 1)
+    )
+    assert Robot.from_urdf(path, floating=False).model.inertias[1].mass == 4.0
+
+
+@pytest.mark.parametrize(
+    "shape", ['cylinder radius="nan" length="1"', 'sphere radius="inf"', 'box size="1 1 1e9"']
+)
+def test_shapes_that_are_nowhere_are_left_out(tmp_path: Path, shape: str) -> None:
+    from impactopt.report.visuals import visuals_of
+
+    given = f"<visual><geometry><{shape}/></geometry></visual>"
+    path = tmp_path / "r.urdf"
+    path.write_text(TWO.format(INERTIAL.format(3, 1), INERTIAL.format(1, 1) + given))
+    with contextlib.suppress(InputError):  # which of them the parser takes is its own matter
+        shown = visuals_of(Robot.from_urdf(path, floating=False, urdf=path))
+        assert all((np.abs(one.solid.vertices) < 1e3).all() for one in shown)
+
+
+@pytest.mark.parametrize(
+    "words", [["collide"], ["show"], ["validate"], ["check"], ["collide", "--speed", "1"]]
+)
+def test_names_that_are_too_long_for_any(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(app, [*words, "a" * 5000]).exit_code == 2

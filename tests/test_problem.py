@@ -174,7 +174,7 @@ def test_a_fixed_base_holds_no_soles() -> None:
         ),
         ({"collision": "rigid", "coefficient_of_restitution": -0.1}, "between 0 and 1, not -0.1"),
         ({"collision": "rigid", "coefficient_of_restitution": 1.1}, "between 0 and 1, not 1.1"),
-        ({"collision": "rigid", "coefficient_of_restitution": np.nan}, "between 0 and 1, not nan"),
+        ({"collision": "rigid", "coefficient_of_restitution": np.nan}, "coefficient_of_restitution: nan"),
         ({"coefficient_of_restitution": 0.5}, "for collision=\"rigid\"; with 'dynamics' leave it out"),
         (
             {"collision": "virtual mass", "coefficient_of_restitution": 0.5},

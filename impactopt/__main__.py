@@ -1,5 +1,5 @@
 """`python -m impactopt`: the command line."""
 
-from impactopt.cli import main
+from impactopt.cli.app import main
 
 main()

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
 
-from impactopt.nlp.transcription import Transcription
-from impactopt.planner import solve
-from impactopt.problem_file import load_problem
-from impactopt.solution import Solution
+from impactopt.files.problem_file import load_problem
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.transcription.transcription import Transcription
 
 
 @pytest.fixture(scope="session")

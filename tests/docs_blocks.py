@@ -22,7 +22,7 @@ from sybil.parsers.markdown import CodeBlockParser
 from typer.main import get_command
 
 import impactopt
-from impactopt.cli import app
+from impactopt.cli.app import app
 
 ROOT = Path(impactopt.__file__).resolve().parents[1]
 PAGES = sorted(
@@ -98,7 +98,7 @@ def whole(fragment: str, base: str) -> str:
 
 def read_toml(example: Example) -> None:
     """A whole file, under the name that its first line gives, or a fragment of the page's last whole one."""
-    from impactopt.problem_file import read_problem_file
+    from impactopt.files.problem_file import read_problem_file
     from impactopt.sweeps import read_sweep_file
 
     text = str(example.parsed)

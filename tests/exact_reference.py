@@ -19,9 +19,9 @@ from scipy.optimize import brentq
 
 from impactopt.collision import SDC, JointFriction, Terms
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall, SpringDamper
-from impactopt.presets import standin, talos
-from impactopt.robot import Robot
-from impactopt.stance import BothSoles
+from impactopt.kinematics.stance import BothSoles
+from impactopt.robots.presets import standin, talos
+from impactopt.robots.robot import Robot
 
 TOLERANCES = {"rtol": 1e-13, "atol": 1e-16}
 LONGEST = 1e-4  # [s] of a step

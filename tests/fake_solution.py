@@ -10,15 +10,15 @@ import pinocchio as pin
 from small_robots import biped
 
 from impactopt.contact import FreeMass, SpringDamper
-from impactopt.motion import CubicSpline
-from impactopt.objectives import Impulse
-from impactopt.plan import Plan, PlannedCollision
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.program import IterationRecord, SolverResult, Status, Violation
-from impactopt.solution import Solution
-from impactopt.starts import Attempt
-from impactopt.statics import static_wrenches
-from impactopt.validation import Simulation
+from impactopt.kinematics.splines import CubicSpline
+from impactopt.kinematics.statics import static_wrenches
+from impactopt.planning.multistart import Attempt
+from impactopt.planning.solution import Solution
+from impactopt.problem.objectives import Impulse
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.simulation import Simulation
+from impactopt.solvers.program import IterationRecord, SolverResult, Status, Violation
+from impactopt.transcription.plan import Plan, PlannedCollision
 
 # a problem file, for tests whose solver is made up
 PROBLEM_FILE = """\

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from textbook import CASES, INF, Case, Textbook
 
-from impactopt.sqp import QuadraticProgram
+from impactopt.solvers.sqp import QuadraticProgram
 
 QPS: dict[str, Case] = {name: CASES[name] for name in ("HS21", "HS35", "HS76")}
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from small_robots import biped, slider
 
 from impactopt.contact import FreeMass, SpringDamper
-from impactopt.coordinates import StanceCoordinates
-from impactopt.robot import Robot
-from impactopt.statics import static_wrenches
-from impactopt.support import support_polygon
-from impactopt.validation import Scene, Simulation, simulate_pinocchio
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.statics import static_wrenches
+from impactopt.kinematics.support import support_polygon
+from impactopt.robots.robot import Robot
+from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 
 Array = NDArray[np.float64]
 NOWHERE = np.array([50.0, 0.0, 0.0])  # a target that is never hit

@@ -17,20 +17,20 @@ from small_robots import arm, biped, striking_point
 
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.apart import LENGTHS, apart
-from impactopt.nlp.blocks import BlockExpression, builders
-from impactopt.nlp.extra_blocks import extra_blocks
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.structured import derivative_functions
-from impactopt.nlp.transcription import Transcription
-from impactopt.plan import Plan, Trajectory
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.program import SolverResult
-from impactopt.stance import FixedBase
-from impactopt.support import support_polygon
-from impactopt.terms import KeepOut, SelfCollision, Term
-from impactopt.validation import Scene, Simulation, scene_of, simulate_pinocchio
+from impactopt.kinematics.stance import FixedBase
+from impactopt.kinematics.support import support_polygon
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.terms import KeepOut, SelfCollision, Term
+from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.apart import LENGTHS, apart
+from impactopt.transcription.blocks import BlockExpression, builders
+from impactopt.transcription.extra_blocks import extra_blocks
+from impactopt.transcription.plan import Plan, Trajectory
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.structured import derivative_functions
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 LAW = SpringDamper(stiffness=1e4, damping=300.0)

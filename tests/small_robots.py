@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impactopt.robot import Robot, Sole, Striker
+from impactopt.robots.robot import Robot, Sole, Striker
 
 HALF_SITTING = {"hip pitch": -0.4, "knee": 0.8, "ankle pitch": -0.4}
 

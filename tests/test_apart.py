@@ -19,19 +19,19 @@ from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
 from impactopt.bodies.clearance import Places
 from impactopt.bodies.fit import PLANES, Planes
 from impactopt.bodies.robot_bodies import bodies_of
-from impactopt.coordinates import StanceCoordinates
-from impactopt.keeping_apart import BEAD, Margins, missing_rows, rows_near, rows_to_add, spots_of
-from impactopt.nlp.apart import LENGTHS, ROUND, ApartRow, Chain, Held, apart, chain_between
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.structured import derivative_functions
-from impactopt.nlp.transcription import Transcription, block_functions
-from impactopt.plan import Plan
-from impactopt.presets import g1, standin, talos
-from impactopt.problem import ImpactProblem
-from impactopt.program import Status
-from impactopt.robot import Robot
-from impactopt.solution import Solution
-from impactopt.terms import Term
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.planning.keeping_apart import BEAD, Margins, missing_rows, rows_near, rows_to_add, spots_of
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import Term
+from impactopt.robots.presets import g1, standin, talos
+from impactopt.robots.robot import Robot
+from impactopt.solvers.program import Status
+from impactopt.transcription.apart import LENGTHS, ROUND, ApartRow, Chain, Held, apart, chain_between
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.structured import derivative_functions
+from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 APART = (SelfCollision(), KeepOut())

@@ -24,16 +24,16 @@ from impactopt import (
     draw_conditions,
     load_robot,
 )
-from impactopt.bench import attack
-from impactopt.bench.attack_calls import CALLS, attack_call
-from impactopt.bench.attack_cases import FINE, REFUSED, Found, attempt
-from impactopt.bench.attack_collisions import strike, truth
-from impactopt.bench.attack_commands import make_result
-from impactopt.bench.attack_files import attack_file, texts
-from impactopt.bench.attack_sound import wrong_with_problem, wrong_with_robot
-from impactopt.bench.attack_urdfs import URDFS, attack_urdf
-from impactopt.cli import app
-from impactopt.problem_file import load_problem, read_problem_file
+from impactopt.cli.app import app
+from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.studies.bench import attack
+from impactopt.studies.bench.attack_calls import CALLS, attack_call
+from impactopt.studies.bench.attack_cases import FINE, REFUSED, Found, attempt
+from impactopt.studies.bench.attack_collisions import strike, truth
+from impactopt.studies.bench.attack_commands import make_result
+from impactopt.studies.bench.attack_files import attack_file, texts
+from impactopt.studies.bench.attack_sound import wrong_with_problem, wrong_with_robot
+from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
 
 SEED = 20
 # odd numbers overflow, and NumPy says so
@@ -89,7 +89,7 @@ def test_a_collision_that_is_off_is_counted(monkeypatch: pytest.MonkeyPatch) -> 
         true = truth(model, blow)
         return type(true)(**{**vars(true), "impulse": 1.001 * true.impulse})
 
-    monkeypatch.setattr("impactopt.bench.attack_collisions.truth", other)
+    monkeypatch.setattr("impactopt.studies.bench.attack_collisions.truth", other)
     found = strike("planar_arm", "Kelvin-Voigt", "mass", 2, SEED)
     assert found.off == found.collisions == len(found.faults) == 2
 

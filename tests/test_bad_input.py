@@ -29,20 +29,20 @@ from impactopt import (
     optimize_strike,
     solve,
 )
-from impactopt._compiler import CompileError, Compiler, find_compiler
-from impactopt.cases import striking_velocity
+from impactopt.codegen.compiler import CompileError, Compiler, find_compiler
 from impactopt.collision import effective_mass
 from impactopt.errors import printable
-from impactopt.problem import FINEST
-from impactopt.problem_file import load_problem, read_problem_file
-from impactopt.problem_file.changes import parse_settings
-from impactopt.problem_file.mistakes import key_lines
-from impactopt.problem_file.names import problem_file
-from impactopt.reference import holding_torque
+from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.files.problem_file.changes import parse_settings
+from impactopt.files.problem_file.mistakes import key_lines
+from impactopt.files.problem_file.names import problem_file
+from impactopt.problem.problem import FINEST
 from impactopt.report.page import html_page
-from impactopt.sqp.ordering import elimination_blocks
+from impactopt.simulation import simulate
+from impactopt.simulation.cases import striking_velocity
+from impactopt.simulation.reference import holding_torque
+from impactopt.solvers.sqp.ordering import elimination_blocks
 from impactopt.sweeps import read_sweep_file
-from impactopt.validation import simulate
 
 ARM = problem_file("arm_planar").read_text(encoding="utf-8")
 OWN = ARM.replace('robot = "planar_arm"\n', "") + '\n[robot]\npreset = "planar_arm"\n'
@@ -254,7 +254,7 @@ def test_a_compiler_whose_children_hang_is_given_up(tmp_path: Path, monkeypatch:
     script = tmp_path / "cc"
     script.write_text("#!/bin/sh\nsleep 60 &\nwait\n")  # the child holds the output open
     script.chmod(0o755)
-    monkeypatch.setattr("impactopt._compiler._LONGEST", 0.2)
+    monkeypatch.setattr("impactopt.codegen.compiler._LONGEST", 0.2)
     began = time.perf_counter()
     with pytest.raises(CompileError, match=r"0\.2 s"):
         Compiler(command=(str(script),), version="1").run(tmp_path / "a.c", tmp_path / "a.so", "-O1")

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from small_robots import arm, biped, striking_point
 
-from impactopt.baseline import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.stance import FixedBase
-from impactopt.terms import TorqueLimit
+from impactopt.kinematics.stance import FixedBase
+from impactopt.planning.baseline import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.terms import TorqueLimit
 
 LAW = SpringDamper(stiffness=1e4, damping=300.0)
 

@@ -12,16 +12,16 @@ import pytest
 from fake_solution import IMPULSE, PROBLEM_FILE, FakeSolution, MissingSolution, still_problem, still_solution
 from typer.testing import CliRunner
 
-from impactopt.bench import replay, robustness, truth
-from impactopt.bench.registry import BENCHES, run_bench
-from impactopt.bench.report import Report, columns_table, make_table, save_report
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file import ProblemFile
-from impactopt.program import Status
-from impactopt.solution import Solution
-from impactopt.validation import Simulation
+from impactopt.files.problem_file import ProblemFile
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation import Simulation
+from impactopt.solvers.program import Status
+from impactopt.studies.bench import replay, robustness, truth
+from impactopt.studies.bench.registry import BENCHES, run_bench
+from impactopt.studies.bench.report import Report, columns_table, make_table, save_report
 
 HEADS = {"seconds", "versions", "machine"}
 
@@ -29,7 +29,7 @@ runner = CliRunner()
 
 
 class Planner:
-    """Stands in for `impactopt.planner.solve`."""
+    """Stands in for `impactopt.planning.planner.solve`."""
 
     def __init__(self) -> None:
         self.status, self.kind = Status.SOLVED, FakeSolution
@@ -47,7 +47,7 @@ def problem() -> ImpactProblem:
 def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem, tmp_path: Path) -> Planner:
     """No solver and no big robot; one problem file in the directory that the benches run in."""
     planner = Planner()
-    monkeypatch.setattr("impactopt.bench.planning.solve", planner)
+    monkeypatch.setattr("impactopt.studies.bench.planning.solve", planner)
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     monkeypatch.setattr(truth, "VARIANTS", {})
     (tmp_path / "problems").mkdir()
@@ -223,7 +223,7 @@ def test_out_keeps_numbers_and_pictures(planner: Planner) -> None:
 def test_all_runs_every_bench(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
     planner.kind = FirstOrder
     benches = {name: name for name in ("truth", "robustness", "replay")}
-    monkeypatch.setattr("impactopt.bench.registry.BENCHES", benches)
+    monkeypatch.setattr("impactopt.studies.bench.registry.BENCHES", benches)
     result = run("all", "--draws", "1", "--workers", "1", "--out", "kept", "--json")
     assert result.exit_code == 0, result.output
     assert list(json.loads(result.stdout)) == list(benches)

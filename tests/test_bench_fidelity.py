@@ -11,20 +11,20 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from impactopt.bench import fidelity, virtual_base
-from impactopt.bench.fidelity import Task
-from impactopt.bench.ladder import GAINS, HORIZON, MASS_RATIOS, TARGETS, Rung, situations
-from impactopt.bench.report import Report
-from impactopt.bench.virtual_base import Hand
-from impactopt.cases import PAPER_SPEEDS
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
-from impactopt.plotting.fidelity import fidelity_picture
-from impactopt.plotting.virtual_base import virtual_base_picture
-from impactopt.presets import standin
-from impactopt.robot import Robot
-from impactopt.stance import BothSoles
+from impactopt.kinematics.stance import BothSoles
+from impactopt.pictures.fidelity import fidelity_picture
+from impactopt.pictures.virtual_base import virtual_base_picture
+from impactopt.robots.presets import standin
+from impactopt.robots.robot import Robot
+from impactopt.simulation.cases import PAPER_SPEEDS
+from impactopt.studies.bench import fidelity, virtual_base
+from impactopt.studies.bench.fidelity import Task
+from impactopt.studies.bench.ladder import GAINS, HORIZON, MASS_RATIOS, TARGETS, Rung, situations
+from impactopt.studies.bench.report import Report
+from impactopt.studies.bench.virtual_base import Hand
 
 runner = CliRunner()
 

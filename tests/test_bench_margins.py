@@ -12,20 +12,20 @@ import pytest
 from fake_solution import IMPULSE, PROBLEM_FILE, simulation_of, still_problem, still_solution
 from typer.testing import CliRunner
 
-from impactopt.bench import margins
-from impactopt.bench.margins import OPTIONS, Option
-from impactopt.bench.report import Report
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.plotting.margins import margins_picture
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file import ProblemFile
-from impactopt.program import Status
-from impactopt.robustness import Robustness, Spread, draw_conditions
-from impactopt.scenario import Scenario
-from impactopt.solution import Solution
-from impactopt.terms import Balance, ContactWrenchCone, TorqueLimit
-from impactopt.validation import Conditions, Simulation
+from impactopt.files.problem_file import ProblemFile
+from impactopt.pictures.margins import margins_picture
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
+from impactopt.simulation import Conditions, Simulation
+from impactopt.simulation.robustness import Robustness, Spread, draw_conditions
+from impactopt.solvers.program import Status
+from impactopt.studies.bench import margins
+from impactopt.studies.bench.margins import OPTIONS, Option
+from impactopt.studies.bench.report import Report
 
 VALUES = [(option, value) for option in OPTIONS for value in option.values]
 EXPECTED_SLIP = np.array([1e-3, 0.5, 3e-3, 2e-3])  # [m] of four draws; the second falls
@@ -217,6 +217,6 @@ def test_with_all_others_it_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
         asked[name] = options
         return Report(name=name, numbers={})
 
-    monkeypatch.setattr("impactopt.bench.registry.run_bench", run_bench)
+    monkeypatch.setattr("impactopt.studies.bench.registry.run_bench", run_bench)
     assert CliRunner().invoke(app, ["bench", "all", "--draws", "200", "--json"]).exit_code == 0
     assert asked["margins"]["quick"] and asked["margins"]["draws"] < 40

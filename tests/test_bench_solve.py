@@ -18,16 +18,16 @@ from small_plans import arm_problem
 from textbook import CASES, Textbook, assert_optimal, infeasible, textbook_program
 from typer.testing import CliRunner
 
-from impactopt.bench import solve
-from impactopt.bench.attempts import Attempt, attempt, judged
-from impactopt.bench.casadi_peer import solve_sqpmethod
-from impactopt.bench.scipy_peer import solve_slsqp, solve_trust_constr
-from impactopt.bench.solvers import SOLVERS
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.nlp.transcription import Transcription
-from impactopt.program import Status
-from impactopt.sqp import QP_SOLVERS
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import QP_SOLVERS
+from impactopt.studies.bench import solve
+from impactopt.studies.bench.attempts import Attempt, attempt, judged
+from impactopt.studies.bench.casadi_peer import solve_sqpmethod
+from impactopt.studies.bench.scipy_peer import solve_slsqp, solve_trust_constr
+from impactopt.studies.bench.solvers import SOLVERS
+from impactopt.transcription.transcription import Transcription
 
 KEYS = [
     "problem", "solver", "qp", "starts", "success", "median_seconds", "median_iterations", "objective",
@@ -189,7 +189,7 @@ def deadly(how: str, _start: int) -> Any:
 def test_what_a_solver_does_costs_its_own_attempt_only(
     how: str, status: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("impactopt.bench.attempts.GRACE", 0.5)
+    monkeypatch.setattr("impactopt.studies.bench.attempts.GRACE", 0.5)
     found = attempt(functools.partial(deadly, how), 0, "sqp:interior", 0.1)
     assert found.status == status
     assert message in found.message
@@ -204,7 +204,7 @@ def textbook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.chdir(tmp_path)
     for name in ("HS71", "infeasible"):
         (tmp_path / f"{name}.toml").write_text(PROBLEM_FILE, encoding="utf-8")
-    monkeypatch.setattr("impactopt._folders.FOLDERS", (tmp_path,))
+    monkeypatch.setattr("impactopt.storage.folders.FOLDERS", (tmp_path,))
     return tmp_path
 
 
@@ -262,8 +262,8 @@ def test_starts_are_plain_first_and_drawn_by_the_seed(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     functions = arm_transcription.functions
-    monkeypatch.setattr("impactopt.problem_file.load_problem", lambda file: arm_problem())
-    monkeypatch.setattr("impactopt.nlp.transcription.block_functions", lambda problem, c: functions)
+    monkeypatch.setattr("impactopt.files.problem_file.load_problem", lambda file: arm_problem())
+    monkeypatch.setattr("impactopt.transcription.transcription.block_functions", lambda problem, c: functions)
     start = lambda seed, k: solve.planning_program(Path("arm.toml"), seed, k)[1]  # noqa: E731
     plain = start(0, 0)
     np.testing.assert_array_equal(plain, start(5, 0))

@@ -12,19 +12,19 @@ import small_robots
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_native import FRICTION, LAW, TARGET, sdc, situation
 
-from impactopt._compiler import find_compiler
-from impactopt.bench import clock, collision, scaling, skip
-from impactopt.bench.registry import run_bench
-from impactopt.bench.scene import Scene
-from impactopt.cases import Case
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Terms, VirtualMass
 from impactopt.collision.describe import independent_joints
 from impactopt.errors import InputError
-from impactopt.plotting.pareto import front, pareto_picture
-from impactopt.plotting.scaling import scaling_picture
-from impactopt.plotting.skip import skip_picture
-from impactopt.plotting.style import STYLE
-from impactopt.presets import standin
+from impactopt.pictures.pareto import front, pareto_picture
+from impactopt.pictures.scaling import scaling_picture
+from impactopt.pictures.skip import skip_picture
+from impactopt.pictures.style import STYLE
+from impactopt.robots.presets import standin
+from impactopt.simulation.cases import Case
+from impactopt.studies.bench import clock, collision, scaling, skip
+from impactopt.studies.bench.registry import run_bench
+from impactopt.studies.bench.scene import Scene
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 unwarned = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -250,7 +250,7 @@ def test_a_front_is_of_what_nothing_beats() -> None:
 
 @compiled
 def test_a_step_that_is_unstable_has_a_row_that_says_so(scene: Scene) -> None:
-    from impactopt.bench import methods
+    from impactopt.studies.bench import methods
 
     found, refused = [], []
     maker = methods._ours(scene, quiet, found, refused)
@@ -390,7 +390,7 @@ def test_legends_of_scaling_leave_the_data_free() -> None:
 
 @pytest.mark.parametrize("name", ["collision", "scaling", "skip"])
 def test_the_benches_are_among_all(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from impactopt.bench.report import Report
+    from impactopt.studies.bench.report import Report
 
     module = {"collision": collision, "scaling": scaling, "skip": skip}[name]
     monkeypatch.setattr(module, "run", lambda _say, **_options: Report(name=name, numbers={"rows": []}))

@@ -21,15 +21,15 @@ from fake_solution import (
 from typer.testing import CliRunner
 
 from impactopt import load_problem
-from impactopt.bench import zoo
-from impactopt.bench.zoo import BASES, cleanliness, draw, drawn_problem, row, run
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.presets import standin
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file import ProblemFile
-from impactopt.program import Status
-from impactopt.solution import Solution
+from impactopt.files.problem_file import ProblemFile
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.presets import standin
+from impactopt.solvers.program import Status
+from impactopt.studies.bench import zoo
+from impactopt.studies.bench.zoo import BASES, cleanliness, draw, drawn_problem, row, run
 
 PROBLEMS = Path(__file__).resolve().parents[1] / "problems"
 
@@ -94,7 +94,7 @@ def test_a_point_out_of_reach_is_drawn_again(punch: ImpactProblem) -> None:
 
 def test_nothing_in_reach_is_an_error(punch: ImpactProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zoo, "TRIES", 2)
-    monkeypatch.setattr("impactopt.problem.reach", _unreachable)
+    monkeypatch.setattr("impactopt.problem.problem.reach", _unreachable)
     with pytest.raises(InputError, match="nowhere"):
         drawn_problem(punch, (0.1, 0.1, 0.1), np.random.default_rng(0))
 
@@ -210,7 +210,7 @@ def test_clean_ones_are_counted(solver: Solver, monkeypatch: pytest.MonkeyPatch)
 @pytest.fixture
 def files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Three files, of which one is wrong and one is hopeless."""
-    monkeypatch.setattr("impactopt.bench.planning.solve", lambda problem, **_: still_solution())
+    monkeypatch.setattr("impactopt.studies.bench.planning.solve", lambda problem, **_: still_solution())
     monkeypatch.setattr(ProblemFile, "build", lambda self: still_problem())
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "problems"

@@ -11,20 +11,18 @@ import pytest
 from numpy.typing import NDArray
 from small_plans import BODILESS, Planned, changed
 
-from impactopt import between, planner
-from impactopt.between import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
-from impactopt.extra_terms import (
+from impactopt.kinematics.splines import CubicSpline
+from impactopt.planning import planner
+from impactopt.problem.extra_terms import (
     Gaze,
     HandOrientation,
     HitCone,
     HitRegion,
     TorqueRate,
 )
-from impactopt.motion import CubicSpline
-from impactopt.nlp.start import carried_over, first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.objectives import (
+from impactopt.problem.objectives import (
     AngularMomentum,
     Effort,
     Impulse,
@@ -33,14 +31,17 @@ from impactopt.objectives import (
     Penetration,
     TargetEnergy,
 )
-from impactopt.plan import Plan
-from impactopt.problem import Phase
-from impactopt.program import Status
-from impactopt.scenario import Scenario
-from impactopt.shapes import Obstacle, TargetBody
-from impactopt.sqp import solve_sqp
-from impactopt.terms import ContactWrenchCone, Term, TorqueLimit
-from impactopt.validation.result import distance_inside
+from impactopt.problem.problem import Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import ContactWrenchCone, Term, TorqueLimit
+from impactopt.simulation.result import distance_inside
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import solve_sqp
+from impactopt.transcription import mesh_refinement as between
+from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import carried_over, first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 
@@ -160,7 +161,11 @@ KINDS = {type(thing) for thing in ON_TOP.values()} | {Impulse, AngularMomentum}
 def test_all_objectives_and_extra_terms_are_tried_here() -> None:
     """The biped's test below has the angular momentum."""
     known = {*Objective.__subclasses__(), *Term.__subclasses__()}
-    ours = {kind for kind in known if kind.__module__ in ("impactopt.objectives", "impactopt.extra_terms")}
+    ours = {
+        kind
+        for kind in known
+        if kind.__module__ in ("impactopt.problem.objectives", "impactopt.problem.extra_terms")
+    }
     assert ours == KINDS
 
 

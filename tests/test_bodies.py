@@ -23,13 +23,13 @@ from impactopt.bodies.clearance import FAR, MISSED, Bodies, Places
 from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface_points
 from impactopt.bodies.pieces import convex, inertia_box, pieces_of
 from impactopt.bodies.robot_bodies import bodies_of, distance
+from impactopt.bodies.shapes import Obstacle, face_axes
 from impactopt.bodies.world import BEHIND, WorldBody, ground, obstacle_bodies, target_bodies
 from impactopt.contact import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
-from impactopt.presets import g1, planar_arm, standin, talos
-from impactopt.problem import ImpactProblem
-from impactopt.robot import Robot, Tool
-from impactopt.shapes import Obstacle, face_axes
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.presets import g1, planar_arm, standin, talos
+from impactopt.robots.robot import Robot, Tool
 
 Array = NDArray[np.float64]
 EXACT = 1e-6  # [m] of coal's distances

@@ -10,12 +10,12 @@ import pytest
 from small_plans import Planned, changed
 
 from impactopt.errors import InputError
-from impactopt.nlp.transcription import Transcription
-from impactopt.output import load_record, record_of, save_record
-from impactopt.replay import load_planned
-from impactopt.scenario import Scenario
-from impactopt.solution import Solution
-from impactopt.validation import Conditions
+from impactopt.files.output import load_record, record_of, save_record
+from impactopt.files.replay import load_planned
+from impactopt.planning.solution import Solution
+from impactopt.problem.scenario import Scenario
+from impactopt.simulation import Conditions
+from impactopt.transcription.transcription import Transcription
 
 PROBLEM = Path(__file__).resolve().parents[1] / "problems" / "punch.toml"
 

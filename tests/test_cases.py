@@ -10,19 +10,19 @@ import pinocchio as pin
 import pytest
 from small_robots import arm, biped, slider
 
-from impactopt.cases import (
+from impactopt.collision import SDC, Collision, VirtualMass
+from impactopt.contact import FreeMass, SpringDamper
+from impactopt.errors import InputError
+from impactopt.kinematics.support import margin
+from impactopt.robots.presets import standin
+from impactopt.robots.robot import Robot
+from impactopt.simulation.cases import (
     Case,
     errors_against,
     paper_motions,
     posture_of_effective_mass,
     striking_velocity,
 )
-from impactopt.collision import SDC, Collision, VirtualMass
-from impactopt.contact import FreeMass, SpringDamper
-from impactopt.errors import InputError
-from impactopt.presets import standin
-from impactopt.robot import Robot
-from impactopt.support import margin
 
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)
 

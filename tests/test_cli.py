@@ -16,14 +16,14 @@ from fake_solution import FakeSolution, MissingSolution, still_problem, still_so
 from typer.testing import CliRunner
 
 import impactopt
-from impactopt.cli import app
-from impactopt.output import Record, load_record
-from impactopt.plotting import PICTURES
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file import ProblemFile
-from impactopt.program import IterationRecord, Status, Violation
-from impactopt.solution import Solution
-from impactopt.starts import Attempt
+from impactopt.cli.app import app
+from impactopt.files.output import Record, load_record
+from impactopt.files.problem_file import ProblemFile
+from impactopt.pictures import PICTURES
+from impactopt.planning.multistart import Attempt
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import IterationRecord, Status, Violation
 
 GOOD = """\
 [problem]
@@ -51,7 +51,9 @@ runner = CliRunner()
 
 
 class Planner:
-    """Stands in for `impactopt.planner.solve`: remembers how it was called, and reports some progress."""
+    """Stands in for `impactopt.planning.planner.solve`: remembers how it was called, and reports some
+    progress.
+    """
 
     def __init__(self) -> None:
         self.options: dict[str, Any] = {}
@@ -84,8 +86,8 @@ def problem() -> ImpactProblem:
 def planner(monkeypatch: pytest.MonkeyPatch, problem: ImpactProblem) -> Planner:
     """No solver and no big robot: files are read, but the problem is a small one."""
     planner = Planner()
-    monkeypatch.setattr("impactopt.planner.solve", planner)
-    monkeypatch.setattr("impactopt.replay.has_mujoco", lambda: True)
+    monkeypatch.setattr("impactopt.planning.planner.solve", planner)
+    monkeypatch.setattr("impactopt.files.replay.has_mujoco", lambda: True)
     monkeypatch.setattr(ProblemFile, "build", lambda self: problem)
     return planner
 
@@ -101,7 +103,7 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReque
         return paths
 
     if "real_pictures" not in request.fixturenames:
-        monkeypatch.setattr("impactopt.plotting.save_pictures", save)
+        monkeypatch.setattr("impactopt.pictures.save_pictures", save)
 
 
 @pytest.fixture
@@ -186,7 +188,7 @@ def test_free_soles_have_a_column_where_mujoco_is_installed(
     assert "free soles" in out and "yes" in row
     summary = json.loads((tmp_path / "with" / "summary.json").read_text())
     assert summary["replayed"]["engine"] == "mujoco" and summary["simulated"]["engine"] == "pinocchio"
-    monkeypatch.setattr("impactopt.replay.has_mujoco", lambda: False)
+    monkeypatch.setattr("impactopt.files.replay.has_mujoco", lambda: False)
     out, err = run("solve", file, "--out", tmp_path / "without")
     assert "free soles" not in out and "mujoco" not in (out + err).lower()
     assert "replayed" not in json.loads((tmp_path / "without" / "summary.json").read_text())
@@ -199,7 +201,7 @@ def test_the_baseline_is_reported_beside_the_plan(
         def describe(self) -> dict[str, object]:
             return {"method": "minimum jerk", "impulse_Ns": 1.5, "hand_speed_m_s": 0.4}
 
-    monkeypatch.setattr("impactopt.baseline.minimum_jerk_baseline", lambda problem: Reach())
+    monkeypatch.setattr("impactopt.planning.baseline.minimum_jerk_baseline", lambda problem: Reach())
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "minimum-jerk reach inside the same limits: 1.50 N s at 0.40 m/s" in out
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["baseline"]["impulse_Ns"] == 1.5
@@ -207,7 +209,7 @@ def test_the_baseline_is_reported_beside_the_plan(
     def nothing(problem: ImpactProblem) -> Reach:
         raise impactopt.InputError("no reach keeps the limits")
 
-    monkeypatch.setattr("impactopt.baseline.minimum_jerk_baseline", nothing)
+    monkeypatch.setattr("impactopt.planning.baseline.minimum_jerk_baseline", nothing)
     out, _ = run("solve", file, "--out", tmp_path / "out", "--baseline")
     assert "no reach keeps the limits" in out
 
@@ -373,7 +375,7 @@ def test_help_and_version() -> None:
 
 def test_help_loads_nothing_heavy() -> None:
     code = (
-        "import sys, impactopt.cli\n"
+        "import sys, impactopt.cli.app\n"
         "heavy = ('casadi', 'pinocchio', 'numpy', 'scipy', 'matplotlib', 'pydantic')\n"
         "print([m for m in heavy if m in sys.modules])"
     )

@@ -18,11 +18,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impactopt import codegen, private_files
-from impactopt._compiler import Compiler, find_compiler
-from impactopt._hashing import canonical
-from impactopt.codegen import cache_directory, cached, model_hash
+from impactopt.codegen import cache as codegen
+from impactopt.codegen.cache import cache_directory, cached, model_hash
+from impactopt.codegen.compiler import Compiler, find_compiler
 from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
+from impactopt.storage import private_files
+from impactopt.storage.hashing import canonical
 
 ROOT = Path(__file__).parent.parent
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -213,7 +214,7 @@ def test_cache_directory_follows_the_environment(monkeypatch: pytest.MonkeyPatch
 WORKER = """
 import sys, time
 import casadi as ca
-from impactopt.codegen import cached
+from impactopt.codegen.cache import cached
 def build():
     with open(sys.argv[1], "a") as log:
         log.write("built\\n")

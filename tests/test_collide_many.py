@@ -11,16 +11,16 @@ import pinocchio as pin
 import pytest
 from small_robots import arm, biped
 
-from impactopt.cases import striking_velocity
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.output import Record, save_record
-from impactopt.presets import load_robot
-from impactopt.problem_file import ProblemFile, problem_file_from_data
-from impactopt.reference import holding_torque
-from impactopt.stance import BothSoles, FixedBase
-from impactopt.support import margin
+from impactopt.files.output import Record, save_record
+from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.kinematics.stance import BothSoles, FixedBase
+from impactopt.kinematics.support import margin
+from impactopt.robots.presets import load_robot
+from impactopt.simulation.cases import striking_velocity
+from impactopt.simulation.reference import holding_torque
 from impactopt.sweeps.collisions import Collisions, collide_many
 from impactopt.sweeps.states import ContactStates, Posture
 

@@ -14,12 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 import impactopt
-from impactopt._command_options import complete_problem
-from impactopt.cli import app
-from impactopt.output import Record, save_record
-from impactopt.problem_file import load_problem, problem_names, read_problem_file, write_toml
-from impactopt.reference import FullDynamics
-from impactopt.robot import Robot
+from impactopt.cli.app import app
+from impactopt.cli.options import complete_problem
+from impactopt.files.output import Record, save_record
+from impactopt.files.problem_file import load_problem, problem_names, read_problem_file, write_toml
+from impactopt.robots.robot import Robot
+from impactopt.simulation.reference import FullDynamics
 from impactopt.sweeps.single import collide_once
 
 ROOT = Path(__file__).parents[1]
@@ -210,7 +210,7 @@ def test_a_fault_of_ours_is_no_answer(file: Path, monkeypatch: pytest.MonkeyPatc
     def fail(*arguments: Any, **options: Any) -> Robot:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("impactopt.problem_file.robot_sections.load_robot", fail)
+    monkeypatch.setattr("impactopt.files.problem_file.robot_sections.load_robot", fail)
     _, err = run("check", file, code=70)
     assert "ZeroDivisionError: a bug" in err and "fault of impactopt" in err
 
@@ -230,8 +230,8 @@ def test_help_and_completion_load_nothing_heavy() -> None:
     code = (
         "import sys\n"
         "from typer.testing import CliRunner\n"
-        "from impactopt.cli import app\n"
-        "from impactopt._command_options import complete_problem, complete_sweep\n"
+        "from impactopt.cli.app import app\n"
+        "from impactopt.cli.options import complete_problem, complete_sweep\n"
         "assert 'punch' in complete_problem('pun')\n"
         "assert complete_sweep('collision_t') == ['collision_target']\n"
         "for arguments in (['--help'], ['solve', '--help'], ['collide', '-h'], ['bench', '--help'], []):\n"

@@ -9,13 +9,13 @@ import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from impactopt.nlp.start import first_iterate
-from impactopt.sqp.cholesky import BlockCholesky
-from impactopt.sqp.compiled import kernels
-from impactopt.sqp.condense import Condenser, Determined, find_eliminations
-from impactopt.sqp.kernels import Kernels
-from impactopt.sqp.newton import NewtonSystem
-from impactopt.sqp.patterns import Elimination
+from impactopt.solvers.sqp.cholesky import BlockCholesky
+from impactopt.solvers.sqp.compiled import kernels
+from impactopt.solvers.sqp.condense import Condenser, Determined, find_eliminations
+from impactopt.solvers.sqp.kernels import Kernels
+from impactopt.solvers.sqp.newton import NewtonSystem
+from impactopt.solvers.sqp.patterns import Elimination
+from impactopt.transcription.start import first_iterate
 
 NONE = np.zeros(9, dtype=bool)
 

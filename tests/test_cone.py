@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from impactopt.cone import contact_wrench_cone, shrink
 from impactopt.errors import InputError
-from impactopt.support import margin, support_polygon, zmp
+from impactopt.kinematics.support import margin, support_polygon, zmp
+from impactopt.kinematics.wrench_cone import contact_wrench_cone, shrink
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

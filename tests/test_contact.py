@@ -27,8 +27,8 @@ from impactopt.contact import (
     SpringDamper,
 )
 from impactopt.errors import InputError
-from impactopt.presets import g1, talos
-from impactopt.stance import BothSoles, FixedBase, OneSole
+from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
+from impactopt.robots.presets import g1, talos
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

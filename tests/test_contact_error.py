@@ -13,20 +13,20 @@ from scipy.integrate import solve_ivp
 from small_plans import BODILESS, Planned, changed, transcribed
 from small_robots import table
 
-from impactopt import planner
 from impactopt.contact import FreeMass, SpringDamper
-from impactopt.nlp.collision import Collision
-from impactopt.nlp.contact_error import ContactError, contact_error, refined_elements
-from impactopt.nlp.finer_contact import same_places
-from impactopt.nlp.mesh import Elements, contact_elements, contact_mesh, halved
-from impactopt.nlp.start import carried_over, first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.program import Status
-from impactopt.scenario import Scenario
-from impactopt.solution import Solution
-from impactopt.sqp import solve_sqp
-from impactopt.stance import FixedBase
+from impactopt.kinematics.stance import FixedBase
+from impactopt.planning import planner
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import solve_sqp
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
+from impactopt.transcription.finer_contact import same_places
+from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh, halved
+from impactopt.transcription.start import carried_over, first_iterate
+from impactopt.transcription.transcription import Transcription
 
 MASS, KP, KD = 2.0, 200.0, 10.0  # [kg], [N/m], [N s/m] of the hammer and its servo
 COARSE = ((1.0,), (1.0,))

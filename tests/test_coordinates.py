@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_robots import arm, biped
 
-from impactopt.coordinates import StanceCoordinates, base_motion, elimination_order, solve_in_order
 from impactopt.errors import InputError
-from impactopt.presets import load_robot
-from impactopt.reach import reach
-from impactopt.robot import Robot
-from impactopt.statics import static_wrenches
+from impactopt.kinematics.coordinates import StanceCoordinates, base_motion, elimination_order, solve_in_order
+from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.statics import static_wrenches
+from impactopt.robots.presets import load_robot
+from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from test_layers import LAYERS, NUMERIC, PACKAGE, ROOMS
+from rooms import NUMERIC, PACKAGE, ROOMS, ROOMS_IN_ORDER
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -151,15 +151,15 @@ def test_equation_numbers_are_the_papers() -> None:
 
 
 def test_a_name_that_is_not_there_is_found_out() -> None:
-    robot = PACKAGE / "robot.py"
+    robot = PACKAGE / "robots/robot.py"
     assert missing("Robot.kp", [robot]) == ""
     assert "has no" in missing("Robot.gain", [robot])
     assert "is in" in missing("SDC.step", [robot])
     assert "no class" in missing("Humanoid.kp", [robot])
     assert "no 'kpp'" in missing("kpp", [robot])
-    assert list(places("`a`, `B.c` (`robot.py`, `plan.py`); `d`")) == [
-        ("a", [robot, PACKAGE / "plan.py"]),
-        ("B.c", [robot, PACKAGE / "plan.py"]),
+    assert list(places("`a`, `B.c` (`robots/robot.py`, `transcription/plan.py`); `d`")) == [
+        ("a", [robot, PACKAGE / "transcription/plan.py"]),
+        ("B.c", [robot, PACKAGE / "transcription/plan.py"]),
         ("d", []),
     ]
 
@@ -170,7 +170,7 @@ BLOCKS = ARCHITECTURE.split("```")[1::2]
 INLINE = CODE.findall("".join(ARCHITECTURE.split("```")[::2]) + text_of("extending.md"))
 NAMED = {name for name in INLINE if re.fullmatch(r"[\w/.]+(\.(py|md|toml)|/)", name)}
 FOLDERS = ("impactopt/", "tests/", "docs/", "problems/")
-TEST_LAYERS = ROOT / "tests" / "test_layers.py"
+TEST_LAYERS = ROOT / "tests" / "rooms.py"
 
 
 @pytest.mark.parametrize("name", sorted(NAMED))
@@ -179,7 +179,7 @@ def test_files_that_the_architecture_names_exist(name: str) -> None:
 
 
 def test_files_in_the_diagram_exist() -> None:
-    named = re.findall(r"[\w/]+\.(?:py|toml)\b|\b\w+/(?= )", BLOCKS[0])
+    named = re.findall(r"[\w/]+\.(?:py|toml)\b|[\w/]+/(?= )", BLOCKS[0])
     assert len(named) > 5
     assert [name for name in named if not ((PACKAGE / name).exists() or (ROOT / name).exists())] == []
 
@@ -200,18 +200,16 @@ def test_every_room_is_described() -> None:
 
 
 def test_the_import_order_is_the_one_that_is_held() -> None:
-    held = [[room for room in layer if room in ROOMS and room != "__init__"] for layer in LAYERS]
-    (written,) = (
-        [line.split() for line in b.split("\n")[1:-1]] for b in BLOCKS if b.startswith("text\nerrors")
-    )
-    assert written == [layer for layer in held if layer]
+    section = ARCHITECTURE.split("## Import order")[1].split("\n| wish")[0]
+    written = [name for name in CODE.findall(section) if "/" not in name]
+    assert written == [room for room in ROOMS_IN_ORDER if not room.startswith("__")]
 
 
 def test_the_numeric_files_named_are_held_to_it() -> None:
     section = ARCHITECTURE.split("## Two worlds")[1].split("\n## ")[0]
     listed = re.search(r"`NUMERIC` \(([^)]*)\)", section)
     assert listed is not None
-    named = [name.rstrip("/").removesuffix(".py") for name in CODE.findall(listed[1])]
+    named = [name.rstrip("/") for name in CODE.findall(listed[1])]
     assert named and set(named) <= set(NUMERIC)
 
 

@@ -14,22 +14,22 @@ import pytest
 from numpy.typing import NDArray
 from small_plans import changed
 
+from impactopt.bodies.shapes import face_axes
 from impactopt.errors import InputError
-from impactopt.extra_terms import (
+from impactopt.problem.extra_terms import (
     Gaze,
     HandOrientation,
     HitCone,
     HitRegion,
     TorqueRate,
 )
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.plan import Plan
-from impactopt.problem import Phase
-from impactopt.program import SolverResult, Status
-from impactopt.shapes import face_axes
-from impactopt.terms import Incidence, Term
+from impactopt.problem.problem import Phase
+from impactopt.problem.terms import Incidence, Term
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from typing import IO
 import pytest
 
 from impactopt.errors import InputError
-from impactopt.files import open_own, write_atomically
-from impactopt.output import write_file
+from impactopt.files.output import write_file
+from impactopt.storage.files import open_own, write_atomically
 from impactopt.sweeps.journal import Journal
 
 

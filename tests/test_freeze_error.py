@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt.bench import freezes as bench
-from impactopt.bench.stability_robots import make_robot
-from impactopt.cases import striking_velocity
 from impactopt.collision import SDC, VirtualMass
 from impactopt.collision.freezing import freeze_error, more_often
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.reference import FullDynamics, holding_torque
-from impactopt.screen import collision_table
+from impactopt.report.console import collision_table
+from impactopt.simulation.cases import striking_velocity
+from impactopt.simulation.reference import FullDynamics, holding_torque
+from impactopt.studies.bench import freezes as bench
+from impactopt.studies.bench.stability_robots import make_robot
 from impactopt.sweeps.collisions import collide_many
 
 X = np.array([1.0, 0.0, 0.0])

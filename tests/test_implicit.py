@@ -12,7 +12,7 @@ import small_robots
 from exact_reference import random_case, robot_named
 from test_sdc import two_masses
 
-from impactopt._compiler import find_compiler
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
 from impactopt.collision.implicit import STAGES, gamma, is_linear, polynomials
 from impactopt.contact import (

@@ -13,7 +13,7 @@ import small_robots
 from test_native import FRICTION, LAW, ROBOTS, TARGET, X, call, inputs, robot_named, situation
 from test_sdc import two_masses
 
-from impactopt._compiler import find_compiler
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Terms, VirtualMass
 from impactopt.contact import Board, KelvinVoigt, Nail, RigidWall
 

@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from small_plans import LAW, OPTIONS, Planned, changed, planned
 
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.blocks import two_mass_restitution
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.output import load_record, record_of, save_record
-from impactopt.plan import Plan
-from impactopt.plotting import PICTURES, save_pictures
-from impactopt.problem import ImpactProblem
-from impactopt.program import Status
-from impactopt.screen import result_table
-from impactopt.solution import Solution
-from impactopt.terms import TorqueLimit
+from impactopt.files.output import load_record, record_of, save_record
+from impactopt.pictures import PICTURES, save_pictures
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import TorqueLimit
+from impactopt.report.console import result_table
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.transcription.blocks import two_mass_restitution
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 RESTITUTION = 0.3

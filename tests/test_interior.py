@@ -13,9 +13,9 @@ from small_plans import changed, transcribed
 from textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import load_problem
-from impactopt.nlp.start import first_iterate
-from impactopt.program import Status
-from impactopt.sqp import SQPOptions, interior, solve_sqp
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import SQPOptions, interior, solve_sqp
+from impactopt.transcription.start import first_iterate
 
 
 def projection(wanted):

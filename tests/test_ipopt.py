@@ -11,8 +11,8 @@ import scipy.sparse as sp
 from textbook import CASES, Textbook, assert_optimal, infeasible
 
 from impactopt.errors import InputError
-from impactopt.ipopt import solve_ipopt
-from impactopt.program import Status
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
 
 
 def overriding(case, **methods):

@@ -16,12 +16,12 @@ import pytest
 from test_implicit_gradient import exact, gradient, implicit
 from test_native import FRICTION, call, situation
 
-from impactopt._compiler import find_compiler
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import Terms, VirtualMass
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.contact import Board, HuntCrossley, KelvinVoigt, Nail, RigidWall
 from impactopt.errors import InputError
-from impactopt.stance import BothSoles
+from impactopt.kinematics.stance import BothSoles
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),

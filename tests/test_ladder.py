@@ -21,10 +21,10 @@ from test_sdc import (
 from impactopt.collision import SDC, Collision, Terms, VirtualMass, effective_mass
 from impactopt.contact import FreeMass, HuntCrossley, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.problem import ImpactProblem
-from impactopt.reference import FullDynamics
+from impactopt.kinematics.stance import BothSoles
+from impactopt.problem.problem import ImpactProblem
 from impactopt.rigid_body import RigidBody
-from impactopt.stance import BothSoles
+from impactopt.simulation.reference import FullDynamics
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

@@ -14,15 +14,15 @@ import pytest
 from numpy.typing import NDArray
 from small_plans import arm_problem, transcribed
 
-from impactopt._compiler import find_compiler
-from impactopt.codegen import NativeCode, cached
+from impactopt.codegen.cache import NativeCode, cached
+from impactopt.codegen.compiler import find_compiler
 from impactopt.errors import NoCompilerWarning
-from impactopt.nlp import lanes
-from impactopt.nlp.batched import BatchedFunction
-from impactopt.nlp.lanes import LANES, in_lanes
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.structured import derivative_functions
-from impactopt.nlp.transcription import Transcription
+from impactopt.transcription import lanes
+from impactopt.transcription.batched import BatchedFunction
+from impactopt.transcription.lanes import LANES, in_lanes
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.structured import derivative_functions
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

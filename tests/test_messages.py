@@ -11,15 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from small_plans import changed
 
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.layout import Layout
-from impactopt.nlp.rows import Measure, Place, along, degrees, millimetres, percent
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.problem import Phase
-from impactopt.program import SpokenProgram, Status, Violation, explain, worst_rows
-from impactopt.scenario import Scenario
-from impactopt.terms import ContactWrenchCone, TorqueLimit
+from impactopt.problem.problem import Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import SpokenProgram, Status, Violation, explain, worst_rows
+from impactopt.transcription.layout import Layout
+from impactopt.transcription.rows import Measure, Place, along, degrees, millimetres, percent
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 SCENARIOS = (

@@ -9,7 +9,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from impactopt.motion import CubicSpline, Radau, basis, graded_breaks, knots, quintic, rate_weights
+from impactopt.kinematics.splines import (
+    CubicSpline,
+    Radau,
+    basis,
+    graded_breaks,
+    knots,
+    quintic,
+    rate_weights,
+)
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

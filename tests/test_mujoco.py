@@ -18,13 +18,13 @@ from small_robots import arm, biped, slider
 
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
-from impactopt.presets import load_robot
-from impactopt.robot import Robot
-from impactopt.solution import Solution
-from impactopt.support import margin
-from impactopt.validation import Conditions, Scene, Simulation, simulate, simulate_mujoco, simulate_pinocchio
-from impactopt.validation.mujoco_engine import _Replay
-from impactopt.validation.mujoco_world import Solver
+from impactopt.kinematics.support import margin
+from impactopt.planning.solution import Solution
+from impactopt.robots.presets import load_robot
+from impactopt.robots.robot import Robot
+from impactopt.simulation import Conditions, Scene, Simulation, simulate, simulate_mujoco, simulate_pinocchio
+from impactopt.simulation.mujoco_engine import _Replay
+from impactopt.simulation.mujoco_world import Solver
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ import pytest
 import small_robots
 from test_sdc import Kinematics, two_masses
 
-from impactopt._compiler import find_compiler
-from impactopt.codegen import cached
+from impactopt.codegen.cache import cached
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
 from impactopt.collision.graph import collision_graph, gradient_graph
 from impactopt.collision.native import native_collision, native_gradient
@@ -31,8 +31,8 @@ from impactopt.contact import (
     RigidWall,
     SpringDamper,
 )
-from impactopt.presets import standin
-from impactopt.stance import BothSoles, OneSole
+from impactopt.kinematics.stance import BothSoles, OneSole
+from impactopt.robots.presets import standin
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),

@@ -13,11 +13,8 @@ from scipy.integrate import trapezoid
 from small_plans import OPTIONS, Planned, changed
 
 from impactopt.errors import InputError
-from impactopt.ipopt import solve_ipopt
-from impactopt.motion import Radau
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.objectives import (
+from impactopt.kinematics.splines import Radau
+from impactopt.problem.objectives import (
     AngularMomentum,
     Effort,
     Impulse,
@@ -26,9 +23,12 @@ from impactopt.objectives import (
     Penetration,
     TargetEnergy,
 )
-from impactopt.plan import Plan
-from impactopt.program import Status
-from impactopt.terms import Balance
+from impactopt.problem.terms import Balance
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 ALL = (Impulse(), PeakForce(), TargetEnergy(), Penetration(), Effort())

@@ -19,23 +19,23 @@ from test_sdc import slider
 from typer.testing import CliRunner
 
 from impactopt import Solution, coasting_reference, load_problem, optimize_strike, solve
-from impactopt._compiler import find_compiler
-from impactopt.cases import errors_against
-from impactopt.cli import app
+from impactopt.cli.app import app
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Terms
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.contact import FreeMass
-from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError
-from impactopt.output import load_record, record_of, record_of_strike, save_record
-from impactopt.plan import PlannedCollision
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file import read_problem_file
-from impactopt.reference import FullDynamics, MujocoDynamics
-from impactopt.strike import StrikeSolution
+from impactopt.files.output import load_record, record_of, record_of_strike, save_record
+from impactopt.files.problem_file import read_problem_file
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.planning.strike import StrikeSolution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation import scene_of, simulate_pinocchio
+from impactopt.simulation.cases import errors_against
+from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 from impactopt.sweeps.single import collide_once, problem_of_result
 from impactopt.sweeps.states import ContactStates, Posture
-from impactopt.validation import scene_of, simulate_pinocchio
+from impactopt.transcription.plan import PlannedCollision
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

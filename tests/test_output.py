@@ -13,13 +13,13 @@ import pytest
 from fake_solution import MissingSolution, simulation_of, still_problem, still_solution
 
 from impactopt.errors import InputError
-from impactopt.output import FORMAT, Record, load_record, record_of, save_record, write_file
-from impactopt.plan import Plan
-from impactopt.plotting import PICTURES, save_pictures
-from impactopt.plotting.torque import _binned
-from impactopt.problem import ImpactProblem
-from impactopt.program import Status
-from impactopt.support import margin
+from impactopt.files.output import FORMAT, Record, load_record, record_of, save_record, write_file
+from impactopt.kinematics.support import margin
+from impactopt.pictures import PICTURES, save_pictures
+from impactopt.pictures.torque import _binned
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Status
+from impactopt.transcription.plan import Plan
 
 
 @pytest.fixture(scope="module")

@@ -14,21 +14,21 @@ from scipy.integrate import trapezoid
 from small_plans import changed
 
 from impactopt.errors import InputError
-from impactopt.extra_terms import Gaze
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.blocks import make_block
-from impactopt.nlp.objective import Quantity
-from impactopt.nlp.own_blocks import key_of
-from impactopt.nlp.rows import millimetres
-from impactopt.nlp.start import first_iterate, strike_iterate
-from impactopt.nlp.strike import StrikeTranscription
-from impactopt.nlp.transcription import Transcription
-from impactopt.objectives import Effort, Impulse, Objective
-from impactopt.problem_file import write_problem
-from impactopt.program import Status
-from impactopt.sqp import solve_sqp
-from impactopt.strike import optimize_strike
-from impactopt.terms import Term, TorqueLimit
+from impactopt.files.problem_file import write_problem
+from impactopt.planning.strike import optimize_strike
+from impactopt.problem.extra_terms import Gaze
+from impactopt.problem.objectives import Effort, Impulse, Objective
+from impactopt.problem.terms import Term, TorqueLimit
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import solve_sqp
+from impactopt.transcription.blocks import make_block
+from impactopt.transcription.objective import Quantity
+from impactopt.transcription.own_blocks import key_of
+from impactopt.transcription.rows import millimetres
+from impactopt.transcription.start import first_iterate, strike_iterate
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 

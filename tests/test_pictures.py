@@ -18,17 +18,17 @@ from PIL import Image
 from small_plans import Planned
 from typer.testing import CliRunner
 
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
-from impactopt.output import Record, record_of
-from impactopt.plotting import PICTURES, ladder, overview
-from impactopt.plotting.ellipsoid import effective_masses
-from impactopt.plotting.style import DPI, PAGE, Picture
-from impactopt.reference.poses import inverse_mass, poses_of
-from impactopt.reproduce.figures import FIGURES, chosen, drawn
-from impactopt.solution import Solution
-from impactopt.support import zmp
+from impactopt.files.output import Record, record_of
+from impactopt.kinematics.support import zmp
+from impactopt.pictures import PICTURES, ladder, overview
+from impactopt.pictures.ellipsoid import effective_masses
+from impactopt.pictures.style import DPI, PAGE, Picture
+from impactopt.planning.solution import Solution
+from impactopt.simulation.reference.poses import inverse_mass, poses_of
+from impactopt.studies.reproduce.figures import FIGURES, chosen, drawn
 
 ROOT = Path(__file__).resolve().parents[1]
 DRAWS: dict[str, Callable[[Record], Picture | None]] = {"overview": overview, **PICTURES}
@@ -269,7 +269,8 @@ def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return lambda name: Picture(1.0, 1.0)
 
     monkeypatch.setattr(
-        "impactopt.reproduce.figures._MAKERS", dict.fromkeys(("plot", "reproduce", "bench", "sweep"), maker)
+        "impactopt.studies.reproduce.figures._MAKERS",
+        dict.fromkeys(("plot", "reproduce", "bench", "sweep"), maker),
     )
     result = CliRunner().invoke(app, ["figures", "zmp", "fig7", "force", "--quiet", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
@@ -280,8 +281,8 @@ def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_every_figure_has_a_source_that_exists() -> None:
-    from impactopt.bench.registry import BENCHES
-    from impactopt.reproduce.registry import REPRODUCED
+    from impactopt.studies.bench.registry import BENCHES
+    from impactopt.studies.reproduce.registry import REPRODUCED
 
     studies = {path.stem for path in (ROOT / "problems" / "sweeps").glob("*.toml")}
     known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}

@@ -31,19 +31,19 @@ from impactopt.contact import (
     power,
 )
 from impactopt.errors import InputError
-from impactopt.ipopt import solve_ipopt
-from impactopt.motion import Radau
-from impactopt.nlp.clearance import CLEARANCE, HASTE
-from impactopt.nlp.mesh import contact_mesh
-from impactopt.nlp.start import first_iterate
-from impactopt.objectives import Penetration
-from impactopt.plan import Plan
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.program import Status, check_program
-from impactopt.scenario import Scenario
-from impactopt.sqp.condense import Condenser, Determined, find_eliminations
-from impactopt.sqp.kernels import Kernels
-from impactopt.stance import FixedBase
+from impactopt.kinematics.splines import Radau
+from impactopt.kinematics.stance import FixedBase
+from impactopt.problem.objectives import Penetration
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status, check_program
+from impactopt.solvers.sqp.condense import Condenser, Determined, find_eliminations
+from impactopt.solvers.sqp.kernels import Kernels
+from impactopt.transcription.clearance import CLEARANCE, HASTE
+from impactopt.transcription.mesh import contact_mesh
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import first_iterate
 
 Array = NDArray[np.float64]
 MASS = 2.0  # [kg] of the hammer

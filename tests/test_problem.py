@@ -11,16 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from small_robots import arm, biped
 
-from impactopt import codegen
+from impactopt.codegen import cache as codegen
 from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
-from impactopt.planner import solve
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.robot import Robot
-from impactopt.scenario import Scenario
-from impactopt.stance import BothSoles, FixedBase, OneSole
-from impactopt.terms import (
+from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
+from impactopt.planning.planner import solve
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import (
     DEFAULT_TERMS,
     Balance,
     ContactWrenchCone,
@@ -33,6 +32,7 @@ from impactopt.terms import (
     TorqueLimit,
     VelocityLimit,
 )
+from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def nothing_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("functions are being built")
 
     monkeypatch.setattr(codegen, "cached", refuse)
-    monkeypatch.setattr("impactopt.nlp.transcription.cached", refuse)
+    monkeypatch.setattr("impactopt.transcription.transcription.cached", refuse)
 
 
 def problem(robot: Robot, **changes: Any) -> ImpactProblem:

@@ -13,11 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impactopt import extra_terms, objectives, terms
 from impactopt.contact import CustomLaw, FreeMass
 from impactopt.errors import InputError
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.problem_file import (
+from impactopt.files.problem_file import (
     change_data,
     key_place,
     load_problem,
@@ -27,8 +25,10 @@ from impactopt.problem_file import (
     read_toml,
     write_toml,
 )
-from impactopt.problem_hash import problem_hash
-from impactopt.robot import Striker
+from impactopt.problem import extra_terms, objectives, terms
+from impactopt.problem.hashing import problem_hash
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.robots.robot import Striker
 
 DATA: dict[str, Any] = {
     "problem": {
@@ -218,7 +218,7 @@ def test_the_hash_is_of_the_content(problem: ImpactProblem) -> None:
 
 def test_the_hash_is_the_same_in_another_process(problem: ImpactProblem) -> None:
     code = (
-        "from impactopt.problem_file import problem_from_data\n"
+        "from impactopt.files.problem_file import problem_from_data\n"
         f"print(problem_from_data({DATA!r}, where='arm.toml').hash)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import impactopt.problem_file.robot_sections as robot_sections
-import impactopt.problem_file.sections as sections
-from impactopt import extra_terms, objectives, terms
+import impactopt.files.problem_file.robot_sections as robot_sections
+import impactopt.files.problem_file.sections as sections
+from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.contact import (
     Board,
     FreeMass,
@@ -26,15 +26,15 @@ from impactopt.contact import (
     SpringDamper,
 )
 from impactopt.errors import InputError
-from impactopt.problem import COLLISIONS, ImpactProblem, Phase
-from impactopt.problem_file import load_problem, read_problem_file
-from impactopt.problem_file.mistakes import key_lines
-from impactopt.problem_file.section import Section, attribute_docs
-from impactopt.robot import Tool
-from impactopt.scenario import Scenario
-from impactopt.shapes import Obstacle, TargetBody
-from impactopt.sqp import SQPOptions
-from impactopt.stance import FixedBase, OneSole
+from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.files.problem_file.mistakes import key_lines
+from impactopt.files.problem_file.section import Section, attribute_docs
+from impactopt.kinematics.stance import FixedBase, OneSole
+from impactopt.problem import extra_terms, objectives, terms
+from impactopt.problem.problem import COLLISIONS, ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.robots.robot import Tool
+from impactopt.solvers.sqp import SQPOptions
 
 TARGETS_AND_LAWS = (
     Board,

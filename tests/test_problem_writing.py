@@ -16,10 +16,10 @@ from small_robots import arm
 from test_problem_file import ARM, write
 
 import impactopt
-from impactopt import contact, extra_terms, objectives, terms
+from impactopt import contact
+from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.problem_file import (
+from impactopt.files.problem_file import (
     SolverSettings,
     load_problem,
     parse_problem_file,
@@ -28,13 +28,14 @@ from impactopt.problem_file import (
     read_toml,
     write_problem,
 )
-from impactopt.problem_file.reference import reference
-from impactopt.problem_file.section import Section
-from impactopt.problem_file.template import problem_template
-from impactopt.robot import Robot, Sole, Striker, Tool
-from impactopt.scenario import Scenario
-from impactopt.shapes import Obstacle, TargetBody
-from impactopt.stance import FixedBase, OneSole
+from impactopt.files.problem_file.reference import reference
+from impactopt.files.problem_file.section import Section
+from impactopt.files.problem_file.template import problem_template
+from impactopt.kinematics.stance import FixedBase, OneSole
+from impactopt.problem import extra_terms, objectives, terms
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 ROOT = Path(__file__).parents[1]
 
@@ -380,7 +381,7 @@ def test_every_key_is_described_with_its_unit() -> None:
         return [section, *(s for inner in section.__subclasses__() for s in below(inner))]
 
     letters = str.maketrans("", "", "_ /^.(),")
-    own = {s for s in below(Section)[1:] if s.__module__.startswith("impactopt.problem_file")}
+    own = {s for s in below(Section)[1:] if s.__module__.startswith("impactopt.files.problem_file")}
     for section in {section for section in own if section.__name__ != "File"}:
         assert section.__doc__ and section.__doc__ != Section.__doc__, section
         for name, info in section.model_fields.items():

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from textbook import CASES, Textbook, infeasible
 
 from impactopt.errors import InputError
-from impactopt.program import (
+from impactopt.solvers.program import (
     BestIterate,
     NonlinearProgram,
     Status,

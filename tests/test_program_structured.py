@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.batched import Block, pattern
-from impactopt.nlp.layout import Affine, Layout, select, stack
-from impactopt.nlp.rows import Rows
-from impactopt.nlp.structured import StructuredProgram, derivative_functions
-from impactopt.program import NonlinearProgram, Status
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import NonlinearProgram, Status
+from impactopt.transcription.batched import Block, pattern
+from impactopt.transcription.layout import Affine, Layout, select, stack
+from impactopt.transcription.rows import Rows
+from impactopt.transcription.structured import StructuredProgram, derivative_functions
 
 Array = NDArray[np.float64]
 seeds = st.integers(0, 2**31)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from textbook import INF, Textbook
 
-from impactopt.program import Status
-from impactopt.sqp import solve_sqp
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import solve_sqp
 
 
 def test_directions_that_nothing_decides_are_left_alone():

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from impactopt.errors import InputError
-from impactopt.sqp import QP_SOLVERS, QPStatus, QuadraticProgram, make_qp_solver
-from impactopt.sqp.daqp_solver import DaqpSolver
-from impactopt.sqp.osqp_solver import OsqpSolver
-from impactopt.sqp.piqp_solver import PiqpSolver
+from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, QuadraticProgram, make_qp_solver
+from impactopt.solvers.sqp.daqp_solver import DaqpSolver
+from impactopt.solvers.sqp.osqp_solver import OsqpSolver
+from impactopt.solvers.sqp.piqp_solver import PiqpSolver
 
 INF = np.inf
 SOLVERS = sorted(QP_SOLVERS)
@@ -206,7 +206,7 @@ def test_unknown_solvers_are_named():
 @pytest.mark.parametrize("name", ["daqp", "piqp"])
 def test_solvers_that_are_not_installed_are_said_so(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, f"impactopt.sqp.{name}_solver")
+    monkeypatch.delitem(sys.modules, f"impactopt.solvers.sqp.{name}_solver")
     with pytest.raises(
         InputError, match=rf"'{name}' is not installed: pip install {name}, or impactopt\[qp\]"
     ):

@@ -14,15 +14,15 @@ from fake_solution import still_problem, still_solution
 from PIL import Image
 from typer.testing import CliRunner
 
-from impactopt._validate_command import validate
-from impactopt.cli import app
+from impactopt.cli.app import app
+from impactopt.cli.validate import validate
 from impactopt.errors import InputError
-from impactopt.output import Record, load_record, record_of, save_record
-from impactopt.plotting.animation import AROUND, FPS, SLOW, _Stage, save_animation, shown_times
-from impactopt.replay import Planned, Replay, load_planned, replay
-from impactopt.solution import Solution
-from impactopt.validation import Conditions
-from impactopt.validation.result import REPORT
+from impactopt.files.output import Record, load_record, record_of, save_record
+from impactopt.files.replay import Planned, Replay, load_planned, replay
+from impactopt.pictures.animation import AROUND, FPS, SLOW, _Stage, save_animation, shown_times
+from impactopt.planning.solution import Solution
+from impactopt.simulation import Conditions
+from impactopt.simulation.result import REPORT
 
 FLAT = REPORT[:13]  # numbers for the whole motion; after them, what is by phase or by sole
 PUNCH = Path(__file__).resolve().parents[1] / "problems" / "punch.toml"

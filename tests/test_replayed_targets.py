@@ -30,13 +30,9 @@ from impactopt.contact import (
     Target,
 )
 from impactopt.errors import InputError
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp.start import first_iterate
-from impactopt.program import Status
-from impactopt.robot import Robot
-from impactopt.robustness import Spread
-from impactopt.screen import replay_table
-from impactopt.validation import (
+from impactopt.report.console import replay_table
+from impactopt.robots.robot import Robot
+from impactopt.simulation import (
     Conditions,
     Scene,
     Simulation,
@@ -44,7 +40,11 @@ from impactopt.validation import (
     simulate_mujoco,
     simulate_pinocchio,
 )
-from impactopt.validation.accuracy import check_steps, with_step_error
+from impactopt.simulation.accuracy import check_steps, with_step_error
+from impactopt.simulation.robustness import Spread
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.transcription.start import first_iterate
 
 Array = NDArray[np.float64]
 Engine = Callable[..., Simulation]

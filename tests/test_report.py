@@ -17,21 +17,21 @@ from small_robots import biped
 from typer.testing import CliRunner
 
 from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.shapes import Obstacle
 from impactopt.bodies.surroundings import surroundings_of
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError
-from impactopt.output import Record, record_of, save_record
-from impactopt.presets import load_robot
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file.names import problem_file
+from impactopt.files.output import Record, record_of, save_record
+from impactopt.files.problem_file.names import problem_file
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
 from impactopt.report import animation_of, bodies_page, report_of
 from impactopt.report.pack import unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
 from impactopt.report.visuals import visuals_of
-from impactopt.shapes import Obstacle
-from impactopt.solution import Solution
+from impactopt.robots.presets import load_robot
 
 NASTY = '# a problem <script>alert("no")</script> & more\n'
 

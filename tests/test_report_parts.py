@@ -14,22 +14,22 @@ from scipy.integrate import trapezoid
 
 from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.meshes import find_mesh, read_mesh
+from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
 from impactopt.bodies.surroundings import surroundings_of
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
-from impactopt.output import Record, record_of
-from impactopt.presets import load_robot
+from impactopt.files.output import Record, record_of
+from impactopt.planning.solution import Solution
 from impactopt.report.charts import charts_of
 from impactopt.report.pack import pack, unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
 from impactopt.report.visuals import visuals_of
-from impactopt.robot import Robot
-from impactopt.shapes import Obstacle, TargetBody
-from impactopt.solution import Solution
+from impactopt.robots.presets import load_robot
+from impactopt.robots.robot import Robot
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ from scipy.integrate import trapezoid
 from small_robots import biped
 from typer.testing import CliRunner
 
-from impactopt.bench import costs
-from impactopt.bench.trees import random_robot, tip_speed
-from impactopt.cases import Case, paper_motions
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.errors import InputError
-from impactopt.reproduce import (
+from impactopt.simulation.cases import Case, paper_motions
+from impactopt.studies.bench import costs
+from impactopt.studies.bench.trees import random_robot, tip_speed
+from impactopt.studies.reproduce import (
     fig3,
     fig4,
     fig7,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impactopt._show_command import PAGE
+from impactopt.cli.show import PAGE
 from impactopt.errors import InputError
-from impactopt.output import DERIVED, Record, load_record, remove_file, save_record, write_file
-from impactopt.plotting import PICTURES
-from impactopt.program import Status
-from impactopt.result_folder import keep_record, keep_series, set_aside
+from impactopt.files.output import DERIVED, Record, load_record, remove_file, save_record, write_file
+from impactopt.files.result_folder import keep_record, keep_series, set_aside
+from impactopt.pictures import PICTURES
+from impactopt.solvers.program import Status
 
 NOT_SOLVED = [s for s in Status if not s.usable]
 

@@ -17,9 +17,10 @@ import pytest
 from scipy.spatial import ConvexHull
 
 import impactopt
-from impactopt import Robot, Sole, Striker, g1, load_robot, presets, talos
-from impactopt.codegen import model_hash
+from impactopt import Robot, Sole, Striker, g1, load_robot, talos
+from impactopt.codegen.cache import model_hash
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.robots import presets
 
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
 <inertia ixx="0.02" iyy="0.03" izz="0.02" ixy="0.001" ixz="0" iyz="0"/></inertial></link>"""

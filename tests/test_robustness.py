@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from fake_solution import still_problem, still_solution
 
-from impactopt import _workers
-from impactopt._workers import map_on_workers
 from impactopt.contact import CustomLaw, RigidWall
 from impactopt.errors import InputError
-from impactopt.robustness import LOGARITHMIC, Robustness, Spread, draw_conditions, robustness
-from impactopt.validation import Conditions
+from impactopt.simulation import Conditions
+from impactopt.simulation import workers as _workers
+from impactopt.simulation.robustness import LOGARITHMIC, Robustness, Spread, draw_conditions, robustness
+from impactopt.simulation.workers import map_on_workers
 
 STEP = 1e-3
 
@@ -219,7 +219,7 @@ def test_what_an_engine_raises_is_a_row(still: tuple[Any, Any], monkeypatch: pyt
     def broken(*_args: Any, **_options: Any) -> None:
         raise ArithmeticError("no such luck")
 
-    monkeypatch.setattr("impactopt.robustness.simulate_mujoco", broken)
+    monkeypatch.setattr("impactopt.simulation.robustness.simulate_mujoco", broken)
     result = robustness(*still, 1.0, draws=2, workers=1, step=STEP)
     assert result.reason == ("ArithmeticError: no such luck",) * 2
 
@@ -276,7 +276,7 @@ def test_a_script_without_a_guard_is_told_of_it(tmp_path: Path) -> None:
     process = run_script(
         tmp_path,
         """\
-        from impactopt._workers import map_on_workers
+        from impactopt.simulation.workers import map_on_workers
 
         def square(_, x):
             return x * x
@@ -294,7 +294,7 @@ def test_ctrl_c_ends_the_processes_and_is_raised(tmp_path: Path) -> None:
         tmp_path,
         """\
         import os, time
-        from impactopt._workers import map_on_workers
+        from impactopt.simulation.workers import map_on_workers
 
         def wait(_, x):
             print(os.getpid(), flush=True)

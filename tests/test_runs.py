@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from impactopt.nlp import runs
-from impactopt.nlp.runs import Runs, count_up, union, with_transposed
+from impactopt.transcription import runs
+from impactopt.transcription.runs import Runs, count_up, union, with_transposed
 
 seeds = st.integers(0, 2**31)
 

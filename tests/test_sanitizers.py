@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from test_native import ROBOTS, robot_named, situation
 
-from impactopt._compiler import find_compiler
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
 from impactopt.contact import Board, FreeMass, HuntCrossley, Nail, SpringDamper

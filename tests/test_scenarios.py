@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from small_plans import LAW, OPTIONS, Planned, changed, planned
 
 from impactopt.contact import FreeMass, SpringDamper
-from impactopt.ipopt import solve_ipopt
-from impactopt.nlp import clearance as nlp
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.plan import PlannedCollision, PlannedScenario
-from impactopt.program import Status
-from impactopt.scenario import Scenario
-from impactopt.solution import Solution
-from impactopt.support import margin, zmp
-from impactopt.terms import Balance, ContactWrenchCone, TorqueLimit
-from impactopt.validation import scene_of
+from impactopt.kinematics.support import margin, zmp
+from impactopt.planning.solution import Solution
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
+from impactopt.simulation import scene_of
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.transcription import clearance as nlp
+from impactopt.transcription.plan import PlannedCollision, PlannedScenario
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 EXPECTED = Scenario(name="as expected", torque=0.85, cone_margin=0.02, capture_margin=0.02)

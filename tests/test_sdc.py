@@ -18,9 +18,9 @@ from scipy.linalg import lu_factor, lu_solve
 from impactopt.collision import SDC, JointFriction, Terms, effective_mass
 from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.errors import InputError
-from impactopt.presets import g1, talos
-from impactopt.robot import Robot, Striker
-from impactopt.stance import BothSoles, FixedBase, OneSole
+from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
+from impactopt.robots.presets import g1, talos
+from impactopt.robots.robot import Robot, Striker
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from textbook import CASES, INF, Textbook, assert_optimal, infeasible
 
 from impactopt.errors import InputError
-from impactopt.program import Status
-from impactopt.sqp import QP_SOLVERS, QPSolution, QPStatus, SQPOptions, solve_sqp
-from impactopt.sqp.hessian import ActiveRows, ExactHessian, is_positive_definite
-from impactopt.sqp.merit import Filter
-from impactopt.sqp.point import TimedProgram
-from impactopt.sqp.subproblem import normal_step
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import QP_SOLVERS, QPSolution, QPStatus, SQPOptions, solve_sqp
+from impactopt.solvers.sqp.hessian import ActiveRows, ExactHessian, is_positive_definite
+from impactopt.solvers.sqp.merit import Filter
+from impactopt.solvers.sqp.point import TimedProgram
+from impactopt.solvers.sqp.subproblem import normal_step
 
 WAYS = {
     "default": SQPOptions(),

@@ -11,15 +11,15 @@ import pytest
 import small_robots
 from typer.testing import CliRunner
 
-from impactopt.bench import stability
-from impactopt.bench.stability import judge_rig
-from impactopt.bench.stability_cases import RIGS, Rig
-from impactopt.bench.stability_others import freezes_of, refusals
-from impactopt.bench.stability_robots import make_robot
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, RigidWall, SpringDamper
 from impactopt.errors import InputError
+from impactopt.studies.bench import stability
+from impactopt.studies.bench.stability import judge_rig
+from impactopt.studies.bench.stability_cases import RIGS, Rig
+from impactopt.studies.bench.stability_others import freezes_of, refusals
+from impactopt.studies.bench.stability_robots import make_robot
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=5.0)

@@ -13,12 +13,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from impactopt import load_problem, load_robot, presets, standin
-from impactopt._standin import LINKS, PELVIS
-from impactopt.coordinates import StanceCoordinates
+from impactopt import load_problem, load_robot, standin
 from impactopt.errors import InputError
-from impactopt.reach import reach
-from impactopt.robot import Robot
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.robots import presets
+from impactopt.robots.robot import Robot
+from impactopt.robots.standin import LINKS, PELVIS
 
 Array = NDArray[np.float64]
 LEG = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")

@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 from small_plans import BODILESS, Planned, changed
 from typer.testing import CliRunner
 
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.extra_terms import HitCone, HitRegion, TorqueRate
-from impactopt.nlp.start import first_iterate, iterate_from_strike, strike_iterate
-from impactopt.nlp.strike import StrikeTranscription
-from impactopt.nlp.transcription import Transcription
-from impactopt.objectives import AngularMomentum, Effort, Impulse, PeakForce
-from impactopt.output import load_record
-from impactopt.planner import solve
-from impactopt.problem_file import ProblemFile
-from impactopt.program import Status, check_program
-from impactopt.reference import FullDynamics
-from impactopt.scenario import Scenario
-from impactopt.strike import StrikeSolution, optimize_strike
-from impactopt.support import support_polygon
-from impactopt.terms import Balance, Incidence, TorqueLimit, VelocityLimit
+from impactopt.files.output import load_record
+from impactopt.files.problem_file import ProblemFile
+from impactopt.kinematics.support import support_polygon
+from impactopt.planning.planner import solve
+from impactopt.planning.strike import StrikeSolution, optimize_strike
+from impactopt.problem.extra_terms import HitCone, HitRegion, TorqueRate
+from impactopt.problem.objectives import AngularMomentum, Effort, Impulse, PeakForce
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import Balance, Incidence, TorqueLimit, VelocityLimit
+from impactopt.simulation.reference import FullDynamics
+from impactopt.solvers.program import Status, check_program
+from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def transcription(request: pytest.FixtureRequest) -> StrikeTranscription:
 
 def optimized(t: Transcription, monkeypatch: pytest.MonkeyPatch, **options: Any) -> StrikeSolution:
     """The strike of a transcription's problem, on its functions."""
-    monkeypatch.setattr("impactopt.strike.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.strike.block_functions", lambda *_: t.functions)
     return optimize_strike(t.problem, **options)
 
 
@@ -374,7 +374,7 @@ def test_a_motion_is_solved_from_several_starts(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch, start: str
 ) -> None:
     t = arm_transcription
-    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.planner.block_functions", lambda *_: t.functions)
     found = solve(t.problem, start=start, starts=2)
     assert found.status is Status.SOLVED
     assert [attempt.start for attempt in found.attempts] == [f"{start} 1", f"{start} 2"]
@@ -390,7 +390,7 @@ def test_a_start_whose_bodies_are_in_each_other_goes_before_no_clean_one(
 ) -> None:
     """One of these three hits harder, with the elbow in the target."""
     t = arm_transcription
-    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.planner.block_functions", lambda *_: t.functions)
     problem = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
     found = solve(problem, starts=3)
     assert found.status is Status.SOLVED and found.clearance()["contacts_besides"] == []
@@ -401,7 +401,7 @@ def test_a_solution_starts_its_neighbour(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t = changed(arm_transcription, terms=BODILESS)  # whose rows know them as they were at the first one's
-    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.planner.block_functions", lambda *_: t.functions)
     first = solve(t.problem)
     assert solve(t.problem, start=first).result.iterations == 0
     moved = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
@@ -417,7 +417,7 @@ def test_a_start_that_is_none_is_refused(
         solve(arm_transcription.problem, start="strik")
     with pytest.raises(InputError, match="leave one of the two out"):
         solve(arm_transcription.problem, start=np.zeros(3), starts=2)
-    monkeypatch.setattr("impactopt.planner.block_functions", lambda *_: arm_transcription.functions)
+    monkeypatch.setattr("impactopt.planning.planner.block_functions", lambda *_: arm_transcription.functions)
     with pytest.raises(InputError, match="start: expected shape"):
         solve(arm_transcription.problem, start=np.zeros(3))
 
@@ -429,7 +429,7 @@ def test_the_command_prints_and_writes(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     t = arm_transcription
-    monkeypatch.setattr("impactopt.strike.block_functions", lambda *_: t.functions)
+    monkeypatch.setattr("impactopt.planning.strike.block_functions", lambda *_: t.functions)
     monkeypatch.setattr(ProblemFile, "build", lambda self: t.problem)
     (tmp_path / "a.toml").write_text(PROBLEM_FILE, encoding="utf-8")
     runner, command = CliRunner(), ["strike", str(tmp_path / "a.toml"), "--starts", "2"]

@@ -10,10 +10,10 @@ import pytest
 from picture_checks import frowns
 from typer.testing import CliRunner
 
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.plotting.sweep import sweep_picture
-from impactopt.plotting.sweep_columns import Columns
+from impactopt.pictures.sweep import sweep_picture
+from impactopt.pictures.sweep_columns import Columns
 from impactopt.sweeps import read_sweep_file, sweep_from_data
 from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.table import read_columns, unit_of, without_unit

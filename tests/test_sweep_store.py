@@ -186,7 +186,7 @@ def test_the_same_sweep_goes_on_and_another_is_refused(tmp_path: Path) -> None:
 
 def test_rows_of_other_versions_are_not_mixed_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Store(sweep(), tmp_path).close()
-    from impactopt.solution import versions
+    from impactopt.planning.solution import versions
 
     monkeypatch.setattr("impactopt.sweeps.store.versions", lambda: {**versions(), "casadi": "9.9"})
     with pytest.raises(InputError, match=r"were made with casadi 3.*this is casadi 9\.9"):

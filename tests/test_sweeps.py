@@ -18,10 +18,10 @@ import pytest
 from sweep_workers import pools, slow, unlucky
 from typer.testing import CliRunner
 
-from impactopt._workers import Died, each_on_workers
-from impactopt.cli import app
+from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.output import load_record
+from impactopt.files.output import load_record
+from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps import Progress, sweep, sweep_from_data
 from impactopt.sweeps.alarm import RANG
 from impactopt.sweeps.collisions import collide_many
@@ -93,13 +93,13 @@ def test_ctrl_c_and_a_worker_that_is_killed_cost_nothing_and_the_table_tells_all
     assert schema.field("impulse_Ns").metadata[b"unit"] == b"N s"
     said = {name.decode(): text.decode() for name, text in schema.metadata.items()}
     chosen = sweep_from_data(SWEEP)
-    assert said["impactopt.problem_hash"] == chosen.problem.build().hash
+    assert said["impactopt.problem.hashing"] == chosen.problem.build().hash
     assert said["impactopt.sweep_hash"] == chosen.hash
     assert json.loads(said["impactopt.versions"])["casadi"]
     assert json.loads(said["impactopt.units"])["target.resistance_N"] == "N"
 
 
-COMMAND = [sys.executable, "-m", "impactopt.cli", "sweep"]
+COMMAND = [sys.executable, "-m", "impactopt.cli.app", "sweep"]
 
 
 def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(

@@ -12,9 +12,9 @@ from hock_schittkowski import BOOK, OUT_OF_SCALE
 from maros_meszaros import QPS, quadratic
 from textbook import assert_optimal
 
-from impactopt.ipopt import solve_ipopt
-from impactopt.program import Status
-from impactopt.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solver, solve_sqp
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import QP_SOLVERS, QPStatus, SQPOptions, make_qp_solver, solve_sqp
 
 # bounds as they are: relaxed by 1e-8, as IPOPT does, optima with large multipliers change in the fifth digit
 EXACT = {"tol": 1e-9, "bound_relax_factor": 0.0}

@@ -16,19 +16,19 @@ from derivative_checks import check_derivatives
 from numpy.typing import NDArray
 from small_plans import LAW, Planned, changed
 
-from impactopt.cone import contact_wrench_cone
-from impactopt.ipopt import solve_ipopt
-from impactopt.motion import Radau
-from impactopt.nlp.at_contact import rotation_rows
-from impactopt.nlp.mesh import collision_mesh, with_middles
-from impactopt.nlp.start import first_iterate
-from impactopt.nlp.transcription import Transcription
-from impactopt.plan import total_ground_wrench
-from impactopt.problem import Phase
-from impactopt.program import Status, check_program
-from impactopt.scenario import Scenario
-from impactopt.support import zmp
-from impactopt.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
+from impactopt.kinematics.splines import Radau
+from impactopt.kinematics.support import zmp
+from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.problem.problem import Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import ContactWrenchCone, Incidence, TorqueLimit, VelocityLimit
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status, check_program
+from impactopt.transcription.at_contact import rotation_rows
+from impactopt.transcription.mesh import collision_mesh, with_middles
+from impactopt.transcription.plan import total_ground_wrench
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from small_motions import blow_motion, reference, scene, standing, strike
 from small_robots import arm, biped, slider
 
 from impactopt.errors import InputError
-from impactopt.presets import load_robot
-from impactopt.robot import Robot
-from impactopt.support import margin
-from impactopt.validation import Scene, Simulation, simulate_pinocchio
+from impactopt.kinematics.support import margin
+from impactopt.robots.presets import load_robot
+from impactopt.robots.robot import Robot
+from impactopt.simulation import Scene, Simulation, simulate_pinocchio
 
 Array = NDArray[np.float64]
 

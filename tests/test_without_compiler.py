@@ -10,7 +10,7 @@ import pytest
 import small_robots
 from scipy.integrate import solve_ivp
 
-from impactopt._compiler import find_compiler
+from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
 from impactopt.contact import (
     Board,

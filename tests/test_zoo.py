@@ -25,15 +25,15 @@ from impactopt import (
     robot_names,
     standin,
 )
-from impactopt._arms import ARM7, arm_model
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.objectives import Impulse
-from impactopt.problem import ImpactProblem, Phase
-from impactopt.problem_file import names, read_problem_file
-from impactopt.robot import Robot
-from impactopt.stance import FixedBase, OneSole
-from impactopt.validation import simulate
+from impactopt.files.problem_file import names, read_problem_file
+from impactopt.kinematics.stance import FixedBase, OneSole
+from impactopt.problem.objectives import Impulse
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.robots.arms import ARM7, arm_model
+from impactopt.robots.robot import Robot
+from impactopt.simulation import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = {path.stem: path for path in (ROOT / "problems").glob("*.toml")}
@@ -159,7 +159,9 @@ def test_the_stand_ins_toes_are_at_the_front_of_its_feet() -> None:
 
 @pytest.mark.parametrize("make", [planar_arm, arm7])
 def test_arms_are_presets_without_files(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("impactopt.presets.distribution", lambda name: pytest.fail("files were asked for"))
+    monkeypatch.setattr(
+        "impactopt.robots.presets.distribution", lambda name: pytest.fail("files were asked for")
+    )
     robot = load_robot(make.__name__)
     assert robot.name == make.__name__ and robot.name in robot_names()
     assert not robot.floating and not robot.soles and "hammer" in robot.strikers and "ready" in robot.postures

@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 
-from impactopt.cli import app as cli
+from impactopt.cli.app import app as cli
 
 
 def entries(command: Any) -> list[tuple[str, str]]:

@@ -4,5 +4,5 @@
 with spheres and puts planes about them, between which distances are simple functions; `robot_bodies.py` says
 which pairs can meet; `world.py` has the bodies of the target, the ground and the obstacles; `clearance.py`
 measures how far all of them are apart, with exact geometry. Numbers only: the rows of a plan are in
-`nlp/apart.py`.
+`transcription/apart.py`.
 """

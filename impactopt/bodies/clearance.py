@@ -17,7 +17,7 @@ from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, transform
 from impactopt.bodies.world import WorldBody
 from impactopt.errors import InputError
-from impactopt.robot import Robot
+from impactopt.robots.robot import Robot
 
 __all__ = ["Bodies", "Near", "Places", "Survey", "Touch"]
 

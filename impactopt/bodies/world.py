@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.fit import Planes, enclose
+from impactopt.bodies.shapes import Obstacle, TargetBody, face_axes
 from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.board import Board
 from impactopt.contact.nail import Nail
 from impactopt.contact.targets import RigidWall, Target
-from impactopt.shapes import Obstacle, TargetBody, face_axes
 
 __all__ = ["BEHIND", "WorldBody", "ground", "obstacle_bodies", "target_bodies"]
 

@@ -1,12 +1,12 @@
 """Collisions: a ladder of models from a point mass to the simplified dynamics computation (SDC)."""
 
-from .effective_mass import effective_mass
-from .interface import CollisionModel
-from .outputs import OUTPUTS
-from .result import Collision
-from .sdc import SDC
-from .terms import JointFriction, Terms
-from .virtual_mass import VirtualMass
+from impactopt.collision.effective_mass import effective_mass
+from impactopt.collision.interface import CollisionModel
+from impactopt.collision.outputs import OUTPUTS
+from impactopt.collision.result import Collision
+from impactopt.collision.sdc import SDC
+from impactopt.collision.terms import JointFriction, Terms
+from impactopt.collision.virtual_mass import VirtualMass
 
 __all__ = [
     "OUTPUTS",

@@ -19,15 +19,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..codegen import cached, library_path
-from ..errors import InputError, check_array, raw_array
-from .checks import ACCURACY, too_large
-from .native import native_collision
-from .outputs import HISTORIES, SCALARS
-from .settings import NO_LIMIT
+from impactopt.codegen.cache import cached, library_path
+from impactopt.collision.checks import ACCURACY, too_large
+from impactopt.collision.native import native_collision
+from impactopt.collision.outputs import HISTORIES, SCALARS
+from impactopt.collision.settings import NO_LIMIT
+from impactopt.errors import InputError, check_array, raw_array
 
 if TYPE_CHECKING:
-    from .symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["Batch"]
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from .result import Collision
+from impactopt.collision.result import Collision
+from impactopt.errors import InputError
 
 if TYPE_CHECKING:
-    from .symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["ACCURACY", "check_course", "check_finite", "check_frozen", "too_large"]
 

@@ -22,8 +22,8 @@ from typing import Any
 
 import casadi as ca
 
-from .frozen import FrozenDynamics
-from .model import JointSpaceModel
+from impactopt.collision.frozen import FrozenDynamics
+from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["GIVES_WAY", "Course", "Loop", "Stretch", "cuts", "relative_to"]
 

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from .graph import METHODS, frozen_dynamics, joint_space_model, number_of_steps
-from .outputs import HISTORIES, OF_SOLES, frozen_for
+from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model, number_of_steps
+from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 
 if TYPE_CHECKING:
-    from .symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["Description", "describe", "independent_joints"]
 

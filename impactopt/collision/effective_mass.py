@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..codegen import cached, model_hash
-from ..errors import check_direction
-from ..robot import Robot
-from ..stance import Stance, usual_stance
-from .frozen import FrozenDynamics
+from impactopt.codegen.cache import cached, model_hash
+from impactopt.collision.frozen import FrozenDynamics
+from impactopt.errors import check_direction
+from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.robots.robot import Robot
 
 __all__ = ["effective_mass"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from .jets import Jet, value_at
+from impactopt.collision.jets import Jet, value_at
 
 __all__ = ["BEYOND", "first_event", "level_jet", "newton", "refine"]
 

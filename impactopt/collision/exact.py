@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from .bernstein import bernstein_matrix, first_negative, largest
-from .course import Stretch, relative_to
-from .graph import frozen_dynamics, joint_space_model, target_yield
-from .linear_contact import force_coefficients, target_pieces
-from .outputs import Outputs, frozen_for
-from .pieces import Phase, Pieces
-from .result import Collision
+from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
+from impactopt.collision.course import Stretch, relative_to
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
+from impactopt.collision.linear_contact import force_coefficients, target_pieces
+from impactopt.collision.outputs import Outputs, frozen_for
+from impactopt.collision.pieces import Phase, Pieces
+from impactopt.collision.result import Collision
 
 if TYPE_CHECKING:
-    from .symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["ExactCollision", "Path", "exact_collision", "exact_path"]
 

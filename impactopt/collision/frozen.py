@@ -30,9 +30,9 @@ from typing import Any
 
 import casadi as ca
 
-from ..rigid_body import RigidBody
-from ..robot import Robot
-from ..stance import Stance
+from impactopt.kinematics.stance import Stance
+from impactopt.rigid_body import RigidBody
+from impactopt.robots.robot import Robot
 
 __all__ = ["FrozenDynamics"]
 

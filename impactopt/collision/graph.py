@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
-from ..contact import Target
-from ..rigid_body import RigidBody
-from .course import Course, Loop
-from .frozen import FrozenDynamics
-from .implicit_numpy import implicit_loop
-from .loop import run
-from .model import JointSpaceModel, shape_of
-from .outputs import HISTORIES, Outputs, frozen_for
-from .runge_kutta import rk4_step
-from .taylor import taylor_step
+from impactopt.collision.course import Course, Loop
+from impactopt.collision.frozen import FrozenDynamics
+from impactopt.collision.implicit_numpy import implicit_loop
+from impactopt.collision.loop import run
+from impactopt.collision.model import JointSpaceModel, shape_of
+from impactopt.collision.outputs import HISTORIES, Outputs, frozen_for
+from impactopt.collision.runge_kutta import rk4_step
+from impactopt.collision.taylor import taylor_step
+from impactopt.contact import Target
+from impactopt.rigid_body import RigidBody
 
 if TYPE_CHECKING:
-    from .symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = [
     "METHODS",

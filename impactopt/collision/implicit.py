@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_laguerre
 
-from ..contact import ContactLaw, Target
-from .bernstein import bernstein_matrix
+from impactopt.collision.bernstein import bernstein_matrix
+from impactopt.contact import ContactLaw, Target
 
 __all__ = ["STAGES", "gamma", "is_linear", "linear_contact", "tables"]
 

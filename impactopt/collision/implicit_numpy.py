@@ -14,9 +14,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from .bernstein import first_negative, largest
-from .implicit import STAGES, gamma, linear_contact, tables
-from .model import JointSpaceModel
+from impactopt.collision.bernstein import first_negative, largest
+from impactopt.collision.implicit import STAGES, gamma, linear_contact, tables
+from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["implicit_loop"]
 

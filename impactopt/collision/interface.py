@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
-from ..contact import ContactLaw, Target
-from ..errors import InputError, check_array, check_direction
-from ..robot import Robot
-from ..stance import Stance, usual_stance
-from .result import Collision
+from impactopt.collision.result import Collision
+from impactopt.contact import ContactLaw, Target
+from impactopt.errors import InputError, check_array, check_direction
+from impactopt.kinematics.stance import Stance, usual_stance
+from impactopt.robots.robot import Robot
 
 __all__ = ["CollisionModel"]
 

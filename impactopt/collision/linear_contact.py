@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact import Board, ContactLaw, Nail, Target
-from ..errors import InputError
+from impactopt.contact import Board, ContactLaw, Nail, Target
+from impactopt.errors import InputError
 
 __all__ = ["TargetPiece", "force_coefficients", "target_pieces"]
 

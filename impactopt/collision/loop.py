@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from .model import JointSpaceModel
+from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["BLOCK", "run"]
 

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact import ContactLaw, Target
-from .settings import Settings
-from .terms import Terms
+from impactopt.collision.settings import Settings
+from impactopt.collision.terms import Terms
+from impactopt.contact import ContactLaw, Target
 
 __all__ = ["JointSpaceModel", "shape_of"]
 

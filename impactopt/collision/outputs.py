@@ -7,9 +7,9 @@ from typing import Any
 
 import casadi as ca
 
-from ..errors import InputError, did_you_mean
-from .course import Stretch
-from .model import JointSpaceModel
+from impactopt.collision.course import Stretch
+from impactopt.collision.model import JointSpaceModel
+from impactopt.errors import InputError, did_you_mean
 
 __all__ = [
     "HISTORIES",

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact import Target
-from .outputs import HISTORIES, OUTPUTS, SCALARS
+from impactopt.collision.outputs import HISTORIES, OUTPUTS, SCALARS
+from impactopt.contact import Target
 
 __all__ = ["Collision"]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import casadi as ca
 
-from .model import JointSpaceModel
+from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["LEFT_OUT_BY_RK4", "rate_of_change", "rk4_step"]
 

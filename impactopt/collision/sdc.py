@@ -8,14 +8,14 @@ from functools import cached_property
 
 from numpy.typing import ArrayLike
 
-from ..contact import ContactLaw, FreeMass, SpringDamper, Target
-from ..errors import InputError, check_array
-from ..robot import Robot
-from ..stance import BothSoles, FixedBase, Stance
-from .freezing import caution, more_often
-from .settings import servo_settings
-from .symbolic import SymbolicModel
-from .terms import JointFriction, Terms
+from impactopt.collision.freezing import caution, more_often
+from impactopt.collision.settings import servo_settings
+from impactopt.collision.symbolic import SymbolicModel
+from impactopt.collision.terms import JointFriction, Terms
+from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
+from impactopt.errors import InputError, check_array
+from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
+from impactopt.robots.robot import Robot
 
 __all__ = ["SDC"]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..contact import ContactLaw, Target
-from ..errors import InputError, check_array, check_direction, did_you_mean, raw_array
-from ..robot import Robot
-from .terms import JointFriction, Terms
+from impactopt.collision.terms import JointFriction, Terms
+from impactopt.contact import ContactLaw, Target
+from impactopt.errors import InputError, check_array, check_direction, did_you_mean, raw_array
+from impactopt.robots.robot import Robot
 
 __all__ = ["REFERENCE_ORDER", "Settings", "no_bend", "servo_settings"]
 

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from .model import JointSpaceModel
-from .runge_kutta import rate_of_change
+from impactopt.collision.model import JointSpaceModel
+from impactopt.collision.runge_kutta import rate_of_change
 
 __all__ = ["longest_stable_step", "slope_function"]
 

@@ -1,7 +1,7 @@
 """How a held robot's striking point can be moved, and what torque lets it move on, compiled for many states.
 
-`impactopt.cases.striking_velocity` and `impactopt.reference.holding_torque` are the same for one state, by
-Pinocchio and least squares; the two are tested against each other.
+`impactopt.simulation.cases.striking_velocity` and `impactopt.simulation.reference.holding_torque` are the
+same for one state, by Pinocchio and least squares; the two are tested against each other.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..codegen import cached, model_hash
-from ..rigid_body import RigidBody
-from ..robot import Robot
-from ..stance import Stance
-from .frozen import _inverse_of_cholesky
+from impactopt.codegen.cache import cached, model_hash
+from impactopt.collision.frozen import _inverse_of_cholesky
+from impactopt.kinematics.stance import Stance
+from impactopt.rigid_body import RigidBody
+from impactopt.robots.robot import Robot
 
 __all__ = ["striking_functions"]
 

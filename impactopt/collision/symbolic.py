@@ -12,14 +12,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..codegen import cached, model_hash
-from ..errors import InputError, check_array, did_you_mean
-from .batch import Batch
-from .checks import check_course, check_finite, check_frozen
-from .describe import Description, describe
-from .exact import ExactCollision
-from .freezing import FREEZE_ERROR, freeze_error
-from .graph import (
+from impactopt.codegen.cache import cached, model_hash
+from impactopt.collision.batch import Batch
+from impactopt.collision.checks import check_course, check_finite, check_frozen
+from impactopt.collision.describe import Description, describe
+from impactopt.collision.exact import ExactCollision
+from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
+from impactopt.collision.graph import (
     METHODS,
     collision_graph,
     frozen_dynamics,
@@ -27,14 +26,15 @@ from .graph import (
     number_of_steps,
     target_yield,
 )
-from .implicit import is_linear
-from .interface import CollisionModel
-from .native import native_collision, native_gradient, native_jacobian
-from .outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_jacobian, check_outputs
-from .result import Collision
-from .settings import Settings
-from .stability import longest_stable_step, slope_function
-from .terms import JointFriction, Terms
+from impactopt.collision.implicit import is_linear
+from impactopt.collision.interface import CollisionModel
+from impactopt.collision.native import native_collision, native_gradient, native_jacobian
+from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_jacobian, check_outputs
+from impactopt.collision.result import Collision
+from impactopt.collision.settings import Settings
+from impactopt.collision.stability import longest_stable_step, slope_function
+from impactopt.collision.terms import JointFriction, Terms
+from impactopt.errors import InputError, check_array, did_you_mean
 
 __all__ = ["SymbolicModel"]
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import casadi as ca
 
-from .events import first_event, level_jet, newton, refine
-from .jets import Jet, derivative, value_at
-from .model import JointSpaceModel
+from impactopt.collision.events import first_event, level_jet, newton, refine
+from impactopt.collision.jets import Jet, derivative, value_at
+from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["LEFT_OUT_BY_TAYLOR", "taylor_step"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import MOST, InputError, check_array, raw_array
+from impactopt.errors import MOST, InputError, check_array, raw_array
 
 __all__ = ["JointFriction", "Terms"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .symbolic import SymbolicModel
-from .terms import Terms
+from impactopt.collision.symbolic import SymbolicModel
+from impactopt.collision.terms import Terms
 
 __all__ = ["VirtualMass"]
 

@@ -1,12 +1,12 @@
 """What is hit and how contact works: laws (force from penetration) and targets (motion from force)."""
 
-from ._expressions import power
-from .board import Board
-from .custom import CustomLaw
-from .laws import ContactLaw, KelvinVoigt, SpringDamper
-from .nail import Nail
-from .nonlinear import HertzDamped, HuntCrossley
-from .targets import FreeMass, RigidWall, Target
+from impactopt.contact._expressions import power
+from impactopt.contact.board import Board
+from impactopt.contact.custom import CustomLaw
+from impactopt.contact.laws import ContactLaw, KelvinVoigt, SpringDamper
+from impactopt.contact.nail import Nail
+from impactopt.contact.nonlinear import HertzDamped, HuntCrossley
+from impactopt.contact.targets import FreeMass, RigidWall, Target
 
 __all__ = [
     "Board",

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..errors import MOST, InputError, check_array
+from impactopt.errors import MOST, InputError, check_array
 
 Parameters = Mapping[str, Any]
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from ..errors import InputError, check_array
-from ._expressions import Parameters, choose
-from .laws import ContactLaw, rough_at
+from impactopt.contact._expressions import Parameters, choose
+from impactopt.contact.laws import ContactLaw, rough_at
+from impactopt.errors import InputError, check_array
 
 __all__ = ["CustomLaw"]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ..errors import InputError
-from .laws import ContactLaw
-from .targets import Target
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
+from impactopt.errors import InputError
 
 __all__ = ["scaled_numbers"]
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ._expressions import Parameters, choose, numbers_of, positive, text_of
+from impactopt.contact._expressions import Parameters, choose, numbers_of, positive, text_of
 
 __all__ = ["ContactLaw", "KelvinVoigt", "SpringDamper", "rough_at"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from ._expressions import Parameters, choose, positive
-from .targets import Target
+from impactopt.contact._expressions import Parameters, choose, positive
+from impactopt.contact.targets import Target
 
 __all__ = ["Nail"]
 

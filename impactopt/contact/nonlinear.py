@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Any, ClassVar
 
-from ..errors import InputError, check_array
-from ._expressions import Parameters, choose, positive, power
-from .laws import ContactLaw
+from impactopt.contact._expressions import Parameters, choose, positive, power
+from impactopt.contact.laws import ContactLaw
+from impactopt.errors import InputError, check_array
 
 __all__ = ["HertzDamped", "HuntCrossley"]
 

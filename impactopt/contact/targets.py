@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from ..errors import InputError
-from ._expressions import Parameters, numbers_of, positive, text_of
+from impactopt.contact._expressions import Parameters, numbers_of, positive, text_of
+from impactopt.errors import InputError
 
 __all__ = ["FreeMass", "RigidWall", "Target"]
 

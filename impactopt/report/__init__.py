@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from impactopt.output import record_of
+from impactopt.files.output import record_of
+from impactopt.planning.solution import Solution
 from impactopt.report.animation import Animation, animation_of
 from impactopt.report.bodies_page import bodies_page, bodies_page_of_problem
 from impactopt.report.report import Report, report_of
-from impactopt.solution import Solution
 
 __all__ = [
     "Animation",

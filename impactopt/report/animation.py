@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 
 from impactopt.errors import InputError
-from impactopt.output import Record, write_file
-from impactopt.problem import ImpactProblem
+from impactopt.files.output import Record, write_file
+from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import html_page
 from impactopt.report.stage import stage_of
 

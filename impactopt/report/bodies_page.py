@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from impactopt.bodies.robot_bodies import RobotBodies, bodies_of
 from impactopt.bodies.solids import Solid
 from impactopt.bodies.world import WorldBody
-from impactopt.problem import ImpactProblem
+from impactopt.problem.problem import ImpactProblem
 from impactopt.report.page import html_page
 from impactopt.report.report import Report
 from impactopt.report.stage import Arrays, pack_robot, pack_solid, pack_track, pack_world
 from impactopt.report.tracks import Track
-from impactopt.robot import Robot
+from impactopt.robots.robot import Robot
 
 __all__ = ["bodies_page", "bodies_page_of_problem"]
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.output import Record
-from impactopt.problem import ImpactProblem
+from impactopt.files.output import Record
+from impactopt.kinematics.support import margin
+from impactopt.problem.problem import ImpactProblem
 from impactopt.report.thinning import BUCKETS, thinned
 from impactopt.report.tracks import planned_hand_speed
-from impactopt.support import margin
-from impactopt.validation.result import centre_of_pressure
+from impactopt.simulation.result import centre_of_pressure
 
 __all__ = ["charts_of"]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.output import plain
+from impactopt.files.output import plain
 
 __all__ = ["pack", "unpack"]
 

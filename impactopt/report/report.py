@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from impactopt.output import Record
-from impactopt.problem import ImpactProblem
+from impactopt.files.output import Record
+from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
+from impactopt.report.result_rows import result_columns, result_rows
 from impactopt.report.stage import stage_of
-from impactopt.result_rows import result_columns, result_rows
 
 __all__ = ["Report", "report_of"]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.output import Record
-from impactopt.problem import ImpactProblem
-from impactopt.validation.result import centre_of_pressure
+from impactopt.files.output import Record
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.result import centre_of_pressure
 
 __all__ = ["AROUND", "FAR", "Track", "planned_hand_speed", "tracks_of"]
 

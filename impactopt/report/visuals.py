@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.pieces import ROD, inertia_box
 from impactopt.bodies.solids import Solid, cylinder, sphere
 from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
-from impactopt.robot import Robot, Striker
+from impactopt.robots.robot import Robot, Striker
 
 __all__ = ["Visual", "visuals_of"]
 

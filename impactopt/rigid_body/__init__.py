@@ -5,7 +5,7 @@ own frame, frame Jacobians and velocities are LOCAL_WORLD_ALIGNED (at the frame'
 axes).
 """
 
-from ._body import RigidBody
-from ._factor import Factor
+from impactopt.rigid_body._body import RigidBody
+from impactopt.rigid_body._factor import Factor
 
 __all__ = ["Factor", "RigidBody"]

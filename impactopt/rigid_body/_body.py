@@ -8,13 +8,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
-from . import _dynamics, _momentum
-from ._coordinates import Coordinates
-from ._factor import Factor, add_to_diagonal, tree_entries
-from ._kinematics import Kinematics
-from ._motion import Accelerations, Velocities
-from ._scalar import (
+from impactopt.errors import InputError
+from impactopt.rigid_body import _dynamics, _momentum
+from impactopt.rigid_body._coordinates import Coordinates
+from impactopt.rigid_body._factor import Factor, add_to_diagonal, tree_entries
+from impactopt.rigid_body._kinematics import Kinematics
+from impactopt.rigid_body._motion import Accelerations, Velocities
+from impactopt.rigid_body._scalar import (
     Scalar,
     Vector,
     as_sx,
@@ -24,7 +24,7 @@ from ._scalar import (
     pack_vector,
     unpack_vector,
 )
-from ._tree import Tree
+from impactopt.rigid_body._tree import Tree
 
 
 class RigidBody:

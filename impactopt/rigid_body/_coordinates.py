@@ -14,10 +14,31 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, check_array, did_you_mean
-from ._scalar import Matrix, Number, Scalar, Vector, cos, pack_entries, pack_vector, sin, tan, unpack_vector
-from ._spatial import IDENTITY, add, cross, product, scale, subtract, times, transpose_times, zero_vector
-from ._tree import Kind, Tree
+from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.rigid_body._scalar import (
+    Matrix,
+    Number,
+    Scalar,
+    Vector,
+    cos,
+    pack_entries,
+    pack_vector,
+    sin,
+    tan,
+    unpack_vector,
+)
+from impactopt.rigid_body._spatial import (
+    IDENTITY,
+    add,
+    cross,
+    product,
+    scale,
+    subtract,
+    times,
+    transpose_times,
+    zero_vector,
+)
+from impactopt.rigid_body._tree import Kind, Tree
 
 BASES = ("quaternion", "rpy")
 

@@ -6,10 +6,10 @@ Dynamics Algorithms (2008), chapters 5 and 6.
 
 from __future__ import annotations
 
-from ._kinematics import Kinematics
-from ._motion import Accelerations
-from ._scalar import Number, Vector, is_zero
-from ._spatial import (
+from impactopt.rigid_body._kinematics import Kinematics
+from impactopt.rigid_body._motion import Accelerations
+from impactopt.rigid_body._scalar import Number, Vector, is_zero
+from impactopt.rigid_body._spatial import (
     add,
     cross,
     move_tensor,
@@ -20,7 +20,7 @@ from ._spatial import (
     times,
     zero_vector,
 )
-from ._tree import Kind
+from impactopt.rigid_body._tree import Kind
 
 
 class CompositeInertias:

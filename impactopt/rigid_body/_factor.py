@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..errors import InputError
-from ._scalar import Number, Vector, as_sx, is_zero, pack_entries, unpack_entries
+from impactopt.errors import InputError
+from impactopt.rigid_body._scalar import Number, Vector, as_sx, is_zero, pack_entries, unpack_entries
 
 
 class Factor:

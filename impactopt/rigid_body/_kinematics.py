@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ._coordinates import Coordinates
-from ._scalar import Matrix, Number, Vector
-from ._spatial import (
+from impactopt.rigid_body._coordinates import Coordinates
+from impactopt.rigid_body._scalar import Matrix, Number, Vector
+from impactopt.rigid_body._spatial import (
     IDENTITY,
     add,
     column,
@@ -18,7 +18,7 @@ from ._spatial import (
     transpose_times,
     zero_vector,
 )
-from ._tree import Kind, Tree
+from impactopt.rigid_body._tree import Kind, Tree
 
 
 class Kinematics:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ..errors import InputError
-from ._dynamics import CompositeInertias, MassMatrix
-from ._motion import Velocities
-from ._scalar import Number, Vector
-from ._spatial import add, cross, scale, subtract, tensor_matrix, times, zero_vector
-from ._tree import Kind
+from impactopt.errors import InputError
+from impactopt.rigid_body._dynamics import CompositeInertias, MassMatrix
+from impactopt.rigid_body._motion import Velocities
+from impactopt.rigid_body._scalar import Number, Vector
+from impactopt.rigid_body._spatial import add, cross, scale, subtract, tensor_matrix, times, zero_vector
+from impactopt.rigid_body._tree import Kind
 
 
 def com_in_root(composites: CompositeInertias) -> Vector:

@@ -5,10 +5,10 @@ They are in link frames; the world's axes enter at the end only, by one rotation
 
 from __future__ import annotations
 
-from ._kinematics import Kinematics
-from ._scalar import Matrix, Vector
-from ._spatial import add, cross, scale, times, transpose_times, zero_vector
-from ._tree import Kind
+from impactopt.rigid_body._kinematics import Kinematics
+from impactopt.rigid_body._scalar import Matrix, Vector
+from impactopt.rigid_body._spatial import add, cross, scale, times, transpose_times, zero_vector
+from impactopt.rigid_body._tree import Kind
 
 
 class Velocities:

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 import casadi as ca
 
-from ..errors import InputError
+from impactopt.errors import InputError
 
 _ADD, _SUB, _MUL, _DIV, _NEG = ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_NEG
 _COS, _SIN, _TAN = ca.OP_COS, ca.OP_SIN, ca.OP_TAN

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ..errors import InputError, did_you_mean
-from ._scalar import Matrix, Vector
-from ._spatial import IDENTITY
+from impactopt.errors import InputError, did_you_mean
+from impactopt.rigid_body._scalar import Matrix, Vector
+from impactopt.rigid_body._spatial import IDENTITY
 
 SNAP = 1e-14  # rotation entries this near to 0, 1 or -1, lengths this short [m]: rounding, not design
 

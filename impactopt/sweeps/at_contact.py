@@ -10,13 +10,13 @@ from pydantic import Field, ValidationError
 
 from impactopt.collision import SDC, CollisionModel, VirtualMass
 from impactopt.errors import InputError
-from impactopt.problem_file.mistakes import mistakes_of, report_mistakes
-from impactopt.problem_file.section import Section
-from impactopt.problem_file.sections import File
-from impactopt.problem_file.values import Positive
-from impactopt.reference import FullDynamics
-from impactopt.robot import Robot
-from impactopt.stance import FixedBase, Stance
+from impactopt.files.problem_file.mistakes import mistakes_of, report_mistakes
+from impactopt.files.problem_file.section import Section
+from impactopt.files.problem_file.sections import File
+from impactopt.files.problem_file.values import Positive
+from impactopt.kinematics.stance import FixedBase, Stance
+from impactopt.robots.robot import Robot
+from impactopt.simulation.reference import FullDynamics
 
 __all__ = ["AtContact", "check_at_contact", "collision_model"]
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from impactopt.errors import InputError, did_you_mean
-from impactopt.problem_file import key_place
-from impactopt.problem_file.toml import Place
+from impactopt.files.problem_file import key_place
+from impactopt.files.problem_file.toml import Place
 from impactopt.sweeps.at_contact import AtContact
 
 __all__ = ["SERVO", "Role", "role_of", "setting_of", "sweep_place"]

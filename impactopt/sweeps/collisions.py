@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.collision.freezing import FREEZE_ERROR
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, raw_array
-from impactopt.problem_file import ProblemFile, read_problem_file
-from impactopt.problem_file.toml import plain_value
+from impactopt.files.problem_file import ProblemFile, read_problem_file
+from impactopt.files.problem_file.toml import plain_value
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
 from impactopt.sweeps.collision_keys import role_of, sweep_place
 from impactopt.sweeps.measures import chosen

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Generator, Iterable, Iterator
 
-from impactopt._workers import Died, each_on_workers
+from impactopt.simulation.workers import Died, each_on_workers
 from impactopt.sweeps.alarm import RANG
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.units import Found, Unit, Work, failed_columns

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from impactopt import __version__
 from impactopt.errors import InputError
-from impactopt.output import Record
+from impactopt.files.output import Record
 from impactopt.sweeps.alarm import Alarm
 from impactopt.sweeps.grains import GRAINS
 from impactopt.sweeps.units import Found, Unit, Work, failed_columns

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from impactopt.problem_file.section import Section, optional, required
+from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.sweeps.dotted import flat
 
 __all__ = ["Figure"]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from impactopt.output import Record, plain, record_of, record_of_strike, summary_of
-from impactopt.planner import solve
-from impactopt.problem import ImpactProblem
-from impactopt.problem_file import ProblemFile, problem_file_from_data
-from impactopt.solution import Solution
-from impactopt.strike import StrikeSolution, optimize_strike
+from impactopt.files.output import Record, plain, record_of, record_of_strike, summary_of
+from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.planning.strike import StrikeSolution, optimize_strike
+from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.alarm import Alarm
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.units import Columns, Unit, Work

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.files import open_own
+from impactopt.storage.files import open_own
 from impactopt.sweeps.units import Columns
 
 __all__ = ["Entry", "Journal"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.targets import UNITS, Target
 from impactopt.errors import InputError, did_you_mean
-from impactopt.support import margin, zmp
+from impactopt.kinematics.support import margin, zmp
 from impactopt.sweeps.states import States
 
 __all__ = ["MEASURES", "Blow", "Measure", "chosen"]

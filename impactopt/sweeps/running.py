@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.nlp.transcription import block_functions
-from impactopt.problem import ImpactProblem
-from impactopt.solution import versions
+from impactopt.planning.solution import versions
+from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.cluster import connected, on_cluster
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.engines import on_processes
@@ -22,6 +21,7 @@ from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
 from impactopt.sweeps.tally import Progress, Tally
 from impactopt.sweeps.units import Found, Unit, Work
+from impactopt.transcription.transcription import block_functions
 
 __all__ = ["SweepResult", "sweep"]
 

@@ -16,8 +16,8 @@ from impactopt.collision.freezing import FREEZE_ERROR
 from impactopt.collision.outputs import HISTORIES
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
-from impactopt.problem_file import ProblemFile
-from impactopt.problem_file.toml import Place
+from impactopt.files.problem_file import ProblemFile
+from impactopt.files.problem_file.toml import Place
 from impactopt.sweeps.at_contact import AtContact
 from impactopt.sweeps.collision_keys import SERVO, setting_of
 from impactopt.sweeps.measures import Blow, Measure

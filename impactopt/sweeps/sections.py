@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from impactopt.problem_file.mistakes import Mistake
-from impactopt.problem_file.section import Section, optional, required
-from impactopt.problem_file.values import Positive
+from impactopt.files.problem_file.mistakes import Mistake
+from impactopt.files.problem_file.section import Section, optional, required
+from impactopt.files.problem_file.values import Positive
 from impactopt.sweeps.figure import Figure
 
 __all__ = ["File", "Grain", "SpanSection", "of_other_grains"]

@@ -14,10 +14,10 @@ from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact.targets import UNITS
 from impactopt.errors import InputError
-from impactopt.output import Record, load_record, plain
-from impactopt.problem_file import ProblemFile, parse_problem_file
-from impactopt.robot import Robot
-from impactopt.support import margin, zmp
+from impactopt.files.output import Record, load_record, plain
+from impactopt.files.problem_file import ProblemFile, parse_problem_file
+from impactopt.kinematics.support import margin, zmp
+from impactopt.robots.robot import Robot
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
 from impactopt.sweeps.measures import MEASURES, Blow
 from impactopt.sweeps.scene import NOT_ENDED

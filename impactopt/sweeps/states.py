@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.striking import striking_functions
-from impactopt.coordinates import StanceCoordinates
 from impactopt.errors import InputError, did_you_mean
-from impactopt.nlp.batched import BatchedFunction
-from impactopt.output import load_record
-from impactopt.reach import reach
-from impactopt.reference import coasting_reference
-from impactopt.robot import Robot
-from impactopt.stance import Stance
-from impactopt.support import support_polygon
+from impactopt.files.output import load_record
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.stance import Stance
+from impactopt.kinematics.support import support_polygon
+from impactopt.robots.robot import Robot
+from impactopt.simulation.reference import coasting_reference
+from impactopt.transcription.batched import BatchedFunction
 
 __all__ = ["ContactStates", "Posture", "States"]
 

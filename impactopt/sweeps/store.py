@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from impactopt.errors import InputError
-from impactopt.files import open_own
-from impactopt.output import make_directory, save_record, write_file
-from impactopt.solution import versions
+from impactopt.files.output import make_directory, save_record, write_file
+from impactopt.planning.solution import versions
+from impactopt.storage.files import open_own
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.journal import Entry, Journal
 from impactopt.sweeps.units import Found

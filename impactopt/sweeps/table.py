@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, did_you_mean
-from impactopt.output import write_file
+from impactopt.files.output import write_file
 from impactopt.sweeps.units import Columns
 
 __all__ = ["merge_kinds", "pyarrow", "read_columns", "unit_of", "without_unit", "write_table"]

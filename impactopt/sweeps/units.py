@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.output import Record
+from impactopt.files.output import Record
 from impactopt.sweeps.design import Column
 
 __all__ = ["GRACE", "Columns", "Found", "Unit", "Work", "failed_columns"]

@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from impactopt.errors import InputError
-from impactopt.problem_file import ProblemFile
-from impactopt.problem_file.mistakes import Mistake, mistakes_of
-from impactopt.problem_file.toml import Place
+from impactopt.files.problem_file import ProblemFile
+from impactopt.files.problem_file.mistakes import Mistake, mistakes_of
+from impactopt.files.problem_file.toml import Place
 from impactopt.sweeps.design import Axis, Column, Span, column
 from impactopt.sweeps.sections import SpanSection
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import casadi as ca
 
-from ...stance import Stance
-from ..frozen import FrozenDynamics
-from ..graph import target_yield
-from ..implicit import linear_contact
-from ..jets import derivative
-from ..model import JointSpaceModel
-from ..taylor import ORDER
+from impactopt.collision.frozen import FrozenDynamics
+from impactopt.collision.graph import target_yield
+from impactopt.collision.implicit import linear_contact
+from impactopt.collision.jets import derivative
+from impactopt.collision.model import JointSpaceModel
+from impactopt.collision.taylor import ORDER
+from impactopt.kinematics.stance import Stance
 
 __all__ = ["Tree", "backwards", "c_code", "gamma_of", "scalar_functions", "tangent_back", "tree_functions"]
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import casadi as ca
 
-from ..frozen import FrozenDynamics
-from .generated import Tree
+from impactopt.collision.frozen import FrozenDynamics
+from impactopt.collision.native.generated import Tree
 
 __all__ = ["forward_in_lanes", "tree_in_lanes"]
 

@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..course import GIVES_WAY, cuts
-from ..events import BEYOND
-from ..graph import MOST_STEPS, columns_of, joint_space_model, number_of_steps
-from ..implicit import STAGES, gamma, tables
-from ..loop import BLOCK
-from ..model import shape_of
-from ..outputs import HISTORIES, OF_SOLES, frozen_for
-from ..runge_kutta import LEFT_OUT_BY_RK4
-from ..taylor import LEFT_OUT_BY_TAYLOR, ORDER
-from .generated import Tree, gamma_of
+from impactopt.collision.course import GIVES_WAY, cuts
+from impactopt.collision.events import BEYOND
+from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model, number_of_steps
+from impactopt.collision.implicit import STAGES, gamma, tables
+from impactopt.collision.loop import BLOCK
+from impactopt.collision.model import shape_of
+from impactopt.collision.native.generated import Tree, gamma_of
+from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
+from impactopt.collision.runge_kutta import LEFT_OUT_BY_RK4
+from impactopt.collision.taylor import LEFT_OUT_BY_TAYLOR, ORDER
 
 if TYPE_CHECKING:
-    from ..symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_jacobians"]
 

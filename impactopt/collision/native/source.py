@@ -5,21 +5,21 @@ from __future__ import annotations
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from ...codegen import NativeCode
-from ...errors import InputError
-from ..graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
-from .generated import (
+from impactopt.codegen.cache import NativeCode
+from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
+from impactopt.collision.native.generated import (
     backwards,
     c_code,
     scalar_functions,
     tangent_back,
     tree_functions,
 )
-from .lanes import tree_in_lanes
-from .sizes import names_table, shapes_out, shapes_table, sizes, with_jacobians
+from impactopt.collision.native.lanes import tree_in_lanes
+from impactopt.collision.native.sizes import names_table, shapes_out, shapes_table, sizes, with_jacobians
+from impactopt.errors import InputError
 
 if TYPE_CHECKING:
-    from ..symbolic import SymbolicModel
+    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["native_collision", "native_gradient", "native_jacobian"]
 

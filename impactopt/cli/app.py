@@ -1,0 +1,288 @@
+"""The command line: `impactopt solve`, and the commands that it gathers.
+
+What is heavy (Pinocchio, CasADi, matplotlib) is imported by the commands that need it: `--help` is quick.
+Exit codes: 0 done; 1 the answer is no: not solved, fallen in a replay, no such collision; 2 bad input; 70 a
+fault of ours; 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from impactopt.cli.collide import collide
+from impactopt.cli.drive import drive
+from impactopt.cli.files import check, new, problems, robots
+from impactopt.cli.options import (
+    NOT_SOLVED,
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Seed,
+    Settings,
+    SolverName,
+    Starts,
+    TimeLimit,
+    Verbose,
+    check_loudness,
+    check_time_limit,
+    command_line,
+    examples,
+)
+from impactopt.cli.show import show
+from impactopt.cli.strike import strike
+from impactopt.cli.sweep import sweep
+from impactopt.cli.validate import validate
+from impactopt.report.plain_errors import plain_errors
+from impactopt.studies.bench.command import app as bench_app
+from impactopt.studies.reproduce.command import reproduce
+from impactopt.studies.reproduce.figures import figures
+
+if TYPE_CHECKING:
+    from impactopt.files.output import Record
+    from impactopt.files.problem_file import ProblemFile
+    from impactopt.planning.solution import Solution
+    from impactopt.problem.problem import ImpactProblem
+    from impactopt.report.console import Progress
+
+__all__ = ["app", "main"]
+
+WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
+
+app = typer.Typer(
+    name="impactopt",
+    help="Impact motions of humanoid robots: planned by the impulse they deliver, checked in full dynamics.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    epilog="Exit codes: 0 done; 1 the answer is no: not solved, fallen, no such collision; 2 bad input; 70 a "
+    "fault of impactopt; 130 Ctrl-C. Each command's own help has examples; docs/command_line.md has more.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+app.add_typer(bench_app)
+
+
+class Start(str, enum.Enum):
+    reach = "reach"
+    strike = "strike"
+
+
+def main() -> None:
+    """Entry point of the command `impactopt`."""
+    app()
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        from impactopt import __version__
+
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command(
+    epilog=examples(
+        "impactopt solve punch --out results/punch",
+        "impactopt solve my.toml --set target.mass=8 --set swing.duration=[0.6,0.9]",
+        "impactopt solve punch --start strike --starts 4 --json --quiet",
+    )
+)
+def solve(
+    context: typer.Context,
+    file: ProblemPath,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
+    ] = None,
+    solver: SolverName = None,
+    start: Annotated[Start, typer.Option(help="A plain reach, or the hardest strike near it.")] = Start.reach,
+    starts: Starts = 1,
+    seed: Seed = 0,
+    time_limit: TimeLimit = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    validate: Annotated[bool, typer.Option(help="Replay the plan in full dynamics.")] = True,
+    baseline: Annotated[
+        bool, typer.Option("--baseline", help="Also find the hardest minimum-jerk reach in the same limits.")
+    ] = False,
+) -> None:
+    """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
+
+    Ctrl-C stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if there is a
+    good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    """
+    with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
+        from impactopt.files.output import make_directory
+        from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.planning.planner import solve as plan
+        from impactopt.report.console import Progress
+
+        check_time_limit(time_limit)
+        check_loudness(quiet, verbose)
+        read = read_problem_file(file, parse_settings(settings or ()))
+        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
+        with Progress(console, quiet=quiet, verbose=verbose) as progress:
+            progress.say(f"{read.path} is read; building the robot")
+            problem = read.build()
+            directory = make_directory(out if out is not None else Path("results") / file.stem)
+            progress.say("building the program (compiles for a minute or two the first time)")
+            solution = plan(
+                problem,
+                start=start.value,
+                starts=starts,
+                seed=seed,
+                report=progress.say,
+                callback=progress.iteration,
+                **chosen,
+            )
+            progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
+            record = _record(solution, read, validate, progress)
+            record.summary["command"] = command_line(context)
+            if baseline:
+                progress.say("looking for the hardest minimum-jerk reach inside the same limits")
+                record.summary["baseline"] = _baseline(problem)
+            written = _write(record, directory, progress)
+        _show(record, written, as_json)
+        if not solution.status.usable:
+            raise typer.Exit(NOT_SOLVED)
+
+
+app.command(
+    epilog=examples("impactopt strike punch --starts 8", "impactopt strike my.toml --json --out results/s")
+)(strike)
+app.command(
+    epilog=examples(
+        "impactopt collide punch --speed 0.5",
+        "impactopt collide punch --speed 0.5 --set target.mass=20 --model full --json",
+        "impactopt collide results/punch",
+    )
+)(collide)
+app.command(
+    epilog=examples(
+        "impactopt validate results/punch",
+        "impactopt validate results/punch --missing --json",
+        "impactopt validate results/punch --animation punch.gif",
+    )
+)(validate)
+app.command(epilog=examples("impactopt show results/punch --open", "impactopt show talos --open"))(show)
+app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
+app.command(
+    epilog=examples(
+        "impactopt sweep my.toml --out results/s", "impactopt sweep collision_target --out results/t"
+    )
+)(sweep)
+app.command(epilog=examples("impactopt reproduce table3", "impactopt reproduce all --out results/r"))(
+    reproduce
+)
+app.command(epilog=examples("impactopt figures strobe fig7", "impactopt figures --out results/figures"))(
+    figures
+)
+app.command(epilog=examples("impactopt new", "impactopt new punch > my.toml", "impactopt new --reference"))(
+    new
+)
+app.command(epilog=examples("impactopt check my.toml", "impactopt check punch --set problem.point.0=0.7"))(
+    check
+)
+app.command(epilog=examples("impactopt problems --json"))(problems)
+app.command(epilog=examples("impactopt robots --json"))(robots)
+
+
+def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Progress) -> Record:
+    """The solution as numbers, with its re-simulations where there is something to simulate."""
+    from impactopt.errors import InputError
+    from impactopt.files.output import record_of
+    from impactopt.files.replay import has_mujoco
+
+    done, violation = {}, solution.result.max_violation
+    engines = {"pinocchio": "in full dynamics", "mujoco": "on free soles"}
+    if validate and not violation <= WORTH_REPLAYING:
+        progress.say(f"no replay: rows of the plan are off by up to {violation:.2g}")
+    elif validate:
+        for engine, how in engines.items():
+            if engine == "mujoco" and not has_mujoco():
+                continue
+            progress.say(f"replaying the plan {how}")
+            try:
+                done[engine] = solution.validate(engine=engine)
+            except KeyboardInterrupt:
+                progress.say("the replay was interrupted; the plan is kept without it")
+                break
+            except InputError as error:
+                progress.say(f"the plan is kept without a replay {how}: {error}")
+    return record_of(
+        solution,
+        simulation=done.get("pinocchio"),
+        replay=done.get("mujoco"),
+        problem=read.text,
+        problem_path=read.path,
+    )
+
+
+def _baseline(problem: ImpactProblem) -> dict[str, object]:
+    from impactopt.errors import InputError
+    from impactopt.planning.baseline import minimum_jerk_baseline
+
+    try:
+        return minimum_jerk_baseline(problem).describe()
+    except InputError as error:
+        return {"method": "minimum jerk", "error": str(error)}
+
+
+def _write(record: Record, directory: Path, progress: Progress) -> list[Path]:
+    from impactopt.files.result_folder import keep_record
+
+    written = [*keep_record(record, directory)]
+    progress.say("drawing pictures")
+    from impactopt.pictures import save_pictures
+
+    return written + save_pictures(record, written[0].parent)
+
+
+def _show(record: Record, written: list[Path], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(record.summary, indent=2))
+        return
+    from rich.console import Console
+
+    from impactopt.errors import printable
+    from impactopt.files.result_folder import set_aside
+    from impactopt.report.console import result_table, starts_table, told_touches, violation_table
+
+    console, summary = Console(), record.summary
+    if record.completed:
+        console.print(result_table(summary))
+    reach = summary.get("baseline", {})
+    if "impulse_Ns" in reach:
+        console.print(
+            f"hardest minimum-jerk reach inside the same limits: {reach['impulse_Ns']:.2f} N s at "
+            f"{reach['hand_speed_m_s']:.2f} m/s (simulated)",
+            highlight=False,
+        )
+    error = summary.get("simulated", {}).get("error")
+    for text in (summary.get("note"), error, reach.get("error"), told_touches(summary)):
+        if text:
+            console.print(printable(str(text)), markup=False, highlight=False)
+    if len(summary["starts"]) > 1:
+        console.print(starts_table(summary["starts"]))
+    if summary["violations"]:
+        console.print(violation_table(summary["violations"]))
+    console.print(
+        f"{summary['solver']}: {summary['status']} after {summary['iterations']} iterations, "
+        f"{summary['solve_seconds']:.1f} s; building took {summary['build_seconds']:.1f} s",
+        highlight=False,
+    )
+    names = ", ".join(path.name for path in written)
+    console.print(printable(f"{written[0].parent}: {names}"), markup=False, highlight=False, soft_wrap=True)
+    if aside := set_aside(summary):
+        console.print(printable(aside), markup=False, highlight=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""The command `impactopt drive`: blows on a nail until it is in."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import (
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Settings,
+    Verbose,
+    check_loudness,
+)
+from impactopt.report.plain_errors import plain_errors
+
+NOT_IN = 1  # exit code
+
+
+def drive(
+    problem: ProblemPath,
+    depth: Annotated[float, typer.Option(metavar="M", help="How deep the nail is to go.")] = 0.05,
+    most: Annotated[int, typer.Option(metavar="N", help="Blows at most.", min=1)] = 20,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write blows.json there.")
+    ] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Plan blow after blow on a nail, each where the one before has left it, until it is in, as in arm7.
+
+    A series that ends before that goes to DIR/failed if there is one in DIR whose nail is in. Exit code: 0 it
+    is in, 1 it is not, 2 bad input.
+    """
+    with plain_errors("interrupted before the nail was in", verbose=verbose) as console:
+        from impactopt.files.output import make_directory, plain
+        from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.result_folder import keep_series, set_aside
+        from impactopt.planning.nail_driving import drive_nail
+        from impactopt.report.console import Progress, blows_table
+
+        check_loudness(quiet, verbose)
+        read = read_problem_file(problem, parse_settings(settings or ()))
+        directory = None if out is None else make_directory(out)
+        with Progress(console, quiet=quiet) as progress:
+            series = drive_nail(
+                read.build(),
+                depth=depth,
+                most=most,
+                report=progress.say,
+                **read.solver.arguments(),
+            )
+        done = plain(series.describe())
+        if directory is not None:
+            keep_series(done, directory)
+        if as_json:
+            typer.echo(json.dumps(done, indent=2))
+        else:
+            from rich.console import Console
+
+            Console().print(blows_table(done))
+            typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
+            if aside := set_aside(done):
+                typer.echo(aside)
+        if not series.done:
+            raise typer.Exit(NOT_IN)

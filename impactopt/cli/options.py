@@ -1,0 +1,107 @@
+"""What several commands take."""
+
+from __future__ import annotations
+
+import enum
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+NOT_SOLVED = 1  # exit code
+
+
+def complete_problem(incomplete: str) -> list[str]:
+    """Names of problems, and files, that begin like this: for the shell, which waits for it."""
+    return _complete(incomplete, "")
+
+
+def complete_sweep(incomplete: str) -> list[str]:
+    """The same of sweeps."""
+    from impactopt.storage.folders import SWEEPS
+
+    return _complete(incomplete, SWEEPS)
+
+
+def _complete(incomplete: str, folder: str) -> list[str]:
+    from impactopt.storage.folders import named_files
+
+    typed = Path(incomplete)
+    inside = typed if incomplete.endswith("/") else typed.parent
+    beside = sorted(inside.iterdir()) if inside.is_dir() else []
+    files = [f"{path}/" if path.is_dir() else str(path) for path in beside]
+    fit = [file for file in files if file.endswith((".toml", "/"))]
+    return [name for name in (*named_files(folder), *fit) if name.startswith(incomplete)]
+
+
+ProblemPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PROBLEM",
+        help="Its name, as `impactopt problems` lists them, or its file.",
+        autocompletion=complete_problem,
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Another value for a key of the problem file, as target.mass=8; may be repeated.",
+    ),
+]
+
+
+class Solver(str, enum.Enum):
+    ipopt = "ipopt"
+    sqp = "sqp"
+
+
+SolverName = Annotated[Solver | None, typer.Option(help="Instead of the one that the file names.")]
+TimeLimit = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Stop the solver then; keep its best iterate.")
+]
+Starts = Annotated[
+    int, typer.Option(min=1, help="Solve from so many starts, drawn but for the first; keep the best.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of the starts that are drawn.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="A line for every iteration, and the traceback of an error.")
+]
+
+
+def check_loudness(quiet: bool, verbose: bool) -> None:
+    """BadParameter if both are asked for."""
+    if quiet and verbose:
+        raise typer.BadParameter("give one of them", param_hint="--quiet, --verbose")
+
+
+def examples(*lines: str) -> str:
+    """Examples as the end of a command's help."""
+    return "\n\n".join(["Examples:", *(f"  {line}" for line in lines)])
+
+
+def check_time_limit(seconds: float | None) -> None:
+    """BadParameter if it is none."""
+    if seconds is not None and not seconds > 0:
+        raise typer.BadParameter(f"{seconds:g}; give seconds > 0", param_hint="--time-limit")
+
+
+def command_line(context: typer.Context) -> str:
+    """The command as it was given, for the record: its name, arguments, and options that were set."""
+    words = ["impactopt", str(context.info_name)]
+    for parameter in context.command.params:
+        name, value = str(parameter.name), context.params[str(parameter.name)]
+        source = context.get_parameter_source(name)
+        if source is None or source.name != "COMMANDLINE":
+            continue
+        if isinstance(value, bool):
+            words.append((parameter.opts if value else parameter.secondary_opts)[0])
+            continue
+        option = max(parameter.opts, key=len)
+        words += [option] if option.startswith("-") else []
+        words.append(str(value.value if isinstance(value, enum.Enum) else value))
+    return shlex.join(words)

@@ -1,0 +1,101 @@
+"""The command `impactopt show`: a result, or the bodies of a robot, as one page for a browser."""
+
+from __future__ import annotations
+
+import os
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from impactopt.report.plain_errors import plain_errors
+
+if TYPE_CHECKING:
+    from impactopt.report import Report
+
+PAGE = "report.html"
+BODIES = "results"  # where the page of a robot goes
+
+
+def show(
+    what: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULT|ROBOT",
+            help="What `impactopt solve` wrote, such as results/punch; or a robot, as `impactopt robots` "
+            "lists them; or a problem file (.toml), for its robot and its world.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE.html",
+            help=f"The page (default: RESULT/{PAGE}, or {BODIES}/ROBOT.html).",
+        ),
+    ] = None,
+    open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
+    problem: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one kept in RESULT.")
+    ] = None,
+) -> None:
+    """Put a result on one page: numbers, plots, the robot's motion, how it was made. It needs no network.
+
+    Of a robot it shows the bodies: hulls and spheres over its meshes, how well they fit, which may touch.
+
+    Exit code: 0 written, 2 bad input.
+    """
+    with plain_errors("interrupted before the page was written"):
+        from impactopt.errors import printable
+        from impactopt.files.output import make_directory
+
+        made, usual = _bodies(what, problem) if _is_robot(what) else _result(what, problem)
+        page = out if out is not None else usual
+        make_directory(page.parent)
+        written = made.save(page)
+        typer.echo(printable(str(written)))
+        if open_:
+            webbrowser.open(written.resolve().as_uri())
+
+
+def _is_robot(what: Path) -> bool:
+    """A name of a robot that is no file's or directory's, or a problem file."""
+    from impactopt.robots.presets import robot_names
+
+    return what.suffix == ".toml" or (str(what) in robot_names() and not os.path.exists(what))
+
+
+def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
+    """The page of a result, and where it goes."""
+    from impactopt.errors import InputError, did_you_mean
+    from impactopt.files.output import load_record
+    from impactopt.files.replay import load_planned
+    from impactopt.report import report_of
+    from impactopt.robots.presets import robot_names
+
+    if not os.path.exists(result):
+        robots = robot_names()
+        raise InputError(
+            f"there is no result {str(result)!r}{did_you_mean(str(result), robots)}; give a directory that "
+            f"`impactopt solve` wrote, a problem file, or one of the robots {', '.join(robots)}"
+        )
+    record = load_record(result)
+    about = load_planned(result, problem_file=problem).problem if record.completed else None
+    return report_of(record, about), (result if os.path.isdir(result) else result.parent) / PAGE
+
+
+def _bodies(what: Path, problem: Path | None) -> tuple[Report, Path]:
+    """The page of a robot's bodies, and where it goes."""
+    from impactopt.errors import InputError
+    from impactopt.files.problem_file import read_problem_file
+    from impactopt.report import bodies_page, bodies_page_of_problem
+    from impactopt.robots.presets import load_robot
+
+    if problem is not None:
+        raise InputError(f"--problem is for a result, and {str(what)!r} is none: leave it out")
+    page = Path(BODIES) / f"{what.stem}.html"
+    if what.suffix == ".toml":
+        return bodies_page_of_problem(read_problem_file(what).build()), page
+    return bodies_page(load_robot(str(what))), page

@@ -1,0 +1,96 @@
+"""The command `impactopt strike`: the hardest blow by itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import (
+    NOT_SOLVED,
+    AsJson,
+    ProblemPath,
+    Quiet,
+    Seed,
+    Settings,
+    SolverName,
+    Starts,
+    TimeLimit,
+    Verbose,
+    check_loudness,
+    check_time_limit,
+    command_line,
+)
+from impactopt.report.plain_errors import plain_errors
+
+
+def strike(
+    context: typer.Context,
+    file: ProblemPath,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Write numbers there."),
+    ] = None,
+    starts: Starts = 4,
+    seed: Seed = 0,
+    solver: SolverName = None,
+    time_limit: TimeLimit = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find the posture and velocity at contact that hit hardest, with no motion that leads to them.
+
+    From several starts, as local optima differ much. What is not solved goes to DIR/failed if there is a good
+    result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    """
+    with plain_errors("interrupted before there was a strike to keep", verbose=verbose) as console:
+        from impactopt.errors import printable
+        from impactopt.files.output import make_directory, record_of_strike
+        from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.result_folder import keep_record, set_aside
+        from impactopt.planning.strike import optimize_strike
+        from impactopt.report.console import Progress
+
+        check_time_limit(time_limit)
+        check_loudness(quiet, verbose)
+        read = read_problem_file(file, parse_settings(settings or ()))
+        chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
+        with Progress(console, quiet=quiet, verbose=verbose) as progress:
+            progress.say(f"{read.path} is read; building the robot")
+            problem = read.build()
+            directory = None if out is None else make_directory(out)
+            progress.say("building the program (compiles for a minute or two the first time)")
+            solution = optimize_strike(
+                problem,
+                starts=starts,
+                seed=seed,
+                report=progress.say,
+                callback=progress.iteration,
+                **chosen,
+            )
+            progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
+        record = record_of_strike(solution, problem=read.text, problem_path=read.path)
+        record.summary["command"] = command_line(context)
+        written = [] if directory is None else keep_record(record, directory)
+        if as_json:
+            typer.echo(json.dumps(record.summary, indent=2))
+        else:
+            from rich.console import Console
+
+            from impactopt.report.console import starts_table, strike_table, violation_table
+
+            shown = Console()
+            shown.print(strike_table(record.summary))
+            shown.print(starts_table(record.summary["starts"]))
+            if record.summary["violations"]:
+                shown.print(violation_table(record.summary["violations"]))
+            for path in written:
+                shown.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+            if aside := set_aside(record.summary):
+                shown.print(aside, highlight=False, markup=False, soft_wrap=True)
+        if not solution.status.usable:
+            raise typer.Exit(NOT_SOLVED)

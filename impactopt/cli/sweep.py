@@ -1,0 +1,163 @@
+"""The command `impactopt sweep`: many cases of one problem."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep
+from impactopt.report.plain_errors import plain_errors
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from impactopt.sweeps import Progress, SweepResult
+
+BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewritten
+
+
+def sweep(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SWEEP",
+            help="A sweep file, or the name of one that comes with the package; see docs/sweeps.md.",
+            autocompletion=complete_sweep,
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Where results go, and are found again.")
+    ],
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port: its workers do it."),
+    ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Do cases once more that crashed or ran out of time before.")
+    ] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Another value for a key of the sweep file, as draw.count=100; of the problem's, as "
+            "set.target.mass=8; may be repeated.",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="A line after every case, and the traceback of an error.")
+    ] = False,
+) -> None:
+    """Do every case of a sweep file, and write one table of them: DIR/table.parquet, and DIR/figure.png.
+
+    Each finished case is on disk at once: after Ctrl-C, a kill or a power cut the same command goes on. A
+    case that fails is a row with its reason. Exit code: 0 done, 1 no case has a usable result, 2 bad input.
+    """
+    interrupted = f"interrupted; what is finished is in {out}, and the same command goes on from there"
+    with plain_errors(interrupted, verbose=verbose) as console:
+        from impactopt.files.problem_file import parse_settings
+        from impactopt.sweeps import read_sweep_file
+        from impactopt.sweeps import sweep as run
+
+        check_loudness(quiet, verbose)
+        chosen = read_sweep_file(file, parse_settings(settings or ()))
+        with _Screen(console, quiet=quiet, verbose=verbose) as screen:
+            told: dict[str, Any] = {"report": screen.say, "progress": screen.progress}
+            result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
+        if as_json:
+            typer.echo(json.dumps(result.summary()))
+        else:
+            _show(result)
+        if result.failed == result.done:
+            raise typer.Exit(NOT_SOLVED)
+        if chosen.figure is not None:
+            from impactopt.pictures.sweep import save_sweep_picture
+
+            picture = save_sweep_picture(chosen, result.table)
+            if not (as_json or quiet):
+                console.print(str(picture), markup=False, highlight=False, soft_wrap=True)
+
+
+class _Screen:
+    """Lines about what is going on, and a live bar; where there is no terminal, a line now and then."""
+
+    def __init__(self, console: Console, *, quiet: bool, verbose: bool) -> None:
+        self._console, self._quiet, self._last = console, quiet, -BETWEEN
+        self._between = 0.0 if verbose else BETWEEN
+        self._live = None
+        if console.is_terminal and not (quiet or verbose):
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+            from rich.progress import Progress as Bar
+
+            parts = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+            self._live = Bar(*parts, console=console, transient=True)
+            self._task = self._live.add_task("starting", total=None)
+
+    def __enter__(self) -> _Screen:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def say(self, text: str) -> None:
+        if not self._quiet:
+            from impactopt.errors import printable
+
+            self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
+
+    def progress(self, now: Progress) -> None:
+        text = f"{now.rate:.3g} a second, {_time(now.remaining)} left"
+        if now.failed:
+            text += f", {now.failed} failed"
+        if now.best is not None:
+            text += f", best {now.best:.2f} N s (case {now.best_case})"
+        if self._live is not None:
+            self._live.update(self._task, completed=now.done, total=now.cases, description=text)
+        elif time.perf_counter() - self._last >= self._between:
+            self._last = time.perf_counter()
+            self.say(f"{now.done} of {now.cases}, {text}")
+
+
+def _show(result: SweepResult) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from impactopt.errors import printable
+
+    table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
+    rows = {
+        "without a usable result": str(result.failed),
+        "there from before": str(result.resumed),
+        "this run": f"{_time(result.seconds)}, {result.rate_per_second:.3g} cases a second",
+        "most memory of a worker": f"{result.peak_worker_mb:.0f} MB",
+    }
+    if result.best is not None:
+        rows["largest impulse"] = f"{result.best:.2f} N s, in case {result.best_case}"
+    for name, value in rows.items():
+        table.add_row(name, value)
+    console = Console()
+    console.print(table)
+    for reason, count in result.reasons.items():
+        console.print(printable(f"{count} x {reason}"), markup=False, highlight=False)
+    console.print(str(result.table), markup=False, highlight=False, soft_wrap=True)
+
+
+def _time(seconds: float) -> str:
+    if not seconds < float("inf"):
+        return "?"
+    hours, rest = divmod(round(seconds), 3600)
+    if not hours and rest < 60:
+        return f"{seconds:.3g} s"
+    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60} min {rest % 60} s"

@@ -1,0 +1,127 @@
+"""The command `impactopt validate`: replay a result, in the world as planned or in another one."""
+
+from __future__ import annotations
+
+import enum
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, check_loudness
+from impactopt.report.plain_errors import plain_errors
+
+FELL = 1  # exit code
+
+
+class Engine(str, enum.Enum):
+    mujoco = "mujoco"
+    pinocchio = "pinocchio"
+
+
+def validate(
+    result: Annotated[
+        Path, typer.Argument(metavar="RESULT", help="What `impactopt solve` wrote, such as results/punch.")
+    ],
+    engine: Annotated[
+        Engine, typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: soles are held.")
+    ] = Engine.mujoco,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Write replay.json and replay.png there."),
+    ] = None,
+    animation: Annotated[
+        Path | None, typer.Option(metavar="FILE.gif", help="Draw the robot's motion, slow around contact.")
+    ] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    problem: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one kept in RESULT.")
+    ] = None,
+    step: Annotated[float | None, typer.Option(metavar="S", help="Step of the simulation.")] = None,
+    settle: Annotated[float | None, typer.Option(metavar="S", help="Time after the motion's end.")] = None,
+    mass: Annotated[float, typer.Option(help="Mass of the target, as a factor of the planned one.")] = 1.0,
+    stiffness: Annotated[float, typer.Option(help="Stiffness of the contact, as a factor.")] = 1.0,
+    damping: Annotated[float, typer.Option(help="Damping of the contact, as a factor.")] = 1.0,
+    distance: Annotated[
+        float, typer.Option(metavar="M", help="The target waits this much farther; < 0: nearer.")
+    ] = 0.0,
+    missing: Annotated[bool, typer.Option("--missing", help="There is no target.")] = False,
+    payload: Annotated[float, typer.Option(metavar="KG", help="Unplanned mass at the striking point.")] = 0.0,
+    friction: Annotated[float, typer.Option(help="Coefficient between soles and floor.")] = 0.9,
+    floor_time: Annotated[
+        float, typer.Option(metavar="S", help="Time constant of floor and soles: how soft they are.")
+    ] = 2e-3,
+    kp: Annotated[float, typer.Option(help="Stiffness of the servo, as a factor.")] = 1.0,
+    kd: Annotated[float, typer.Option(help="Damping of the servo, as a factor.")] = 1.0,
+    torque_limit: Annotated[float, typer.Option(help="Torque limits of the joints, as a factor.")] = 1.0,
+    period: Annotated[float, typer.Option(metavar="S", help="Of the servo's clock; 0: every step.")] = 0.0,
+    delay: Annotated[float, typer.Option(metavar="S", help="From reading joints to setting torques.")] = 0.0,
+) -> None:
+    """Does it stand? Replay a result with nothing held, in the world as planned or in another one.
+
+    Exit code: 0 stands (or the engine holds the soles), 1 fell, 2 bad input.
+    """
+    with plain_errors("interrupted before the replay was done", verbose=verbose) as stderr:
+        from impactopt.errors import printable
+        from impactopt.files.output import make_directory, remove_file, write_file
+        from impactopt.files.problem_file import parse_settings
+        from impactopt.files.replay import load_planned, replay
+        from impactopt.report.console import Progress
+        from impactopt.simulation import Conditions
+
+        check_loudness(quiet, verbose)
+
+        world = Conditions(
+            mass=mass,
+            stiffness=stiffness,
+            damping=damping,
+            distance=distance,
+            missing=missing,
+            payload=payload,
+            friction=friction,
+            floor_time=floor_time,
+            kp=kp,
+            kd=kd,
+            torque_limit=torque_limit,
+            period=period,
+            delay=delay,
+        )
+        directory = None if out is None else make_directory(out)
+        if animation is not None:
+            make_directory(animation.parent)
+        options = {name: value for name, value in (("step", step), ("settle", settle)) if value is not None}
+        changes, written = parse_settings(settings or ()), []
+        with Progress(stderr, quiet=quiet, verbose=verbose) as progress:
+            planned = load_planned(result, problem_file=problem, settings=changes)
+            progress.say(f"{result} is read; replaying it in {engine.value}")
+            done = replay(planned, engine=engine.value, conditions=world, **options)
+            if directory is not None:
+                from impactopt.pictures import save_pictures
+
+                text = f"{json.dumps(done.report, indent=2)}\n".encode()
+                written.append(directory / "replay.json")
+                drawn = directory / "replay.png"  # of another replay, or of none
+                write_file(written[0], lambda file: file.write(text), before=lambda: remove_file(drawn))
+                written += save_pictures(done.record, directory, ["replay"])
+            if animation is not None:
+                progress.say("drawing the motion")
+                from impactopt.pictures.animation import save_animation
+
+                written.append(save_animation(done, animation))
+        if as_json:
+            typer.echo(json.dumps(done.report, indent=2))
+        else:
+            from rich.console import Console
+
+            from impactopt.report.console import replay_table
+
+            console = Console()
+            console.print(replay_table(done.report, planned.record.summary))
+            for path in written:
+                console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+        if done.report["standing"] is False:
+            raise typer.Exit(FELL)

@@ -1,0 +1,342 @@
+"""What a solve leaves on disk: `solution.npz` with all numbers, and `summary.json` for a glance.
+
+`solution.npz` stands for itself: it holds the summary and the problem file too. Every file is written beside
+its place and then moved there, so that a reader never sees half of one. When new numbers take the place of
+old ones, what was made of those goes first: whenever a process ends, all files are of one result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.files.record_schema import check_arrays, check_summary
+from impactopt.kinematics.support import support_polygon
+from impactopt.planning.solution import Solution
+from impactopt.planning.strike import StrikeSolution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.reference.poses import poses_of
+from impactopt.solvers.program import SolverResult
+from impactopt.storage.files import read_plain, write_atomically
+
+__all__ = [
+    "Record",
+    "load_record",
+    "make_directory",
+    "plain",
+    "record_of",
+    "record_of_strike",
+    "remove_file",
+    "replay_arrays",
+    "save_record",
+    "summary_of",
+    "write_file",
+]
+
+FORMAT = 1  # of solution.npz; raised when a reader of the old one would go wrong
+LARGEST, MOST_ARRAYS = 1 << 29, 1000  # bytes and arrays of solution.npz; ours have some MB, and a hundred
+NUMBERS, SUMMARY = "solution.npz", "summary.json"
+# what is made of the numbers beside them: by `impactopt show`, by `impactopt validate`, pictures
+DERIVED = (
+    "report.html",
+    "replay.json",
+    *(
+        f"{picture}.png"
+        for picture in ("force", "zmp", "torque", "strobe", "motion", "ellipsoid", "iterations", "replay")
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Record:
+    """A solution as numbers and text only: what is kept, drawn and compared.
+
+    summary : the content of `summary.json`.
+    problem : text of the problem file, "" if there was none.
+    arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
+        corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
+        by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan with a brake,
+        `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*`
+        (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation`
+        on free soles, without velocities and torques), `solver_*` (`SolverResult`), `history_*` (its
+        iterations).
+    problem_path : where the problem file was, for the files that it names; None if there was none.
+    """
+
+    summary: dict[str, Any]
+    problem: str = ""
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict, repr=False)
+    problem_path: Path | None = None
+
+    @property
+    def completed(self) -> bool:
+        """Whether the planned motion is part of the record."""
+        return "reference_time" in self.arrays
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a re-simulation is part of the record."""
+        return "simulated_time" in self.arrays
+
+    @property
+    def replayed(self) -> bool:
+        """Whether a replay on free soles is part of the record."""
+        return "replayed_time" in self.arrays
+
+
+def record_of(
+    solution: Solution,
+    *,
+    simulation: Any | None = None,
+    replay: Any | None = None,
+    problem: str = "",
+    problem_path: Path | None = None,
+) -> Record:
+    """The record of a solution, of its re-simulations if there are any, and of the problem file's text.
+
+    There is always one: where the solver was stopped so early that legs and base do not fit together, it has
+    no `reference_*`, and a summary without the motion's numbers and with a `note` that says why.
+    """
+    plan, robot, result = solution.plan, solution.problem.robot, solution.result
+    arrays = _scene_arrays(solution.problem)
+    parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
+    parts |= {"collision": plan.collision, "solver": result}
+    summary = _summary(solution, simulation, replay)
+    if "note" not in summary:
+        parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}
+        if plan.brake is not None:
+            parts["missed"] = solution.missed_trajectory
+    if simulation is not None:
+        parts["simulated"] = simulation
+    if replay is not None:
+        arrays |= replay_arrays(replay)
+    for prefix in {"reference", "simulated"} & parts.keys():
+        arrays[f"{prefix}_angle"] = np.array([robot.joint_positions(q) for q in parts[prefix].q])
+    arrays |= _parts_arrays(parts, result)
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    return Record(summary=plain(summary), problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def record_of_strike(
+    solution: StrikeSolution, *, problem: str = "", problem_path: Path | None = None
+) -> Record:
+    """The record of a strike: as of a solution, with `strike_*` (`PlannedStrike`) and no motion."""
+    hit = solution.strike
+    parts = {"strike": hit, "collision": hit.collision, "solver": solution.result}
+    arrays = _scene_arrays(solution.problem) | _parts_arrays(parts, solution.result)
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    summary = plain(solution.summary())
+    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:
+    """That of the solution's record; where nothing else of it is kept, its arrays need not be made."""
+    return plain(
+        solution.summary() if isinstance(solution, StrikeSolution) else _summary(solution, None, None)
+    )
+
+
+def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
+    """What a record keeps of the robot and of where it stands."""
+    robot, c = problem.robot, problem.coordinates
+    out: dict[str, Any] = {
+        "joints": np.array(robot.joint_names),
+        "torque_limit": robot.torque_limit,
+        "velocity_limit": robot.velocity_limit,
+        "polygon": support_polygon(robot, c),
+    }
+    for leg in c.legs:
+        corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
+        world = corners @ leg.placement.rotation.T + leg.placement.translation
+        out[f"sole_{leg.sole.name}"] = world[:, :2]
+    return out
+
+
+def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, Any]:
+    """Numbers of dataclasses under their prefixes, and the solver's history."""
+    out: dict[str, Any] = {}
+    for prefix, thing in parts.items():
+        out |= {f"{prefix}_{name}": value for name, value in _numbers(thing).items()}
+    if result.history:
+        history = [_numbers(iteration) for iteration in result.history]
+        out |= {f"history_{name}": [row[name] for row in history] for name in history[0]}
+    return out
+
+
+def replay_arrays(replay: Any) -> dict[str, Any]:
+    """What a record keeps of a `Simulation` on free soles: motion and forces, by `replayed_*`."""
+    left_out = {"v", "demand", "torque"}
+    kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
+    return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}
+
+
+def _summary(solution: Solution, simulation: Any | None, replay: Any | None) -> dict[str, Any]:
+    try:
+        return solution.summary(simulation, replay)
+    except InputError as error:
+        if simulation is not None:  # such as one that missed the target
+            return {**_summary(solution, None, replay), "simulated": {"error": str(error)}}
+        return {**solution.outcome(), "note": f"the plan's motion cannot be completed: {error}"}
+
+
+def _numbers(thing: Any) -> dict[str, Any]:
+    """The fields of a dataclass that are numbers or arrays."""
+    values = {f.name: getattr(thing, f.name) for f in dataclasses.fields(thing)}
+    kinds = (int, float, np.ndarray, np.generic)
+    return {name: value for name, value in values.items() if isinstance(value, kinds)}
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON has it; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def make_directory(directory: str | os.PathLike[str]) -> Path:
+    """The directory, made if it is not there; before hours of work are lost for want of it.
+
+    Raises
+    ------
+    InputError : it cannot be made, or nothing can be written there.
+    """
+    path = Path(directory)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the directory {path}: {error.strerror}; give another one") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write into {path}; give another directory")
+    return path
+
+
+def save_record(record: Record, directory: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """Write `solution.npz` and `summary.json` into the directory, which is made if it is not there.
+
+    What an earlier result has left there goes, of the files that this package makes (`DERIVED`).
+
+    Raises
+    ------
+    InputError : they cannot be written.
+    """
+    path = make_directory(directory)
+    summary = json.dumps(plain(record.summary), indent=2, allow_nan=False)
+    extra = {"summary_json": summary, "problem_toml": record.problem, "format": FORMAT}
+    if record.problem_path is not None:  # relative, so that results and problems can move together
+        extra["problem_path"] = os.path.relpath(record.problem_path.resolve(), path.resolve())
+    numbers: dict[str, Any] = {**record.arrays, **extra}
+
+    def clear() -> None:
+        for name in (SUMMARY, *DERIVED):
+            remove_file(path / name)
+
+    write_file(path / NUMBERS, lambda file: np.savez(file, **numbers), before=clear)
+    write_file(path / SUMMARY, lambda file: file.write(f"{summary}\n".encode()))
+    return path / NUMBERS, path / SUMMARY
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file if it is there.
+
+    Raises
+    ------
+    InputError : it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write over {path}: {error.strerror}") from error
+
+
+def write_file(
+    path: Path, write: Callable[[IO[bytes]], Any], *, before: Callable[[], object] | None = None
+) -> None:
+    """Let `write` fill a new file that then takes the place of `path` in one step.
+
+    before : what is to be done just before that, when nothing of the new file can fail any more.
+
+    Raises
+    ------
+    InputError : it cannot be written; what was at `path` before is still there.
+    """
+    try:
+        write_atomically(path, write, before=before)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _check_archive(content: IO[bytes]) -> None:
+    """ValueError for an archive that is larger unpacked than any of ours, or has two arrays of one name."""
+    with zipfile.ZipFile(content) as archive:
+        entries = archive.infolist()
+    names = {entry.filename for entry in entries}
+    if len(entries) > MOST_ARRAYS or len(names) < len(entries):
+        raise ValueError(f"{len(entries)} arrays, or two of the same name")
+    if sum(entry.file_size for entry in entries) > LARGEST:
+        raise ValueError(f"larger than {LARGEST / 2**20:g} MiB when it is unpacked")
+    content.seek(0)
+
+
+def load_record(directory: str | os.PathLike[str]) -> Record:
+    """The record that `save_record` left in a directory; its `solution.npz` can be named too.
+
+    Raises
+    ------
+    InputError : there is none, it is damaged, or of a newer impactopt.
+    """
+    path = Path(directory)
+    path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
+    mend = "solve again with `impactopt solve`"
+    try:
+        # from memory: np.load leaves a damaged file open
+        content = io.BytesIO(read_plain(path, LARGEST))
+        _check_archive(content)
+        with np.load(content, allow_pickle=False) as file:
+            version = int(file["format"])
+            if version > FORMAT:
+                raise InputError(f"{path} is of a newer impactopt (format {version}); update impactopt")
+            arrays = {name: file[name] for name in file.files}
+        summary = json.loads(str(arrays.pop("summary_json")))
+        problem = str(arrays.pop("problem_toml"))
+        near = str(arrays.pop("problem_path", ""))
+        del arrays["format"]
+        check_summary(summary, whole="joints" in arrays)
+        check_arrays(arrays)
+    except InputError:
+        raise
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise InputError(f"there is no {path}; {mend}") from error
+    except PermissionError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    # what NumPy and zipfile raise for files that are cut, overwritten or of another kind
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, NotImplementedError) as error:
+        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        tokenize.TokenError,
+        MemoryError,
+        OverflowError,
+        RecursionError,
+        RuntimeError,
+    ) as error:
+        raise InputError(f"{path} is damaged ({error}); {mend}") from error
+    place = Path(os.path.normpath(path.parent.resolve() / near)) if near else None
+    return Record(summary=summary, problem=problem, arrays=arrays, problem_path=place)

@@ -1,0 +1,47 @@
+"""Problem files: an `impactopt.problem.problem.ImpactProblem` written in TOML, in SI units.
+
+* section.py    what all sections have in common
+* contacts.py   [target] and [contact], of which there are several kinds
+* robot_sections.py, term_sections.py, solver_sections.py   [robot]; [terms]; [solver]
+* sections.py   the other sections and keys of a file, and what they make
+* values.py     ranges of the keys' values
+* mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
+* reading.py    from file to problem
+* changes.py    other values by dotted keys
+* toml.py       text from and to plain data
+* robot_writing.py, writing.py   from problem to file
+* describing.py, reference.py, template.py   keys in words: comments, docs/problem_files.md, `impactopt new`
+* names.py      the files that come with the package, by name
+"""
+
+from impactopt.files.problem_file.changes import change_data, key_place, parse_settings
+from impactopt.files.problem_file.names import problem_names
+from impactopt.files.problem_file.reading import (
+    ProblemFile,
+    SolverSettings,
+    load_problem,
+    parse_problem_file,
+    problem_file_from_data,
+    problem_from_data,
+    read_problem_file,
+)
+from impactopt.files.problem_file.toml import read_toml, write_toml
+from impactopt.files.problem_file.writing import problem_data, write_problem
+
+__all__ = [
+    "ProblemFile",
+    "SolverSettings",
+    "change_data",
+    "key_place",
+    "load_problem",
+    "parse_problem_file",
+    "parse_settings",
+    "problem_data",
+    "problem_file_from_data",
+    "problem_from_data",
+    "problem_names",
+    "read_problem_file",
+    "read_toml",
+    "write_problem",
+    "write_toml",
+]

@@ -1,0 +1,62 @@
+"""Problems and sweeps by name: the files that come with the package."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from impactopt.errors import InputError, did_you_mean, shortened
+from impactopt.storage.files import is_plain_file
+from impactopt.storage.folders import SWEEPS, named_files
+
+__all__ = ["problem_file", "problem_names", "problem_summary", "sweep_file", "sweep_names"]
+
+
+def problem_names() -> tuple[str, ...]:
+    """Names of the problems that come with the package, as `load_problem` takes them."""
+    return tuple(named_files())
+
+
+def problem_file(name: str | os.PathLike[str]) -> Path:
+    """The file of a problem's name; a path to a file is returned as it is.
+
+    A path has a folder or a suffix, or there is a file of that name; what is neither has to be a name.
+
+    Raises
+    ------
+    InputError : an unknown name.
+    """
+    return _file(name, named_files(), "problem")
+
+
+def sweep_names() -> tuple[str, ...]:
+    """Names of the sweeps that come with the package, as `read_sweep_file` takes them."""
+    return tuple(named_files(SWEEPS))
+
+
+def sweep_file(name: str | os.PathLike[str]) -> Path:
+    """The file of a sweep's name, as `problem_file` of a problem's."""
+    return _file(name, named_files(SWEEPS), "sweep")
+
+
+def problem_summary(name: str) -> str:
+    """What a named problem is about: the first sentence of its file's comment."""
+    words: list[str] = []
+    for line in problem_file(name).read_text(encoding="utf-8").splitlines():
+        if not line.startswith("# "):
+            break
+        words.append(line.removeprefix("# "))
+    return " ".join(words).split(". ")[0].rstrip(".:")
+
+
+def _file(name: str | os.PathLike[str], named: Mapping[str, Path], kind: str) -> Path:
+    path = Path(name)
+    if path.suffix or len(path.parts) != 1 or is_plain_file(path):
+        return path
+    if path.name not in named:
+        raise InputError(
+            f"there is no {kind} {shortened(path.name)!r}{did_you_mean(path.name, named)}; {kind}s are "
+            f"{', '.join(named)}; or give the path of a file"
+        )
+    return named[path.name]

@@ -1,0 +1,125 @@
+"""All sections and keys of a problem file as a page, docs/problem_files.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import AfterValidator, BaseModel, PlainValidator
+from pydantic.fields import FieldInfo
+
+from impactopt.files.problem_file.contacts import LAWS, TARGETS
+from impactopt.files.problem_file.describing import about_section
+from impactopt.files.problem_file.mistakes import range_of
+from impactopt.files.problem_file.section import Section
+from impactopt.files.problem_file.sections import File
+from impactopt.files.problem_file.toml import plain_value
+
+__all__ = ["reference"]
+
+_INTRODUCTION = """\
+# Problem files
+
+A problem file says in [TOML](https://toml.io) all that `impactopt.ImpactProblem` takes. It is data: nothing
+in it is run. Units are SI, and part of a key's name where the quantity has one. Keys and sections that are
+left out keep their defaults.
+
+```sh
+impactopt new                                 # which problems come with the package
+impactopt new punch > my.toml                 # a copy of one, with a comment to each key, and the other keys
+impactopt check my.toml                       # all mistakes at once: where, what was meant, what is allowed
+impactopt solve my.toml --set target.mass=8   # another value for once; a key's unit may be left out
+```
+
+`--set` takes a value as in TOML and can be repeated. A number of a list has its index from 0
+(`--set problem.point.1=-0.2`), one of several sections its index or its name
+(`--set scenarios.missing.brake_after=0.03`).
+
+In Python: `impactopt.load_problem("my.toml")`, `impactopt.write_problem(problem)`, which leaves defaults out,
+and `problem.hash`, the same for the same problem, however it was written. A contact law, target, term or
+robot that is made of functions or models in Python is no data, and has no file.
+
+This page is made by `impactopt new --reference`.
+"""
+_TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
+
+
+def reference() -> str:
+    """The page, in Markdown."""
+    parts = [_INTRODUCTION]
+    several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
+    for name, info in File.model_fields.items():
+        kinds = several.get(name, {})
+        for kind, section in kinds.items():
+            (choice,) = (i.alias or n for n, i in section.model_fields.items() if n == section.choice)
+            parts.append(_part(f"[{name}] {choice} = {_show(kind)}", section))
+        below = _sections(name, info)
+        if kinds:
+            next(below)  # the section itself, which its kinds have said all of
+        parts += [_part(header, section) for header, section in below]
+    return "\n".join(parts)
+
+
+def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel]]]:
+    """A section and those below it, with their headers."""
+    section, many = _inner(info)
+    if section is None:
+        return
+    yield (f"[[{place}]]" if many else f"[{place}]"), section
+    for name, inner in section.model_fields.items():
+        yield from _sections(f"{place}.{name}", inner)
+
+
+def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
+    """The section that a field holds, if any, and whether it holds a list of them."""
+    many = get_origin(info.annotation) is list
+    kind = get_args(info.annotation)[0] if many else info.annotation
+    return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
+
+
+def _part(header: str, section: type[BaseModel]) -> str:
+    keys = {n: i for n, i in section.model_fields.items() if _inner(i)[0] is None}
+    lines = [f"## `{header}`", "", f"{about_section(section)}.", ""]
+    if keys:
+        lines += ["| key | | value | default |", "|---|---|---|---|"]
+    usual = section.defaults() if issubclass(section, Section) else {}
+    for name, info in keys.items():
+        if info.is_required():
+            default = "**needed**"
+        else:
+            value = usual.get(name, info.default)
+            default = "" if value is None or value == () else f"`{_show(value)}`"
+        about = (info.description or "").replace("|", "\\|")
+        lines.append(f"| `{info.alias or name}` | {about} | {_allowed(info)} | {default} |")
+    return "\n".join([*lines, ""] if keys else lines)
+
+
+def _allowed(info: FieldInfo) -> str:
+    """What a key may hold."""
+    for check in reversed(info.metadata):
+        if isinstance(check, (AfterValidator, PlainValidator)) and check.func.__doc__:
+            return _sentence(check.func.__doc__)
+    if get_origin(info.annotation) is Literal:
+        return ", ".join(f"`{_show(choice)}`" for choice in get_args(info.annotation))
+    if info.annotation in _TYPES:
+        return f"{_TYPES[info.annotation]} {range_of(info)}".strip()
+    if get_origin(info.annotation) is dict:
+        return "table by name" if str in get_args(info.annotation) else "table"
+    length = next((m.min_length for m in info.metadata if hasattr(m, "min_length")), None)
+    if length:
+        return f"{length} numbers"
+    kind, *_ = get_args(get_args(info.annotation)[0]) or (float,)  # of what it is a list
+    pairs = "pairs of " if get_origin(kind) is list else ""
+    return f"list of {pairs}{'names' if get_args(kind) == (str,) else 'numbers'}"
+
+
+def _sentence(text: str) -> str:
+    words = text.split("\n")[0].rstrip(".")
+    return words[0].lower() + words[1:]
+
+
+def _show(value: Any) -> str:
+    value = plain_value(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else str(value)

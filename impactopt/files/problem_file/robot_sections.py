@@ -1,0 +1,163 @@
+"""The section [robot]: a preset with changes, or a URDF with what it lacks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from pydantic import model_validator
+
+from impactopt.errors import InputError
+from impactopt.files.problem_file.section import Section, optional, required
+from impactopt.files.problem_file.values import (
+    Inertia,
+    Pair,
+    PerJoint,
+    Point2,
+    Positive,
+    Preset,
+    Range,
+    Rotation,
+    Vector,
+)
+from impactopt.robots.build import check_count
+from impactopt.robots.presets import load_robot
+from impactopt.robots.robot import Robot, Sole, Striker, Tool
+
+
+class SoleSection(Section):
+    """A flat, convex sole, on a frame of the model or on a new one."""
+
+    kind = Sole
+    name: str = required("what [stance] and messages call it")
+    frame: str = required("at the sole: z up out of the ground, x forward")
+    polygon: list[Point2] = required(
+        "corners in the frame's x-y plane, counter-clockwise from above [m]", "polygon_m"
+    )
+    parent: str = optional("frame of the model that a new `frame` is placed in")
+    position: Vector = optional("of a new frame, in its parent [m]", "position_m")
+    rotation: Rotation = optional("of a new frame, in its parent: a matrix by rows; left out: none")
+
+    @model_validator(mode="after")
+    def _placed_on_a_parent(self) -> SoleSection:
+        if "parent" not in self.model_fields_set and {"position", "rotation"} & self.model_fields_set:
+            raise ValueError("position_m and rotation place a new frame: name its parent")
+        return self
+
+    def build(self) -> Any:
+        given = self.given()
+        position, rotation = given.pop("position", np.zeros(3)), given.pop("rotation", np.eye(3))
+        if "parent" in given:
+            given["placement"] = pin.SE3(np.array(rotation), np.array(position))
+        return Sole(**given)
+
+
+class StrikerSection(Section):
+    """A point of the robot that hits."""
+
+    kind = Striker
+    name: str = required("what [problem] calls it")
+    frame: str = required("of the model")
+    point: Vector = required("in the frame [m]", "point_m")
+
+
+class ToolSection(Section):
+    """A rigid body that a link holds firmly, and the striker that it makes."""
+
+    kind = Tool
+    name: str = required("of the tool and its striker")
+    frame: str = required("of the model, at the link that holds it")
+    mass: Positive = required("[kg]", "mass_kg")
+    center: Vector = required("centre of mass in the frame [m]", "center_m")
+    inertia: Inertia = required(
+        "about the centre of mass [kg m2]: its diagonal, or a matrix by rows", "inertia_kg_m2"
+    )
+    head: Vector = required("the point that hits, in the frame [m]", "head_m")
+
+
+class RobotSection(Section):
+    """A preset with changes, or a URDF; files are relative to the problem file.
+
+    A preset keeps its own strikers beside the section's.
+    """
+
+    preset: Preset = optional("its name: see `impactopt robots`")
+    urdf: str = optional("the robot's file, in place of a preset")
+    srdf: str = optional("file with the URDF's named postures and rotors")
+    name: str = optional("what reports call it")
+    floating: bool = optional("with a free base; false: the root link is fixed to the ground")
+    locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
+    armature: PerJoint = optional(
+        "reflected rotor inertia, of all joints or by joint [kg m2]", "armature_kg_m2"
+    )
+    kp: PerJoint = optional("servo stiffness, of all joints or by joint [N m/rad]", "kp_N_m_rad")
+    kd: PerJoint = optional("servo damping, of all joints or by joint [N m s/rad]", "kd_N_m_s_rad")
+    torque_limit: PerJoint = optional("of all joints or by joint [N m]", "torque_limit_N_m")
+    velocity_limit: PerJoint = optional("of all joints or by joint [rad/s]", "velocity_limit_rad_s")
+    position_limit: dict[str, Range] = optional("[lower, upper] by joint [rad]", "position_limit_rad")
+    disable_collisions: list[Pair] = optional("pairs of links that may pass through each other")
+    soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
+    strikers: list[StrikerSection] = optional("points that hit")
+    tools: list[ToolSection] = optional("what the robot holds")
+    postures: dict[str, dict[str, float]] = optional(
+        "named postures: joint angles by joint, the others 0 or the SRDF's [rad]", "postures_rad"
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RobotSection:
+        if ("preset" in self.model_fields_set) == ("urdf" in self.model_fields_set):
+            raise ValueError("give either preset or urdf")
+        return self
+
+    def make(self, folder: Path) -> Robot:
+        """The robot; relative files are in `folder`."""
+        for key in ("soles", "strikers", "tools"):
+            check_count(key.removesuffix("s"), getattr(self, key) or ())
+        options = self.given()
+        for file in ("urdf", "srdf"):
+            if file in options:
+                options[file] = folder / options[file]
+        if "soles" in options:
+            options["soles"] = [sole.build() for sole in self.soles]
+        if "position_limit" in options:
+            options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
+        strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
+        tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
+        if "urdf" in options:
+            robot = Robot.from_urdf(options.pop("urdf"), **options)
+        else:
+            robot = load_robot(options.pop("preset"), **options)
+        for striker in strikers:
+            robot = robot.with_striker(striker)
+        for tool in tools:
+            robot = robot.with_tool(tool)
+        return robot
+
+    def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
+        """All that keeps `make` from making a robot, `error` being the first of it, and of which key it is.
+
+        Each key is tried by itself on the bare robot.
+        """
+        bare = {key: getattr(self, key) for key in self.model_fields_set & _BARE}
+        if _tried(bare, folder):
+            return [((), error)]
+        found: list[tuple[tuple[str, ...], InputError]] = []
+        for key, info in type(self).model_fields.items():
+            if key in self.model_fields_set - _BARE:
+                wrong = _tried({**bare, key: getattr(self, key)}, folder)
+                found += [((info.alias or key,), wrong)] if wrong else []
+        return found or [((), error)]
+
+
+_BARE = {"preset", "urdf", "srdf", "floating", "locked"}  # what the other keys are about
+
+
+def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:
+    """What is wrong with a robot of these keys alone."""
+    try:
+        RobotSection.model_construct(_fields_set=set(keys), **keys).make(folder)
+    except InputError as error:
+        return error
+    return None

@@ -1,0 +1,295 @@
+"""The sections of a problem file: their keys and units.
+
+Each model is a section; its fields are the keys, by their `alias` where a unit belongs to the name. `build`
+makes the class `kind` from the keys that are given: defaults and further checks are that class's own, and
+stand nowhere twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from impactopt.bodies.shapes import Obstacle
+from impactopt.errors import InputError
+from impactopt.files.problem_file.contacts import Contact, Target
+from impactopt.files.problem_file.robot_sections import RobotSection
+from impactopt.files.problem_file.section import Section, optional, required
+from impactopt.files.problem_file.solver_sections import Solver
+from impactopt.files.problem_file.term_sections import Terms
+from impactopt.files.problem_file.values import (
+    AtLeastOne,
+    Duration,
+    Fractions,
+    NotNegative,
+    Positive,
+    Posture,
+    Preset,
+    Restitution,
+    UnitVector,
+    Vector,
+)
+from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
+from impactopt.kinematics.stance import Stance as Stances
+from impactopt.problem import objectives
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.scenario import Scenario
+from impactopt.robots.robot import Robot
+
+ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_elements
+
+
+def _of_problem(section: type[Section]) -> dict[str, Any]:
+    """The defaults of the problem's own fields that a section sets."""
+    known = {f.name: f.default for f in fields(ImpactProblem) if f.default is not MISSING}
+    return {name: known[name] for name in section.model_fields if name in known}
+
+
+class Problem(Section):
+    """Who hits what, where."""
+
+    name: str = optional("what reports call the problem")
+    robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
+    striker: str = required("what hits: one of the robot's strikers")
+    point: Vector = required(
+        "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
+    )
+    normal: UnitVector = required("which way the target is pushed: a unit vector")
+    start: Posture = Field(
+        default=ImpactProblem.start,
+        description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",
+    )
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return _of_problem(cls)
+
+
+class Stance(Section):
+    """What the robot stands on."""
+
+    soles: str = Field(default="both", description='"both", or the name of the sole that is held')
+
+
+class PhaseSection(Section):
+    """A phase of the motion: its duration and its spline."""
+
+    kind = Phase
+    duration: Duration = required(
+        "one number, or [shortest, longest] for the solver to choose [s]", "duration_s"
+    )
+    intervals: int = optional("of the spline, at least 6: more make the motion freer, and the solve longer")
+    grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
+
+
+class Swing(PhaseSection):
+    """Wind-up and strike, from rest to contact."""
+
+
+class Follow(PhaseSection):
+    """From the state that the impact leaves behind to rest."""
+
+
+class Collision(Section):
+    """How the collision is modelled and discretized."""
+
+    collision: Literal["dynamics", "rigid", "virtual mass"] = optional(
+        '"dynamics": the whole equation of motion; or an impact without duration, to compare with', "model"
+    )
+    coefficient_of_restitution: Restitution = optional('of the model "rigid"')
+    contact_duration: Duration = optional(
+        "[shortest, longest] of each of compression and restitution [s]", "duration_s"
+    )
+    collision_stages: Literal[2, 3] = optional("Radau IIA stages of an element", "stages")
+    compression: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
+    restitution: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return _of_problem(cls) | dict(zip(ELEMENTS, ImpactProblem.collision_elements, strict=True))
+
+
+class ScenarioSection(Section):
+    """What else may happen, and has to be survived with the same swing."""
+
+    kind = Scenario
+    name: str = required("what reports call it")
+    mass: Positive = optional("of the target, as a factor of the expected one")
+    stiffness: Positive = optional("of the contact, as a factor")
+    damping: NotNegative = optional("of the contact, as a factor")
+    missing: bool = optional("there is nothing to hit")
+    brake_after: Positive = optional(
+        "when a robot that has felt nothing goes on to a stop planned for that [s]",
+        "brake_after_s",
+    )
+    torque: Positive = optional("fraction of each joint's limit in the collision")
+    cone_margin: NotNegative = optional(
+        "from each sole's centre of pressure to its edges in the collision [m]", "cone_margin_m"
+    )
+    capture_margin: NotNegative = optional(
+        "from the capture point to the support polygon's edges, after it [m]", "capture_margin_m"
+    )
+
+
+class ObstacleSection(Section):
+    """A box or a capsule that nothing of the robot may touch."""
+
+    kind = Obstacle
+    name: str = required("what reports call it")
+    size: Vector = optional("sides of a box [m]", "size_m")
+    position: Vector = optional("middle of the box, world [m]", "position_m")
+    rpy: Vector = optional("turns of the box about x, y and z [rad]", "rpy_rad")
+    start: Vector = optional("of a capsule's axis, world [m]", "start_m")
+    end: Vector = optional("of its axis [m]; left out: a sphere", "end_m")
+    radius: Positive = optional("of the capsule [m]", "radius_m")
+
+
+class Objective(Section):
+    """Prices that only make the optimum unique, and its end natural."""
+
+    smoothness: NotNegative = optional("of accelerations [N s per (rad/s^2)^2 s]")
+    wrench_price: NotNegative = optional("of the soles' wrenches")
+    return_price: NotNegative = optional("of ending away from the start posture [N s per rad^2]")
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        return _of_problem(cls)
+
+
+class Weighted(Section):
+    """A quantity that counts in what is maximized."""
+
+    weight: float = optional("what one unit of it is worth [N s a unit]")
+
+
+class Impulse(Weighted):
+    """The impulse to the target."""
+
+    kind = objectives.Impulse
+
+
+class PeakForce(Weighted):
+    """The largest contact force; a weight below zero keeps it small."""
+
+    kind = objectives.PeakForce
+
+
+class TargetEnergy(Weighted):
+    """What the target holds at separation, or has used up in what it was hit for."""
+
+    kind = objectives.TargetEnergy
+
+
+class Penetration(Weighted):
+    """The deepest penetration; a weight below zero keeps it small."""
+
+    kind = objectives.Penetration
+
+
+class AngularMomentum(Weighted):
+    """Cost: angular momentum after contact, squared."""
+
+    kind = objectives.AngularMomentum
+
+
+class Effort(Weighted):
+    """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints."""
+
+    kind = objectives.Effort
+
+
+class Objectives(Section):
+    """What is maximized; if there are any, only those that are given."""
+
+    impulse: Impulse = optional("")
+    peak_force: PeakForce = optional("")
+    target_energy: TargetEnergy = optional("")
+    penetration: Penetration = optional("")
+    angular_momentum: AngularMomentum = optional("")
+    effort: Effort = optional("")
+
+
+class File(Section):
+    """A whole problem file; its [target] and [contact] are of a kind (`with_kinds`)."""
+
+    problem: Problem
+    robot: RobotSection = optional("")
+    target: Target
+    contact: Contact
+    stance: Stance = optional("")
+    swing: Swing = optional("")
+    follow: Follow = optional("")
+    collision: Collision = optional("")
+    scenarios: list[ScenarioSection] = optional("")
+    obstacles: list[ObstacleSection] = optional("")
+    objectives: Objectives = optional("")
+    objective: Objective = optional("")
+    terms: Terms = optional("")
+    solver: Solver = optional("")
+
+    def make_robot(self, folder: Path) -> Robot:
+        """The robot of [robot], or the preset that [problem] names."""
+        section = RobotSection(preset=self.problem.robot) if self.robot is None else self.robot
+        return section.make(folder)
+
+    def robot_mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
+        """All that keeps `make_robot` from making one, `error` being the first of it, and where it is."""
+        if "robot" not in self.model_fields_set:
+            return [(("problem", "robot"), error)]
+        return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
+
+    def given_terms(self) -> Iterator[tuple[str, Any]]:
+        """The terms that the file has, by their sections' names."""
+        for name in Terms.model_fields if self.terms is not None else ():
+            section = getattr(self.terms, name)
+            if section is not None:
+                yield name, section.build()
+
+    def make_stance(self, robot: Robot) -> Stances:
+        """What [stance] says of a robot; InputError for what it cannot stand on."""
+        soles = self.stance.soles if self.stance else "both"
+        stance: Stances = BothSoles() if soles == "both" else OneSole(soles)
+        if not robot.floating:
+            if self.stance:
+                raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
+            stance = FixedBase()
+        stance.soles(robot)
+        return stance
+
+    def make_start(self, robot: Robot) -> NDArray[np.float64]:
+        """The posture (nq,) to start from; InputError for one that the robot cannot have."""
+        start = self.problem.start
+        return (
+            robot.posture(start) if isinstance(start, str) else robot.check_configuration(start, name="start")
+        )
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""
+        out = {name: value for name, value in self.problem.given().items() if name != "robot"}
+        out |= {"law": self.contact.build(), "target": self.target.build()}
+        out |= {name: getattr(self, name).build() for name in ("swing", "follow") if getattr(self, name)}
+        out |= self.objective.given() if self.objective else {}
+        if self.collision is not None:
+            given = self.collision.given()
+            usual = zip(ELEMENTS, ImpactProblem.collision_elements, strict=True)
+            elements = [given.pop(name, lengths) for name, lengths in usual]
+            if "contact_duration" in given:
+                given["contact_duration"] = tuple(given["contact_duration"])
+            out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
+        if self.target.body is not None:
+            out["body"] = self.target.body.build()
+        if self.obstacles is not None:
+            out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
+        if self.scenarios is not None:
+            out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
+        for name, section in (("terms", self.terms), ("objectives", self.objectives)):
+            if section is not None:
+                found = (getattr(section, field) for field in type(section).model_fields)
+                out[name] = tuple(part.build() for part in found if part is not None)
+        return out

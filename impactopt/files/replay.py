@@ -1,0 +1,146 @@
+"""Replays of what a solve left on disk: the problem and the reference from a record, through an engine."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impactopt.errors import InputError
+from impactopt.files.output import Record, load_record, plain, replay_arrays
+from impactopt.files.problem_file import parse_problem_file, read_problem_file
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation import Conditions, Simulation, scene_of, simulate
+from impactopt.simulation.accuracy import check_steps
+from impactopt.transcription.plan import Trajectory
+
+__all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "replay"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Planned:
+    """What there is to replay: a record, its problem, the reference that the servo is to follow, and the one
+    that it goes on with if it hits nothing, where the plan has one.
+    """
+
+    record: Record
+    problem: ImpactProblem
+    reference: Trajectory
+    missed: Trajectory | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replay:
+    """A replay: the world it found, its histories, and its numbers as in `impactopt validate --json`.
+
+    record : the plan's, with this replay in place of its own.
+    """
+
+    planned: Planned
+    conditions: Conditions
+    simulation: Simulation
+    report: dict[str, Any]
+    record: Record
+
+
+def has_mujoco() -> bool:
+    """Whether the engine "mujoco" can run."""
+    return importlib.util.find_spec("mujoco") is not None
+
+
+def load_planned(
+    result: str | os.PathLike[str],
+    *,
+    problem_file: str | os.PathLike[str] | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Planned:
+    """The plan in a directory that `impactopt solve` wrote, or in its `solution.npz`.
+
+    problem_file : instead of the record's own text, such as when that is missing or its URDF has moved.
+    settings : other values of the problem, by dotted key.
+
+    Raises
+    ------
+    InputError : there is no record, it holds no motion, or it does not fit the robot that the problem names.
+    """
+    record = load_record(result)
+    if not record.completed:
+        note = record.summary.get("note", "the solve was stopped before there was one")
+        raise InputError(f"{result} holds no motion to replay: {note}")
+    problem = _problem(record, Path(result), problem_file, settings)
+    a, robot = record.arrays, problem.robot
+    if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
+        raise InputError(
+            f"{result} was planned for another robot than {robot.name!r} is today: its joints differ; "
+            "solve again, or give the file of its problem with --problem"
+        )
+    missed = _trajectory(record, "missed") if "missed_time" in a else None
+    return Planned(record=record, problem=problem, reference=_trajectory(record, "reference"), missed=missed)
+
+
+def _trajectory(record: Record, prefix: str) -> Trajectory:
+    given = {f.name: record.arrays[f"{prefix}_{f.name}"] for f in dataclasses.fields(Trajectory)}
+    fields: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in given.items()}
+    return Trajectory(**fields)
+
+
+def _problem(
+    record: Record,
+    result: Path,
+    problem_file: str | os.PathLike[str] | None,
+    settings: Mapping[str, Any] | None,
+) -> ImpactProblem:
+    if problem_file is not None:
+        return read_problem_file(problem_file, settings).build()
+    if not record.problem:
+        raise InputError(f"{result} holds no problem file: give it with --problem FILE")
+    path = record.problem_path or result / "problem.toml"
+    try:
+        return parse_problem_file(record.problem, path, settings).build()
+    except InputError as error:
+        raise InputError(
+            f"the problem in {result} cannot be built again ({error}); if its files have moved, give the "
+            "problem file with --problem FILE"
+        ) from error
+
+
+def replay(
+    planned: Planned, *, engine: str = "mujoco", conditions: Conditions | None = None, **options: Any
+) -> Replay:
+    """Follow the plan's reference in an engine; "mujoco" lets the robot slip, lift its soles and fall.
+
+    conditions : where the world differs from what was planned ("mujoco" only).  options : of the engine, such
+        as ``step`` [s].
+
+    Raises
+    ------
+    InputError : an unknown engine or option, a missing package, a simulation that diverges, or whose steps
+        leave more than 1 % of its impulse uncertain.
+    """
+    world = conditions if conditions is not None else Conditions()
+    if world != Conditions():
+        options["conditions"] = world
+    if engine == "mujoco" and planned.missed is not None:
+        options["missed"] = planned.missed
+    problem = planned.problem
+    simulation = simulate(problem, planned.reference, engine=engine, **options)
+    check_steps(simulation, options.get("step"))
+    report = plain(
+        simulation.report(
+            torque_limit=world.torque_limit * problem.robot.torque_limit,
+            polygon=scene_of(problem).polygon,
+            planned_impulse=float(planned.record.summary["impulse_Ns"]),
+        )
+    )
+    kept = {n: v for n, v in planned.record.arrays.items() if not n.startswith("replayed_")}
+    kept |= {name: np.asarray(value) for name, value in replay_arrays(simulation).items()}
+    record = dataclasses.replace(
+        planned.record, arrays=kept, summary={**planned.record.summary, "replayed": report}
+    )
+    return Replay(planned=planned, conditions=world, simulation=simulation, report=report, record=record)

@@ -1,0 +1,2 @@
+"""Where a robot can be: stances, independent coordinates, inverse kinematics, splines, support polygon,
+wrench cone."""

@@ -1,0 +1,403 @@
+"""Independent coordinates of a robot whose soles are held: the base's pose and the joints outside its legs.
+
+A motion that is written in these coordinates y keeps its soles where they are at *every* instant, not only at
+an optimizer's nodes: the legs follow from y by inverse kinematics, and their velocities and accelerations by
+the sole's constraint
+
+    J_leg qdot_leg = -V,      J_leg qddot_leg = -(A + Jdot qdot),
+
+with V and A the twist and the acceleration that the base alone would give the sole.  Both sides are written
+in the base's own frame, where J_leg depends on the leg's joints only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.rigid_body import RigidBody
+from impactopt.robots.robot import Robot, Sole
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def elimination_order(matrices: list[Array]) -> tuple[Index, Index]:
+    """Row and column order in which Gaussian elimination needs no pivoting at any of the sample matrices.
+
+    Complete pivoting on the least of the samples' normalised magnitudes; with a fixed order the symbolic
+    elimination has no branches.
+    """
+    work = [m / np.abs(m).max() for m in matrices]
+    n = work[0].shape[0]
+    rows, cols = np.arange(n), np.arange(n)
+    for k in range(n):
+        size = np.min([np.abs(w[k:, k:]) for w in work], axis=0)
+        r, c = np.unravel_index(int(np.argmax(size)), size.shape)
+        rows[[k, k + r]], cols[[k, k + c]] = rows[[k + r, k]], cols[[k + c, k]]
+        for w in work:
+            w[[k, k + r]] = w[[k + r, k]]
+            w[:, [k, k + c]] = w[:, [k + c, k]]
+            w[k + 1 :, k:] -= np.outer(w[k + 1 :, k] / w[k, k], w[k, k:])
+    return rows, cols
+
+
+def solve_in_order(a: Any, b: Any, order: tuple[Index, Index]) -> tuple[Any, Any]:
+    """x of  a x = b  (SX, a square) by elimination in a fixed order, and the product of the pivots.
+
+    Structural zeros are skipped.
+    """
+    rows, cols = order
+    n, k_rhs = a.shape[0], b.shape[1]
+    m = [[a[int(r), int(c)] for c in cols] for r in rows]
+    y = [[b[int(r), j] for j in range(k_rhs)] for r in rows]
+    for k in range(n):
+        for i in range(k + 1, n):
+            if m[i][k].is_zero():
+                continue
+            f = m[i][k] / m[k][k]
+            for j in range(k + 1, n):
+                if not m[k][j].is_zero():
+                    m[i][j] = m[i][j] - f * m[k][j]
+            for j in range(k_rhs):
+                y[i][j] = y[i][j] - f * y[k][j]
+    x = ca.SX(n, k_rhs)
+    for j in range(k_rhs):
+        back: list[Any] = [None] * n
+        for i in range(n - 1, -1, -1):
+            s = y[i][j]
+            for c in range(i + 1, n):
+                if not m[i][c].is_zero():
+                    s = s - m[i][c] * back[c]
+            back[i] = s / m[i][i]
+            x[int(cols[i]), j] = back[i]
+    pivots = m[0][0]
+    for k in range(1, n):
+        pivots = pivots * m[k][k]
+    return x, pivots
+
+
+@dataclass(frozen=True)
+class Leg:
+    """One held sole with the joints between it and the base."""
+
+    sole: Sole
+    joints: Index  # (6,) into the robot's joints
+    order: tuple[Index, Index]
+    placement: Any  # pin.SE3 of the sole in the world
+
+
+class StanceCoordinates:
+    """The map from independent coordinates to the robot's full motion, symbolic and numeric.
+
+    Attributes
+    ----------
+    ny, nl : number of independent coordinates, and of dependent leg joints (6 a held sole).
+    independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
+    labels : names of the independent coordinates.
+    """
+
+    def __init__(self, robot: Robot, soles: tuple[Sole, ...], posture: Array) -> None:
+        """``posture`` (nq,): pin configuration with the soles in place; it fixes where the soles are held."""
+        self.robot, self.soles = robot, soles
+        self.model, self.data = robot.model, robot.model.createData()
+        self.base = 6 if robot.floating else 0
+        if robot.floating and not soles:
+            raise InputError(
+                f"{robot.name} has a free-flyer: a stance needs at least one sole (or build it with "
+                "floating=False)"
+            )
+        pin.framesForwardKinematics(self.model, self.data, posture)
+        self.legs: list[Leg] = []
+        for sole in soles:
+            joints = np.array(robot.limb(sole.frame), dtype=np.intp)
+            if len(joints) != 6:
+                raise InputError(
+                    f"the leg of sole '{sole.name}' has {len(joints)} joints between the base and "
+                    f"'{sole.frame}'; a held sole needs exactly 6 (lock the others with `locked=`)"
+                )
+            placement = self.data.oMf[self.model.getFrameId(sole.frame)].copy()
+            order = elimination_order(self._leg_samples(sole.frame, joints, posture))
+            self.legs.append(Leg(sole, joints, order, placement))
+        held = {int(j) for leg in self.legs for j in leg.joints}
+        if len(held) != 6 * len(self.legs):
+            raise InputError("the held soles' legs share joints: their motion is not independent")
+        self.dependent = np.array([j for leg in self.legs for j in leg.joints], dtype=np.intp)
+        self.independent = np.array([j for j in range(robot.n) if j not in held], dtype=np.intp)
+        self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
+        base_labels = ["base x", "base y", "base z", "base roll", "base pitch", "base yaw"][: self.base]
+        self.labels = (*base_labels, *(robot.joint_names[j] for j in self.independent))
+        self.leg_labels = tuple(robot.joint_names[j] for j in self.dependent)
+        self.rb = RigidBody(self.model, base="rpy")
+        self._build_symbolic_pieces()
+        legs = ca.SX.sym("legs", self.nl)
+        start = self.split(posture)[1]
+        self.start_determinants = np.array(
+            ca.Function("det", [legs], [self.leg_determinants(legs)])(start) if self.legs else np.zeros(0)
+        ).ravel()
+
+    def _leg_samples(self, frame: str, joints: Index, posture: Array) -> list[Array]:
+        rng = np.random.default_rng(0)
+        out = []
+        angles = self.robot.joint_positions(posture)[joints]
+        for k in range(5):
+            step = np.zeros(self.model.nv)
+            if k:
+                near = angles + 0.15 * rng.standard_normal(6)
+                step[self.base + joints] = (
+                    np.clip(near, self.robot.lower[joints], self.robot.upper[joints]) - angles
+                )
+            qk = pin.integrate(self.model, posture, step)
+            if self.robot.floating:
+                qk[:7] = [0, 0, 0, 0, 0, 0, 1]
+            jac = pin.computeFrameJacobian(
+                self.model, self.data, qk, self.model.getFrameId(frame), pin.LOCAL_WORLD_ALIGNED
+            )
+            out.append(np.array(jac[:, self.base + joints]))
+        return out
+
+    # ------------------------------------------------------------------ symbolic
+    def _build_symbolic_pieces(self) -> None:
+        rb = self.rb
+        self._motion = None
+        if self.base:
+            qd, qdd = ca.SX.sym("qd", rb.nv), ca.SX.sym("qdd", rb.nv)
+            v = ca.mtimes(rb.velocity_map(), qd)[:6]
+            a = rb.acceleration(qd, qdd)[:6]
+            self._base_motion = ca.Function("base_motion", [rb.q, qd, qdd], [v, a])
+        # in the base's own frame: the base at the world's origin, unturned
+        self._sole = []
+        for leg in self.legs:
+            rotation, point = rb.frame(leg.sole.frame)
+            jac = rb.jacobian(leg.sole.frame)[:, [self.base + int(j) for j in leg.joints]]
+            twist = rb.frame_velocity(leg.sole.frame, rb.v)
+            acc = rb.frame_acceleration(leg.sole.frame, rb.v, rb.a)
+            self._sole.append(
+                ca.Function("sole", [rb.q, rb.v, rb.a], [rotation, point, ca.densify(jac), twist, acc])
+            )
+
+    def _embed(self, base: Any, independent: Any, dependent: Any) -> Any:
+        """Vector over base and joints (nv) from its three parts (SX)."""
+        full = [None] * self.robot.n
+        for i, j in enumerate(self.independent):
+            full[j] = independent[i]
+        for i, j in enumerate(self.dependent):
+            full[j] = dependent[i]
+        return ca.vertcat(base, *full) if self.base else ca.vertcat(*full)
+
+    def configuration(self, y: Any, legs: Any) -> Any:
+        """q of the "rpy" coordinates (nv,) from y (ny,) and the leg joints (nl,), SX."""
+        return self._embed(y[: self.base], y[self.base :], legs)
+
+    def _sole_terms(self, k: int, legs: Any, v: Any, a: Any) -> Any:
+        """Rotation, point, leg Jacobian, twist and acceleration of sole k in the base's own frame."""
+        zero = ca.SX.zeros(len(self.independent))
+        q = self._embed(ca.SX.zeros(self.base), zero, legs)
+        return self._sole[k](q, v, a)
+
+    def velocity(self, y: Any, legs: Any, rates: Any) -> Any:
+        """Pinocchio velocities v = N(y) ydot (nv, k) that keep the held soles at rest, SX.
+
+        ``rates`` (ny, k): one ydot a column.
+        """
+        k = rates.shape[1]
+        if not self.base:
+            return ca.horzcat(*[self._embed(None, rates[:, i], ca.SX(0, 1)) for i in range(k)])
+        still = ca.SX.zeros(self.nl)
+        q = self.configuration(y, legs)
+        nothing = ca.SX.zeros(self.rb.nv)
+        base = [
+            self._base_motion(q, self._embed(rates[:6, i], rates[6:, i], still), nothing)[0] for i in range(k)
+        ]
+        leg_rates = []
+        for s, leg in enumerate(self.legs):
+            _, _, jac, _, _ = self._sole_terms(s, legs, nothing, nothing)
+            twists = [self._sole_terms(s, legs, self._base_only(b), nothing)[3] for b in base]
+            leg_rates.append(solve_in_order(jac, -ca.horzcat(*twists), leg.order)[0])
+        parts = ca.vertcat(*leg_rates)
+        return ca.horzcat(*[self._embed(base[i], rates[6:, i], parts[:, i]) for i in range(k)])
+
+    def _base_only(self, base: Any) -> Any:
+        return self._embed(base, ca.SX.zeros(len(self.independent)), ca.SX.zeros(self.nl))
+
+    def motion(self, y: Any, legs: Any, yd: Any, ydd: Any) -> tuple[Any, Any]:
+        """Pinocchio v and a (nv,) that keep the held soles at rest, SX.
+
+        y (ny,), legs (nl,), yd, ydd (ny,): coordinates, dependent joints, rates [1/s] and second rates
+        [1/s^2].
+        """
+        v = self.velocity(y, legs, yd)
+        if not self.base:
+            return v, self._embed(None, ydd, ca.SX(0, 1))
+        still = ca.SX.zeros(self.nl)
+        q = self.configuration(y, legs)
+        a_base = self._base_motion(
+            q, self._embed(yd[:6], yd[6:], still), self._embed(ydd[:6], ydd[6:], still)
+        )[1]
+        accs = []
+        for s, leg in enumerate(self.legs):
+            _, _, jac, _, acc = self._sole_terms(s, legs, v, self._base_only(a_base))
+            accs.append(solve_in_order(jac, -acc, leg.order)[0])
+        return v, self._embed(a_base, ydd[6:], ca.vertcat(*accs))
+
+    def leg_determinants(self, legs: Any) -> Any:
+        """Determinant, up to its sign, of each held leg's Jacobian (a leg), SX; zero at a straight knee."""
+        nothing = ca.SX.zeros(self.rb.nv)
+        out = []
+        for s, leg in enumerate(self.legs):
+            jac = self._sole_terms(s, legs, nothing, nothing)[2]
+            out.append(solve_in_order(jac, ca.SX(6, 0), leg.order)[1])
+        return ca.vertcat(*out)
+
+    def sole_twists(self, y: Any, legs: Any, yd: Any, rates: Any) -> Any:
+        """Twists (6 a held sole) [m/s, rad/s], in the base's own frame, SX.
+
+        They are for leg rates (nl,) that need not be right.
+        """
+        still, nothing = ca.SX.zeros(self.nl), ca.SX.zeros(self.rb.nv)
+        base = self._base_motion(self.configuration(y, still), self._embed(yd[:6], yd[6:], still), nothing)[0]
+        v = self._embed(base, ca.SX.zeros(len(self.independent)), rates)
+        return ca.vertcat(*[self._sole_terms(k, legs, v, nothing)[3] for k in range(len(self.legs))])
+
+    def upper_motion(self, y: Any, yd: Any, ydd: Any) -> tuple[Any, Any, Any]:
+        """q, v, a (SX) with the leg joints left out (zero): enough for frames that no stance leg carries."""
+        still = ca.SX.zeros(self.nl)
+        q = self.configuration(y, still)
+        if not self.base:
+            return q, self._embed(None, yd, still), self._embed(None, ydd, still)
+        qd, qdd = self._embed(yd[:6], yd[6:], still), self._embed(ydd[:6], ydd[6:], still)
+        v, a = self._base_motion(q, qd, qdd)
+        return q, self._embed(v, yd[6:], still), self._embed(a, ydd[6:], still)
+
+    def closure(self, y: Any, legs: Any) -> Any:
+        """Pose error of the held soles (6 a sole), SX: position [m], rotation vector [rad] to first order."""
+        q = self.configuration(y, legs)
+        out = []
+        for leg in self.legs:
+            rotation, point = self.rb_frame(leg.sole.frame, q)
+            d = ca.mtimes(rotation, ca.DM(leg.placement.rotation.T))
+            w = 0.5 * ca.vertcat(d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1])
+            out += [point - ca.DM(leg.placement.translation), w]
+        return ca.vertcat(*out)
+
+    def rb_frame(self, name: str, q: Any) -> tuple[Any, Any]:
+        """Rotation and position of a frame at the symbolic configuration q ("rpy" coordinates)."""
+        f = ca.Function("frame", [self.rb.q], list(self.rb.frame(name)))
+        return f(q)
+
+    def sole_wrench_map(self, legs: Any, wrenches: Any) -> Any:
+        """Generalized force (nv,) J_soles^T w of the soles' wrenches, SX.
+
+        wrenches (6 a sole): force [N] and moment [N m] in each sole's own frame.
+        """
+        nv = self.rb.nv
+        if not self.legs:
+            return ca.SX.zeros(nv)
+        zero_v, base, leg_tau = ca.SX.zeros(nv), ca.SX.zeros(6), []
+        for k in range(len(self.legs)):
+            rotation, point, jac, _, _ = self._sole_terms(k, legs, zero_v, zero_v)
+            w = wrenches[6 * k : 6 * k + 6]
+            f, n = ca.mtimes(rotation, w[:3]), ca.mtimes(rotation, w[3:])
+            base = base + ca.vertcat(f, n + ca.cross(point, f))
+            leg_tau.append(ca.mtimes(jac.T, ca.vertcat(f, n)))
+        return self._embed(base, ca.SX.zeros(len(self.independent)), ca.vertcat(*leg_tau))
+
+    # ------------------------------------------------------------------ numeric
+    def split(self, q_pin: Array) -> tuple[Array, Array]:
+        """(y, legs) of a pin configuration."""
+        q = self.rb.from_pin(q_pin)
+        joints = q[self.base :]
+        return np.concatenate([q[: self.base], joints[self.independent]]), joints[self.dependent]
+
+    def join(self, y: Array, legs: Array) -> Array:
+        """pin configuration (nq,) of (y, legs)."""
+        joints = np.zeros(self.robot.n)
+        joints[self.independent], joints[self.dependent] = y[self.base :], legs
+        return self.rb.to_pin(np.concatenate([y[: self.base], joints]))
+
+    def solve_legs(self, y: Array, guess: Array, *, tolerance: float = 1e-12, iterations: int = 50) -> Array:
+        """Leg joints (nl,) that put every held sole in its place; Newton from ``guess``.
+
+        Raises InputError if a sole cannot be reached.
+        """
+        legs = np.array(guess, dtype=float)
+        model, data = self.model, self.data
+        for _ in range(iterations):
+            q = self.join(y, legs)
+            pin.computeJointJacobians(model, data, q)
+            worst = 0.0
+            for k, leg in enumerate(self.legs):
+                fid = model.getFrameId(leg.sole.frame)
+                m = pin.updateFramePlacement(model, data, fid)
+                error = pin.log6(m.actInv(leg.placement)).vector
+                worst = max(worst, float(np.abs(error).max()))
+                jac = pin.getFrameJacobian(model, data, fid, pin.LOCAL)[:, self.base + leg.joints]
+                step = np.linalg.solve(jac.T @ jac + 1e-12 * np.eye(6), jac.T @ error)
+                legs[6 * k : 6 * k + 6] += np.clip(step, -0.3, 0.3)
+            if worst < tolerance:
+                return legs
+        if worst < 1e-6:
+            return legs
+        raise InputError(
+            f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
+            "the legs' reach"
+        )
+
+    def sole_jacobians(self, q: Array) -> tuple[Array, list[Any]]:
+        """Jacobians of the held soles, stacked (6 a sole, nv), and their placements, at a pin configuration.
+
+        The Jacobians are in each sole's own frame, the placements in the world.
+        """
+        model, data = self.model, self.data
+        pin.computeJointJacobians(model, data, q)
+        pin.updateFramePlacements(model, data)
+        ids = [model.getFrameId(leg.sole.frame) for leg in self.legs]
+        jac = np.vstack(
+            [np.zeros((0, model.nv)), *[pin.getFrameJacobian(model, data, i, pin.LOCAL) for i in ids]]
+        )
+        return jac, [data.oMf[i].copy() for i in ids]
+
+    def complete_motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array]:
+        """pin q, v, a of independent coordinates and rates; the legs' part is from the soles' constraint."""
+        model, data, b = self.model, self.data, self.base
+        q = self.join(y, legs)
+        v, a = np.zeros(model.nv), np.zeros(model.nv)
+        if b:
+            v[:6], a[:6] = base_motion(y[:6], yd[:6], ydd[:6])
+        v[b + self.independent], a[b + self.independent] = yd[b:], ydd[b:]
+        if self.legs:
+            columns = b + self.dependent
+            jac, _ = self.sole_jacobians(q)
+            block = jac[:, columns]
+            v[columns] = np.linalg.solve(block, -jac @ v)
+            pin.forwardKinematics(model, data, q, v, a)
+            drift = np.concatenate(
+                [
+                    pin.getFrameAcceleration(model, data, model.getFrameId(leg.sole.frame), pin.LOCAL).vector
+                    for leg in self.legs
+                ]
+            )
+            a[columns] = np.linalg.solve(block, -drift)
+        return q, v, a
+
+
+def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
+    """Free-flyer velocity and acceleration (6,), in its own frame, of (p, roll, pitch, yaw) and rates.
+
+    The numeric twin of the symbolic map.
+    """
+    rotation = pin.rpy.rpyToMatrix(y[3:6])
+    jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
+    omega = jac @ yd[3:6]
+    alpha = jac @ ydd[3:6] + pin.rpy.computeRpyJacobianTimeDerivative(y[3:6], yd[3:6], pin.LOCAL) @ yd[3:6]
+    linear = rotation.T @ yd[:3]
+    # body components of a vector that turns with the base: d/dt (R' pdot) = R' pddot - omega x (R' pdot)
+    return np.concatenate([linear, omega]), np.concatenate(
+        [rotation.T @ ydd[:3] - np.cross(omega, linear), alpha]
+    )

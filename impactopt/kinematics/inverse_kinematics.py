@@ -1,0 +1,118 @@
+"""Inverse kinematics on held soles: a posture whose striking point is where it should be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.kinematics.coordinates import StanceCoordinates
+
+Array = NDArray[np.float64]
+TURNING, WISH = 100, 0.1  # steps that also turn the hand, and how much that is damped
+ASIDE, ABOUT = 0.1, 0.3  # [rad] how far postures are drawn from the guess: the first one that turns; others
+
+
+def reach(
+    coordinates: StanceCoordinates,
+    striker: str,
+    point: Array,
+    guess: Array,
+    *,
+    facing: tuple[Array, Array] | None = None,
+    margin: float = 0.02,
+    starts: int = 8,
+    tolerance: float = 1e-8,
+) -> Array:
+    """A pin configuration (nq,) with the striking point at ``point`` (3,) [m], the soles in place.
+
+    Joints are inside their limits by ``margin`` [rad].  facing : an axis of the striker's frame, and the
+    direction (world) that it is to have, as nearly as may be; unit vectors (3,).
+
+    Damped least squares on soles and striking point, from ``guess`` and then from postures about it. The
+    soles of ``coordinates`` stay.
+
+    Raises
+    ------
+    InputError : nothing found; says how near the best posture came and where the striking point starts.
+    """
+    robot, model = coordinates.robot, coordinates.model
+    data = model.createData()
+    fid = model.getFrameId(f"striker:{striker}")
+    lower, upper = robot.lower + margin, robot.upper - margin
+    # a continuous joint takes two numbers of q, and has no limits
+    joints = list(model.joints)[-robot.n :]
+    limited = np.array([k for k, j in enumerate(joints) if j.nq == 1], dtype=np.intp)
+    place = np.array([joints[k].idx_q for k in limited], dtype=np.intp)
+    rng = np.random.default_rng(0)
+    base = coordinates.base
+    # the base moves last: a reach with the arm keeps the centre of mass over the feet
+    ease = np.ones(model.nv)
+    ease[:base] = 0.02
+    best_gap = np.inf
+    for k in range(starts):
+        q = guess.copy()
+        if k or facing is not None:  # what is in a plane of symmetry would stay there
+            drawn = (ABOUT if k else ASIDE) * rng.standard_normal(robot.n)
+            q = pin.integrate(model, q, np.concatenate([np.zeros(base), drawn]))
+        for turn in range(200):
+            q[place] = np.clip(q[place], lower[limited], upper[limited])
+            pin.computeJointJacobians(model, data, q)
+            pin.updateFramePlacements(model, data)
+            errors, jacs = [], []
+            for leg in coordinates.legs:
+                f = model.getFrameId(leg.sole.frame)
+                errors.append(pin.log6(data.oMf[f].actInv(leg.placement)).vector)
+                jacs.append(pin.getFrameJacobian(model, data, f, pin.LOCAL))
+            gap = point - data.oMf[fid].translation
+            errors.append(gap)
+            hand = pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)
+            hand = np.reshape(hand, (6, model.nv))  # pin drops an axis where nv is 1
+            jacs.append(hand[:3])
+            off = float(np.abs(np.concatenate(errors)).max())
+            best_gap = min(best_gap, off)
+            turning = facing is not None and turn < TURNING
+            if off < tolerance and not turning:
+                return q
+            damping = np.full(6 * len(coordinates.legs) + 3, 1e-8)
+            if facing is not None and turning:
+                axis = data.oMf[fid].rotation @ facing[0]
+                across = np.linalg.svd(axis[None])[2][1:]  # turning about the axis changes nothing
+                errors.append(across @ _turn(axis, facing[1], across[0]))
+                jacs.append(across @ hand[3:])
+                damping = np.concatenate([damping, [WISH, WISH]])
+            e, jac = np.concatenate(errors), np.vstack(jacs)
+            # joints at a limit that would leave it are held for this step
+            step = np.zeros(model.nv)
+            free = np.ones(model.nv, dtype=bool)
+            for _hold in range(3):
+                j = jac[:, free]
+                step[:] = 0.0
+                jw = j * ease[free]
+                step[free] = jw.T @ np.linalg.solve(jw @ j.T + np.diag(damping), e)
+                joint = step[base:][limited]
+                out = np.zeros(robot.n, dtype=bool)
+                out[limited] = ((q[place] >= upper[limited] - 1e-9) & (joint > 0)) | (
+                    (q[place] <= lower[limited] + 1e-9) & (joint < 0)
+                )
+                if not (out & free[base:]).any():
+                    break
+                free[base:] &= ~out
+            q = pin.integrate(model, q, np.clip(step, -0.15, 0.15))
+    pin.framesForwardKinematics(model, data, guess)
+    start = data.oMf[fid].translation
+    raise InputError(
+        f"the point {np.round(point, 4).tolist()} m is out of reach of '{striker}' with the soles in place: "
+        f"the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
+        f"{np.round(start, 3).tolist()} m); move the point nearer"
+    ) from None
+
+
+def _turn(axis: Array, direction: Array, across: Array) -> Array:
+    """The least rotation (3,) [rad] from one unit vector to another; ``across``: one at right angles."""
+    cross, along = np.cross(axis, direction), float(axis @ direction)
+    sine = float(np.linalg.norm(cross))
+    if sine < 1e-9:
+        return np.zeros(3) if along > 0 else np.pi * across
+    return np.asarray(cross * (np.arctan2(sine, along) / sine))

@@ -1,0 +1,140 @@
+"""What holds the robot during an impact: its soles, exactly or by the paper's virtual base, or a fixed base.
+
+The virtual base (paper, eqs. 1-4) adds a mass M_g and an inertia I_g E to each held sole. That equals
+holding the sole by a constraint with the compliance 1/M_g, 1/I_g on the diagonal of its inverse inertia J
+H^-1 J^T, without the rounding errors of huge masses in H; M_g to infinity is the exact constraint.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError, check_array
+from impactopt.robots.robot import Robot, Sole
+
+__all__ = ["BothSoles", "FixedBase", "OneSole", "Stance", "usual_stance"]
+
+
+class Stance(ABC):
+    """What holds the robot."""
+
+    @abstractmethod
+    def soles(self, robot: Robot) -> tuple[Sole, ...]:
+        """The soles that are held, in the robot's order; InputError if the robot cannot stand like this."""
+
+    def sole_names(self, robot: Robot) -> tuple[str, ...]:
+        """Names of the soles that are held."""
+        return tuple(sole.name for sole in self.soles(robot))
+
+    def sole_frames(self, robot: Robot) -> tuple[str, ...]:
+        """Frames of the soles that are held."""
+        return tuple(sole.frame for sole in self.soles(robot))
+
+    def hand_frames(self, robot: Robot) -> tuple[str, ...]:
+        """Frames of the hands that are held; InputError for one that the robot has not."""
+        return ()
+
+    def constraint_frames(self, robot: Robot) -> tuple[str, ...]:
+        """Frames of the model that are held in all six directions: soles first, then hands."""
+        return self.sole_frames(robot) + self.hand_frames(robot)
+
+    @property
+    def compliance(self) -> NDArray[np.float64]:
+        """(6,) of each held frame, LOCAL_WORLD_ALIGNED: acceleration it yields by per force [1/kg; 1/(kg
+        m2)]."""
+        return np.zeros(6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OnSoles(Stance):
+    """Soles, and hands that support the robot, held exactly, or by a virtual base.
+
+    Attributes
+    ----------
+    base_mass, base_inertia : M_g [kg] and I_g [kg m2] added to each held sole and hand (paper, eqs. 1, 2);
+        None: exact.
+    hands : names of strikers with which the robot holds on to the world, in all six directions (paper,
+        section II-A).
+
+    Raises
+    ------
+    InputError : one of the two is missing, or is not a positive number.
+    """
+
+    base_mass: float | None = None
+    base_inertia: float | None = None
+    hands: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.hands, (tuple, list)) or len(set(self.hands)) != len(self.hands):
+            raise InputError(f"hands: {self.hands!r}; give a tuple of strikers' names, each once")
+        object.__setattr__(self, "hands", tuple(self.hands))
+        if (self.base_mass is None) != (self.base_inertia is None):
+            raise InputError(
+                "virtual base: give both base_mass [kg] and base_inertia [kg m2], or neither (exact)"
+            )
+        for name, value in (("base_mass [kg]", self.base_mass), ("base_inertia [kg m2]", self.base_inertia)):
+            if value is not None and not check_array(f"virtual base: {name}", value, ()) > 0:
+                raise InputError(
+                    f"virtual base: {name}: {value:g}; give a number > 0, or None for exactly held soles"
+                )
+
+    def hand_frames(self, robot: Robot) -> tuple[str, ...]:
+        return tuple(robot.striker(name).model_frame for name in self.hands)
+
+    @property
+    def compliance(self) -> NDArray[np.float64]:
+        if self.base_mass is None or self.base_inertia is None:
+            return np.zeros(6)
+        return np.array([1.0 / self.base_mass] * 3 + [1.0 / self.base_inertia] * 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BothSoles(_OnSoles):
+    """All of the robot's soles are held."""
+
+    def soles(self, robot: Robot) -> tuple[Sole, ...]:
+        _check_floating(robot)
+        if not robot.soles:
+            raise InputError(f"robot {robot.name!r} has no soles to stand on; give it some (Robot's soles=)")
+        return tuple(robot.soles)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneSole(_OnSoles):
+    """One sole, given by its name, is held; the others are free."""
+
+    name: str = field(kw_only=False)
+
+    def soles(self, robot: Robot) -> tuple[Sole, ...]:
+        _check_floating(robot)
+        return (robot.sole(self.name),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixedBase(Stance):
+    """The root link is part of the ground: for robots without a free-flyer."""
+
+    def soles(self, robot: Robot) -> tuple[Sole, ...]:
+        if robot.floating:
+            raise InputError(
+                f"robot {robot.name!r} has a free-flyer: stand it on BothSoles() or OneSole(name), "
+                "or build it with floating=False"
+            )
+        return ()
+
+
+def usual_stance(robot: Robot) -> Stance:
+    """Both soles of a robot with a free-flyer, else its fixed base."""
+    return BothSoles() if robot.floating else FixedBase()
+
+
+def _check_floating(robot: Robot) -> None:
+    if not robot.floating:
+        raise InputError(
+            f"robot {robot.name!r} has a fixed base: use FixedBase(), or build it with floating=True"
+        )

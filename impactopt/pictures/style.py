@@ -1,0 +1,128 @@
+"""One style for all pictures.
+
+Okabe and Ito's colours, and cividis for scales: any kind of colour vision tells them apart.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from functools import wraps
+from typing import IO, Any, ParamSpec, TypeVar
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
+from numpy.typing import NDArray
+
+from impactopt.files.output import Record
+
+Array = NDArray[np.float64]
+Given = ParamSpec("Given")
+Drawn = TypeVar("Drawn")
+
+BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#56B4E9",
+    "#000000",
+)
+
+PLANNED, SIMULATED, OVER = BLUE, VERMILION, VERMILION
+PHASES = ("swing", "collision", "follow-through")
+
+# [in] what a paper's column and its page are wide; a picture of that width needs no scaling in print
+COLUMN, PAGE = 3.5, 7.2
+DPI = 200
+
+STYLE: Any = {
+    "text.usetex": False,  # a matplotlibrc in the working directory would have LaTeX run what it says
+    "figure.dpi": DPI,
+    "savefig.dpi": DPI,
+    "figure.constrained_layout.use": True,
+    "font.size": 8,
+    "axes.titlesize": 9,
+    "axes.prop_cycle": cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK]),
+    "figure.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "image.cmap": "cividis",
+}
+
+
+class Picture(Figure):
+    """A figure in our style, however and wherever it is drawn; notebooks show it as it is.
+
+    No display is needed, and no global state is touched.
+    """
+
+    def __init__(self, width: float, height: float) -> None:
+        with matplotlib.rc_context(STYLE):
+            super().__init__(figsize=(width, height))
+            FigureCanvasAgg(self)
+
+    def add_subplot(self, *args: Any, **options: Any) -> Any:  # subplots come through here too
+        with matplotlib.rc_context(STYLE):
+            return super().add_subplot(*args, **options)
+
+    def legend(self, *args: Any, **options: Any) -> Any:
+        with matplotlib.rc_context(STYLE):
+            return super().legend(*args, **options)
+
+    def draw(self, renderer: Any) -> None:
+        with matplotlib.rc_context(STYLE):  # ticks are made when they are drawn
+            super().draw(renderer)
+
+    def write(self, file: IO[bytes]) -> None:
+        """Write the picture as PNG."""
+        with matplotlib.rc_context(STYLE):
+            self.savefig(file, format="png")
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        """For notebooks: half as many pixels on the page as in the file, which is sharp on any screen."""
+        width, height = (int(side * DPI / 2) for side in self.get_size_inches())
+        memory = io.BytesIO()
+        self.write(memory)
+        return memory.getvalue(), {"width": width, "height": height}
+
+
+def styled(draw: Callable[Given, Drawn]) -> Callable[Given, Drawn]:
+    """The function, in our style."""
+
+    @wraps(draw)
+    def in_style(*args: Given.args, **options: Given.kwargs) -> Drawn:
+        with matplotlib.rc_context(STYLE):
+            return draw(*args, **options)
+
+    return in_style
+
+
+def title(record: Record, what: str) -> str:
+    """The problem's name, and what is drawn."""
+    name = record.summary.get("problem", {}).get("name", "")
+    return f"{name}: {what}" if name else what
+
+
+def joint_label(name: object) -> str:
+    """A joint's name as a reader wants it."""
+    return str(name).removesuffix("_joint").replace("_", " ")
+
+
+def simulated_phases(record: Record) -> NDArray[np.intp]:
+    """Of the simulated instants (k,): 0 before, 1 in, 2 after contact; planned contact if there was none."""
+    a = record.arrays
+    kind = "simulated" if np.isfinite(a["simulated_contact_start"]) else "reference"
+    start, end = (float(a[f"{kind}_contact_{which}"]) for which in ("start", "end"))
+    # nan, for a contact that did not end, compares false
+    return (a["simulated_time"] >= start).astype(int) + (a["simulated_time"] >= end).astype(int)

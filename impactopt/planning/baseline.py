@@ -1,0 +1,211 @@
+"""What people do without an optimizer: a minimum-jerk reach to the target, as hard as the same limits let it
+be.
+
+From rest to a posture at the hit point (by inverse kinematics) with the striking point moving along the
+normal, and back, each on the minimum-jerk polynomial (Flash and Hogan 1985) in the independent coordinates;
+the swing's duration is the best of several, the way back has the problem's own.  The speed is the greatest
+for which position, velocity and torque limits and the contact wrench cones hold on the way and, re-simulated
+in full dynamics with the same servo, ZMP and torque stay inside while and after it hits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+
+from impactopt.errors import InputError
+from impactopt.kinematics.splines import quintic
+from impactopt.kinematics.statics import static_wrenches
+from impactopt.kinematics.wrench_cone import contact_wrench_cone
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit, VelocityLimit
+from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
+from impactopt.transcription.plan import Trajectory, complete_reference
+from impactopt.transcription.start import strike_rates
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline:
+    """The reach: duration [s] of the swing, speed [m/s] of the striking point that it was planned with, the
+    servo's reference, and what came of it.
+    """
+
+    duration: float
+    speed: float
+    reference: Trajectory
+    simulation: Simulation
+    summary: dict[str, Any]
+
+    @property
+    def impulse(self) -> float:
+        """Simulated impulse [N s]."""
+        return float(self.summary["impulse_Ns"])
+
+    def describe(self) -> dict[str, Any]:
+        """The numbers for ``summary.json``, all simulated but the swing's duration."""
+        return {"method": "minimum jerk", "swing_s": self.duration, **self.summary}
+
+
+DURATIONS = (0.6, 0.8, 1.0, 1.3, 1.7)  # [s] of the swing that are tried
+
+
+def minimum_jerk_baseline(
+    problem: ImpactProblem, *, fastest: float = 5.0, tolerance: float = 0.02
+) -> Baseline:
+    """The hardest minimum-jerk reach; ``tolerance``: of its speed, relative; ``fastest`` [m/s] that is tried.
+
+    Raises
+    ------
+    InputError : not even a touch at 1 cm/s keeps the limits.
+    """
+    found = [b for b in (_hardest(problem, d, fastest, tolerance) for d in DURATIONS) if b is not None]
+    if not found:
+        raise InputError("not even a minimum-jerk reach that hits at 0.01 m/s keeps the limits")
+    return max(found, key=lambda b: b.impulse)
+
+
+def _hardest(problem: ImpactProblem, duration: float, fastest: float, tolerance: float) -> Baseline | None:
+    slow, fast = 0.01, fastest
+    if not _holds(problem, duration, slow):
+        return None
+    while fast > (1 + tolerance) * slow:
+        middle = float(np.sqrt(fast * slow))
+        slow, fast = (middle, fast) if _holds(problem, duration, middle) else (slow, middle)
+    speed, scene = slow, scene_of(problem)
+    while speed >= 0.01:
+        reference = _reference(problem, duration, speed)
+        simulation = simulate_pinocchio(problem.robot, reference, scene, step=2e-4)
+        summary = simulation.summary(
+            torque_limit=problem.robot.torque_limit, polygon=scene.polygon, planned_impulse=np.nan
+        )
+        del summary["impulse_error_pct"]  # nothing was planned
+        margins, ratios = summary.get("zmp_margin_m", {"": 0.0}), summary["torque_ratio"]
+        if min(margins.values()) >= 0 and max(ratios.values()) <= 1.0:
+            return Baseline(
+                duration=duration, speed=speed, reference=reference, simulation=simulation, summary=summary
+            )
+        speed *= 0.93
+    return None
+
+
+def _phases(
+    problem: ImpactProblem, there: float, speed: float
+) -> list[tuple[float, tuple[Array, Array, Array, Array]]]:
+    """(duration, (start, start rate, end, end rate)) of the way there and of the way back."""
+    c = problem.coordinates
+    y0, _ = c.split(problem.start_posture)
+    hit, legs = c.split(problem.contact_posture)
+    rates = strike_rates(c, problem.striker, hit, legs, speed * problem.normal, base=0.02)  # by the arm
+    zero = np.zeros(c.ny)
+    back = float(np.mean(problem.follow.duration))
+    return [(there, (y0, zero, hit, rates)), (back, (hit, rates, y0, zero))]
+
+
+def _profile(
+    duration: float, ends: tuple[Array, Array, Array, Array], time: Array
+) -> tuple[Array, Array, Array]:
+    """y, ydot, yddot (k, ny) of the quintic at times [s]; it rests after ``duration``."""
+    nodes = np.linspace(0, 1, 6)
+    fit = np.polynomial.polynomial.polyfit(nodes, quintic(*ends[:2], *ends[2:], duration, nodes), 5)
+    s = np.clip(time / duration, 0.0, 1.0)
+    out = []
+    for order in range(3):
+        coefficients = np.polynomial.polynomial.polyder(fit, order) / duration**order
+        values = np.polynomial.polynomial.polyval(s, coefficients).T
+        out.append(values if order == 0 else np.where((time <= duration)[:, None], values, 0.0))
+    return out[0], out[1], out[2]
+
+
+def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) -> bool:
+    """Whether the reach keeps the limits, with no contact, at ``nodes`` instants of each way."""
+    c, r = problem.coordinates, problem.robot
+    margin = problem.term(PositionLimit).margin
+    legs0 = c.split(problem.start_posture)[1]
+    for duration, ends in _phases(problem, there, speed):
+        y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
+        wrench = np.tile(static_wrenches(c, ends[0], legs0), (len(y), 1))
+        try:
+            q, v, a, _, _ = complete_reference(problem, y, yd, ydd, wrench, legs0)
+        except InputError:  # a leg too short for the base's way
+            return False
+        joints, rates = q[:, -r.n :], v[:, -r.n :]
+        if (joints < r.lower + margin).any() or (joints > r.upper - margin).any():
+            return False
+        if (np.abs(rates) > problem.term(VelocityLimit).fraction * r.velocity_limit).any():
+            return False
+        if not all(_wrenches_exist(problem, q[k], v[k], a[k]) for k in range(len(y))):
+            return False
+    return True
+
+
+def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> bool:
+    """Whether some sole wrenches in their cones balance the motion with torques inside the limits (a linear
+    program).
+    """
+    c, r = problem.coordinates, problem.robot
+    tau = np.array(pin.rnea(c.model, c.data, q, v, a))
+    limit = problem.term(TorqueLimit).fraction * r.torque_limit
+    if not c.legs:
+        return bool(np.all(np.abs(tau) <= limit))
+    cone = problem.term(ContactWrenchCone)
+    jac, _ = c.sole_jacobians(q)
+    n = 6 * len(c.legs)
+    rows, bounds = [], []
+    for k, leg in enumerate(c.legs):
+        facets = contact_wrench_cone(leg.sole.polygon, cone.friction, margin=cone.margin)
+        block = np.zeros((len(facets) + 1, n))
+        block[:-1, 6 * k : 6 * k + 6] = -facets
+        block[-1, 6 * k + 2] = -1.0
+        rows.append(block)
+        bounds.append(np.concatenate([np.zeros(len(facets)), [-cone.minimum_force]]))
+    legs = jac[:, c.base :].T
+    rows += [-legs, legs]
+    bounds += [limit - tau[c.base :], limit + tau[c.base :]]
+    found = linprog(
+        np.zeros(n),
+        A_ub=np.vstack(rows),
+        b_ub=np.concatenate(bounds),
+        A_eq=jac[:, :6].T,
+        b_eq=tau[:6],
+        bounds=(None, None),
+        method="highs",
+    )
+    return bool(found.status == 0)
+
+
+def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory:
+    """The servo's reference: there and back, as if there were no target."""
+    c = problem.coordinates
+    legs = c.split(problem.start_posture)[1]
+    parts, start = [], 0.0
+    for phase, (duration, ends) in zip((0, 2), _phases(problem, there, speed), strict=True):
+        length = duration + (0.5 if phase else 0.0)
+        time = np.linspace(0.0, length, round(length / 1e-3) + 1)
+        y, yd, ydd = _profile(duration, ends, time)
+        wrench = np.tile(static_wrenches(c, ends[0], legs), (len(time), 1))
+        parts.append(
+            (start + time, np.full(len(time), phase), *complete_reference(problem, y, yd, ydd, wrench, legs))
+        )
+        legs = c.split(parts[-1][2][-1])[1]
+        start += duration
+    time, phases, q, v, a, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(7))
+    hit = float(parts[0][0][-1])
+    return Trajectory(
+        time=time,
+        phase=phases,
+        q=q,
+        v=v,
+        a=a,
+        torque=torque,
+        ground=ground,
+        contact_start=hit,
+        contact_end=hit,
+        end=start,
+    )

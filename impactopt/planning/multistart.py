@@ -1,0 +1,225 @@
+"""One program from several starts: the problem has local optima, and the best of them is kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
+from impactopt.solvers.sqp import SQPOptions, solve_sqp
+
+if TYPE_CHECKING:
+    from impactopt.transcription.at_contact import ContactProgram
+
+Array = NDArray[np.float64]
+Program = TypeVar("Program", bound="ContactProgram")
+Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
+SOLVERS = ("sqp", "ipopt")
+VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
+NAMED = 20  # at most
+SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """What came of one start.
+
+    start : its name; impulse [N s]; seconds: of the solver; kept: it is the one that was best.
+    """
+
+    start: str
+    status: Status
+    impulse: float
+    objective: float
+    max_violation: float
+    iterations: int
+    seconds: float
+    kept: bool = False
+
+    def summary(self) -> dict[str, Any]:
+        """As in ``summary.json``."""
+        return {
+            "start": self.start,
+            "status": self.status.value,
+            "impulse_Ns": self.impulse,
+            "objective": self.objective,
+            "max_violation": self.max_violation,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "kept": self.kept,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """A solver with its options, and the time [s] that is left for all that it is given; None: any.
+
+    Raises
+    ------
+    InputError : an unknown solver; a time that is none; options that the SQP does not have (IPOPT is asked
+        about its own when it starts).
+    """
+
+    solver: str
+    options: Mapping[str, Any] | None
+    time_limit: float | None
+    callback: Callback | None
+    since: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        if self.solver not in SOLVERS:
+            raise InputError(
+                f"unknown solver {self.solver!r}{did_you_mean(self.solver, SOLVERS)}: there are "
+                f"{', '.join(SOLVERS)}"
+            )
+        if self.time_limit is not None and not check_array("time_limit [s]", self.time_limit, ()) > 0:
+            raise InputError(f"time_limit [s]: {self.time_limit:g}; give a number > 0")
+        if self.options is None:
+            return
+        if not isinstance(self.options, Mapping) or not all(isinstance(name, str) for name in self.options):
+            raise InputError(f"options are those of the solver by name, not {self.options!r}")
+        if self.solver == "sqp":
+            known = [f.name for f in fields(SQPOptions)]
+            for name in self.options:
+                if name not in known:
+                    raise InputError(
+                        f"the solver 'sqp' has no option {name!r}{did_you_mean(name, known)}; it has "
+                        f"{', '.join(known)}"
+                    )
+            SQPOptions(**self.options)
+
+    def started(self) -> Budget:
+        """The same with all its time, which begins now."""
+        return replace(self, since=time.perf_counter())
+
+    @property
+    def left(self) -> float | None:
+        """[s]"""
+        if self.time_limit is None:
+            return None
+        return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
+
+    def run(
+        self, program: NonlinearProgram, start: Array | SolverResult, barrier: float | None = None
+    ) -> SolverResult:
+        """Let the solver work on a program in the time that is left.
+
+        barrier : the first of "sqp" from a result, where that is not as near as it looks.
+
+        start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
+        """
+        left, y, z = self.left, None, None
+        if isinstance(start, SolverResult):
+            x0, y, z = start.x, start.multipliers, start.bound_multipliers
+        else:
+            x0 = start
+        if self.solver == "ipopt":
+            return solve_ipopt(program, x0, options=self.options, callback=self.callback, time_limit=left)
+        settings = dict(self.options or {})
+        if barrier is not None and z is not None:
+            settings.setdefault("barrier_warm", barrier)
+        if left is not None:
+            settings["time_limit"] = max(left, 1e-9)
+        return solve_sqp(
+            program,
+            x0,
+            options=SQPOptions(**settings),
+            callback=self.callback,
+            multipliers=y,
+            bound_multipliers=z,
+        )
+
+
+def check_starts(starts: int, seed: int, *, given: bool) -> None:
+    """InputError if these are no number of starts, or no seed; ``given``: the one start is given."""
+    for name, value, least in (("starts", starts, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise InputError(f"{name} is {value!r}; give a whole number >= {least}")
+    if given and starts > 1:
+        raise InputError(f"starts is {starts}, of one start that is given; leave one of the two out")
+
+
+def drawn(starts: int, seed: int) -> list[dict[str, Any]]:
+    """Speed, noise and seed of each start's reach; the first one is the plain reach."""
+    rng = np.random.default_rng(seed)
+    others = [
+        {
+            "speed": float(rng.uniform(*SPEEDS)),
+            "noise": float(rng.uniform(*NOISE)),
+            "seed": int(rng.integers(2**31)),
+        }
+        for _ in range(starts - 1)
+    ]
+    return [{}, *others]
+
+
+def solve_from(
+    t: Program,
+    starts: Starts,
+    budget: Budget,
+    began: float,
+    work: Callable[[Program, Array | SolverResult], tuple[Program, SolverResult]] | None = None,
+) -> tuple[Program, dict[str, Any]]:
+    """The program of the best result from these starts, and the fields of its
+    :class:`impactopt.planning.solution.Solved`.
+
+    starts : name, and what makes its x (n,) when its turn comes. An interrupted solve is the last one, and so
+    is one after which no time is left.  began [s] : when work on the problem did.
+    work : what is done from a start; None: the program is solved as it is. It may end with another program.
+
+    Of those that meet their rows the one of least objective is best, else the one of least violation.
+    """
+    built = time.perf_counter()
+    found, attempts = list[tuple[Program, SolverResult]](), list[Attempt]()
+    for name, make in starts:
+        start = make()
+        program, result = (t, budget.run(t.program, start)) if work is None else work(t, start)
+        found.append((program, result))
+        attempts.append(attempt_of(program, name, result))
+        if result.status is Status.INTERRUPTED or budget.left == 0:
+            break
+    order = [_rank(result) for _, result in found]
+    best = order.index(min(order))
+    attempts[best] = replace(attempts[best], kept=True)
+    t, result = found[best]
+    solved, rows = time.perf_counter(), t.program.constraints(result.x)
+    return t, {
+        "problem": t.problem,
+        "result": result,
+        "solver": budget.solver,
+        "build_seconds": built - began,
+        "solve_seconds": solved - built,
+        "violations": violations_of(t, result.x, rows),
+        "objectives": t.achieved(result.x),
+        "attempts": tuple(attempts),
+    }
+
+
+def attempt_of(t: ContactProgram, name: str, result: SolverResult) -> Attempt:
+    """What came of a start, or of a round, of that name."""
+    return Attempt(
+        start=name,
+        status=result.status,
+        impulse=t.impulse(result.x),
+        objective=result.objective,
+        max_violation=result.max_violation,
+        iterations=result.iterations,
+        seconds=result.seconds,
+    )
+
+
+def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, ...]:
+    """What is not met at solver variables (n,), whose rows are (m,), worst first."""
+    return tuple(worst_rows(t.program, x, rows, tolerance=VIOLATED, count=NAMED))
+
+
+def _rank(result: SolverResult) -> tuple[bool, float]:
+    met = result.status.usable or result.max_violation <= VIOLATED
+    return not met, result.objective if met else result.max_violation

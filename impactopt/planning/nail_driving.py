@@ -1,0 +1,119 @@
+"""A series of blows on a nail: each is planned where the one before has left it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from impactopt.contact.nail import Nail
+from impactopt.errors import InputError, check_array
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+
+__all__ = ["Blow", "Series", "drive_nail"]
+
+ADVANCE = 1e-4  # [m] a blow that drives less is the last
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Blow:
+    """One blow of a series: its plan, and how deep the nail is after it [m]."""
+
+    solution: Solution
+    depth: float
+
+    @property
+    def driven(self) -> float:
+        """What this blow has driven [m]."""
+        target = self.solution.problem.target
+        assert isinstance(target, Nail)
+        return self.depth - target.depth
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Series:
+    """A series of blows. reason : why it ended before the nail was in, "" if it is in."""
+
+    blows: tuple[Blow, ...]
+    reason: str
+
+    @property
+    def done(self) -> bool:
+        """Whether the nail is in."""
+        return not self.reason
+
+    def describe(self) -> dict[str, Any]:
+        """The series as numbers, for JSON."""
+        rows = [
+            {
+                "depth_m": blow.depth,
+                "driven_m": blow.driven,
+                "impulse_Ns": blow.solution.impulse,
+                "peak_force_N": float(blow.solution.plan.collision.force.max()),
+                "hand_speed_m_s": blow.solution.plan.hand_speed,
+                "iterations": blow.solution.result.iterations,
+                "solve_seconds": blow.solution.solve_seconds,
+            }
+            for blow in self.blows
+        ]
+        return {"done": self.done, "reason": self.reason, "blows": rows}
+
+
+def drive_nail(
+    problem: ImpactProblem,
+    *,
+    depth: float,
+    most: int = 20,
+    report: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Series:
+    """Blows on the problem's nail until it is ``depth`` [m] deep in the wood.
+
+    The nail's head goes with it: each blow is planned anew at ``point`` plus what has been driven along the
+    normal, with the wood's resistance at that depth, from the plan before, or if that leads nowhere from a
+    plain reach. Between the blows the robot goes back to its start.
+
+    most : blows at most.  report : told of each blow in words.  options : of :func:`impactopt.solve`.
+
+    Raises
+    ------
+    InputError : the target is no `Nail`, or is deeper already.
+    """
+    nail = problem.target
+    if not isinstance(nail, Nail):
+        raise InputError(f"a series of blows drives a Nail; the problem's target is a {type(nail).__name__}")
+    if not check_array("depth [m]", depth, ()) > nail.depth:
+        raise InputError(
+            f"the nail is {nail.depth:g} m deep already; give a depth beyond that, not {depth:g} m"
+        )
+    blows: list[Blow] = []
+    at, x = nail.depth, options.pop("start", "reach")
+    while at < depth:
+        if len(blows) == most:
+            return Series(blows=tuple(blows), reason=f"the nail is not in yet at {1e3 * at:.1f} mm")
+        here = dataclasses.replace(
+            problem,
+            point=problem.point + (at - nail.depth) * problem.normal,
+            target=dataclasses.replace(nail, depth=at),
+        )
+        solution = solve(here, start=x, report=report, **options)
+        if not isinstance(x, str) and not solution.status.usable:  # from a plain reach, then
+            solution = solve(here, start="reach", report=report, **options)
+        if not solution.status.usable:
+            why = f"blow {len(blows) + 1} has no plan: {solution.result.message}"
+            return Series(blows=tuple(blows), reason=why)
+        driven = float(solution.plan.collision.outcome["depth_m"])
+        at += driven
+        blows.append(Blow(solution=solution, depth=at))
+        x = solution
+        if report is not None:
+            report(
+                f"blow {len(blows)}: {1e3 * driven:.1f} mm with {solution.impulse:.2f} N s; "
+                f"{1e3 * at:.1f} mm in all"
+            )
+        if driven < ADVANCE and at < depth:
+            return Series(blows=tuple(blows), reason=f"the nail moves no more at {1e3 * at:.1f} mm")
+    return Series(blows=tuple(blows), reason="")

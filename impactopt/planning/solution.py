@@ -1,0 +1,250 @@
+"""What a solve gives back, and the record that it leaves on disk."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt import __version__
+from impactopt.bodies.clearance import MISSED, Places
+from impactopt.planning.multistart import Attempt
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import SolverResult, Status, Violation
+from impactopt.transcription.contact_error import ContactError
+from impactopt.transcription.mesh import Elements, contact_elements
+from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.plan import Plan, Trajectory
+from impactopt.transcription.planned_strike import PlannedStrike
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solved:
+    """What a solved (or stopped) program of a problem is told by.
+
+    result : the solver's own record, its history included; of the best start.
+    build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver,
+        from all starts.
+    violations : what is not met, worst first.
+    objectives : what each of the problem's objectives comes to, by name, in its own unit.
+    attempts : what came of each start.
+    """
+
+    problem: ImpactProblem
+    result: SolverResult
+    solver: str
+    build_seconds: float
+    solve_seconds: float
+    violations: tuple[Violation, ...]
+    objectives: Mapping[str, float] = field(default_factory=dict)
+    attempts: tuple[Attempt, ...] = ()
+
+    @property
+    def status(self) -> Status:
+        return self.result.status
+
+    def outcome(self) -> dict[str, Any]:
+        """How the solve ended: what ``summary.json`` says even of a plan whose motion cannot be completed."""
+        return {
+            "status": self.status.value,
+            "message": self.result.message,
+            "solver": self.solver,
+            "iterations": self.result.iterations,
+            "solve_seconds": self.solve_seconds,
+            "build_seconds": self.build_seconds,
+            "max_violation": self.result.max_violation,
+            "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
+            "starts": [attempt.summary() for attempt in self.attempts],
+            "problem": self.problem.describe(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution(Solved):
+    """A solved (or stopped) impact problem.
+
+    plan : the motion; for a status that is not usable, that of the best iterate.
+    nodes : what its program had beside the ends and middles of its splines' intervals, as
+        :func:`impactopt.solve` adds them.
+    elements : of the contact's phases, fractions of them, where it took finer ones than the problem asks for;
+        () where not.
+    contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
+        without duration, and where nothing usable was found.
+    apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
+    """
+
+    plan: Plan
+    nodes: MoreNodes = NO_MORE
+    apart: Mapping[Any, Any] = field(default_factory=dict)
+    elements: Elements = ()
+    contact_error: ContactError | None = None
+
+    @property
+    def impulse(self) -> float:
+        """Planned impulse to the target [N s]."""
+        return self.plan.impulse
+
+    @property
+    def contact_elements(self) -> list[int]:
+        """How many each phase of the contact has; none of an impact without duration."""
+        if self.problem.collision != "dynamics":
+            return []
+        return [len(phase) for phase in self.elements or contact_elements(self.problem)]
+
+    @property
+    def contact_error_pct(self) -> float | None:
+        """Estimated error of the impulse [%]; None where there is no estimate, as an event is missed."""
+        error = self.contact_error
+        return error.pct if error is not None and np.isfinite(error.pct) else None
+
+    @property
+    def motion_price_pct(self) -> float:
+        """What the prices on motion, sole wrenches and a rest away from the start take of the objective [%].
+
+        They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
+        ``wrench_price`` and ``return_price``.  nan where the objectives are worth nothing, or not known.
+        """
+        if any(o.name not in self.objectives for o in self.problem.objectives):
+            return np.nan
+        worth = sum(
+            (-o.weight if o.cost else o.weight) * self.objectives[o.name] for o in self.problem.objectives
+        )
+        return 100 * (self.result.objective + worth) / abs(worth) if worth else np.nan
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The servo's reference, sampled."""
+        return self.plan.trajectory()
+
+    @cached_property
+    def missed_trajectory(self) -> Trajectory:
+        """The servo's reference if nothing is hit; InputError if the plan has no brake."""
+        return self.plan.trajectory(missed=True)
+
+    def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
+        """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
+
+        engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
+        ``validate``).  options : of the engine, such as ``step`` [s].
+
+        Raises
+        ------
+        InputError : an unknown engine or option.
+        """
+        from impactopt.simulation import simulate
+
+        if engine == "mujoco" and self.plan.brake is not None:
+            options.setdefault("missed", self.missed_trajectory)
+        return simulate(self.problem, self.trajectory, engine=engine, **options)
+
+    def animate(self, *, simulation: Any | None = None, replay: Any | None = None) -> Any:
+        """The motion in 3D, in a notebook or as a file: ``solution.animate().save("punch.html")``.
+
+        simulation, replay : as of :func:`impactopt.animate`.
+        """
+        # by the public name: pages come after solutions in the order of imports
+        from impactopt import animate
+
+        return animate(self, simulation=simulation, replay=replay)
+
+    def report(
+        self, path: str | PathLike[str], *, simulation: Any | None = None, replay: Any | None = None
+    ) -> Path:
+        """Write the page of `impactopt show`; simulation, replay : as of :func:`impactopt.animate`.
+
+        Raises
+        ------
+        InputError : it cannot be written, or its name does not end in .html.
+        """
+        from impactopt import report_page
+
+        return Path(report_page(self, simulation=simulation, replay=replay).save(path))
+
+    def plot(
+        self, what: str = "overview", *, simulation: Any | None = None, replay: Any | None = None
+    ) -> Any:
+        """Poses, contact force, ZMP and torque as one picture, or another one by name; a matplotlib figure.
+
+        what, simulation, replay : as of :func:`impactopt.plot`, such as ``solution.plot("strobe")``.
+        """
+        from impactopt import plot
+
+        return plot(self, what, simulation=simulation, replay=replay)
+
+    def clearance(self) -> dict[str, Any]:
+        """How far bodies are apart in the plan, and what touches what, by exact geometry at 1 ms: the keys
+        ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow
+        are among them, and say so.
+        """
+        problem, bodies = self.problem, self.problem.bodies
+        least, nearest, touches = np.inf, "", list[dict[str, Any]]()
+        for missed in (False, True) if self.plan.brake is not None else (False,):
+            motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
+            at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
+            found = bodies.survey(motion.time, at)
+            if found.clearance < least:
+                least, nearest = found.clearance, " and ".join(found.nearest)
+            for one, other, start, end, depth in found.touches:
+                touches.append(
+                    {"one": one, "other": other, "start_s": start, "end_s": end, "depth_mm": 1e3 * depth}
+                    | ({"missed": True} if missed else {})
+                )
+        return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": touches}
+
+    def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
+        """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
+        plan = self.plan
+        out: dict[str, Any] = {
+            **self.outcome(),
+            **blow_numbers(plan),
+            "objectives": dict(self.objectives),
+            "motion_price_pct": self.motion_price_pct,
+            "duration_s": plan.duration,
+            "nodes_added": self.nodes.total,
+            "collision_elements": self.contact_elements,
+            "collision_error_pct": self.contact_error_pct,
+            **plan.margins(self.trajectory),
+            **self.clearance(),
+            "versions": versions(),
+        }
+        known: dict[str, Any] = {
+            "torque_limit": self.problem.robot.torque_limit,
+            "polygon": plan.polygon,
+            "planned_impulse": plan.impulse,
+        }
+        if plan.scenarios:
+            limits = {name: known[name] for name in ("torque_limit", "polygon")}
+            out["scenarios"] = [scenario.summary(**limits) for scenario in plan.scenarios]
+        if simulation is not None:
+            out["simulated"] = simulation.summary(**known)
+        if replay is not None:
+            out["replayed"] = replay.report(**known)
+        return out
+
+
+def blow_numbers(hit: Plan | PlannedStrike) -> dict[str, Any]:
+    """What ``summary.json`` says of a planned blow; one without duration knows no force."""
+    duration = hit.compression + hit.restitution
+    return {
+        "impulse_Ns": hit.impulse,
+        "target": hit.collision.outcome,
+        "peak_force_N": float(hit.collision.force.max()) if duration > 0 else None,
+        "contact_ms": 1e3 * duration,
+        "hand_speed_m_s": hit.hand_speed,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what made the numbers."""
+    names = ("casadi", "pin", "numpy", "scipy", "osqp")
+    return {"impactopt": __version__, "python": platform.python_version(), **{n: version(n) for n in names}}

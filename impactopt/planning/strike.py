@@ -1,0 +1,136 @@
+"""The hardest blow by itself: the state at contact that no motion need reach."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import InputError, check_array
+from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near
+from impactopt.planning.multistart import Budget, Starts, check_starts, drawn, solve_from
+from impactopt.planning.solution import Solved, blow_numbers, versions
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Callback, SolverResult
+from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import block_functions
+
+Array = NDArray[np.float64]
+ROUNDS = 5  # of more rows between bodies
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StrikeSolution(Solved):
+    """A solved (or stopped) strike.
+
+    strike : posture and velocity at contact, and the blow; for a status that is not usable, of the best
+    iterate.  The rest: :class:`impactopt.planning.solution.Solved`.
+    """
+
+    strike: PlannedStrike
+
+    @property
+    def impulse(self) -> float:
+        """Planned impulse to the target [N s]: no motion from this local optimum brings more."""
+        return self.strike.impulse
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers of ``summary.json``."""
+        hit = self.strike
+        names = self.problem.robot.joint_names
+        angles = self.problem.robot.joint_positions(hit.posture)
+        return {
+            **self.outcome(),
+            **blow_numbers(hit),
+            "objectives": dict(self.objectives),
+            **hit.margins(),
+            "posture_rad": {name: float(a) for name, a in zip(names, angles, strict=True)},
+            "velocity_rad_s": {
+                name: float(v) for name, v in zip(names, hit.velocity[-len(names) :], strict=True)
+            },
+            "versions": versions(),
+        }
+
+
+def optimize_strike(
+    problem: ImpactProblem,
+    *,
+    solver: str = "sqp",
+    starts: int = 1,
+    seed: int = 0,
+    start: ArrayLike | None = None,
+    options: Mapping[str, Any] | None = None,
+    time_limit: float | None = None,
+    report: Callable[[str], None] | None = None,
+    callback: Callback | None = None,
+) -> StrikeSolution:
+    """Find the state at contact that hits hardest within the problem's terms, whatever leads to it.
+
+    What the robot does before and after is left open, so near a motion's state at contact the impulse of the
+    strike is a bound on the motion's. There are local optima, so different postures can differ by a factor.
+
+    solver, options, time_limit, report, callback : as of :func:`impactopt.solve`.
+    starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
+        drawn by ``seed``; the best strike is kept, ``StrikeSolution.attempts`` tells of all.
+    start (n,) : solver variables to start from instead, such as ``result.x`` of a neighbouring problem.
+
+    Raises
+    ------
+    InputError : unknown solver or option, a start of the wrong length, several of a given start, a problem
+        with objectives of a whole motion only.
+    """
+    budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
+    check_starts(starts, seed, given=start is not None)
+    if all(o.whole_motion for o in problem.objectives):
+        raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
+    began = time.perf_counter()
+    functions = block_functions(problem, problem.coordinates, report)
+    budget = budget.started()
+    t = StrikeTranscription(problem, problem.coordinates, functions)
+    given = None if start is None else check_array("start", start, (t.program.n,))
+    if report is not None:
+        report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
+    margins = Margins(problem) if problem.keeps_apart else None
+    t, fields = solve_from(
+        t, _starts(t, given, starts, seed), budget, began, partial(clear_strike, budget, margins)
+    )
+    return StrikeSolution(strike=t.decode(fields["result"].x), **fields)
+
+
+def clear_strike(
+    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
+) -> tuple[StrikeTranscription, SolverResult]:
+    """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
+    not.
+    """
+    x0 = start.x if isinstance(start, SolverResult) else start
+    if margins is None:
+        return t, budget.run(t.program, x0)
+    t = t.with_apart(rows_near(t, x0, margins, FAR))
+    result = budget.run(t.program, x0)
+    for _ in range(ROUNDS):
+        more = missing_rows(t, result.x, margins) if result.status.usable and budget.left != 0 else {}
+        if not more:
+            break
+        t = t.with_apart({**t.apart_rows, **more})
+        new = budget.run(t.program, result.x)
+        if not new.status.usable:
+            break
+        result = new
+    return t, result
+
+
+def _starts(t: StrikeTranscription, given: Array | None, starts: int, seed: int) -> Starts:
+    """Names of the starts, and what makes them."""
+    if given is not None:
+        yield "given", lambda: given
+        return
+    for k, draw in enumerate(drawn(starts, seed)):
+        yield f"reach {k + 1}", partial(strike_iterate, t, **draw)

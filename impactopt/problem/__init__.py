@@ -1,0 +1,4 @@
+"""What is asked: `ImpactProblem` with its scenarios, terms and objectives.
+
+A new term or objective begins here.
+"""

@@ -1,0 +1,111 @@
+"""What an `impactopt.ImpactProblem` refuses: parts that do not go together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
+from impactopt.contact.targets import FreeMass, RigidWall, Target
+from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.support import margin, support_polygon
+from impactopt.problem.terms import Term
+from impactopt.robots.robot import Robot
+
+__all__ = ["COLLISIONS", "check_apart", "check_at_rest", "check_collision", "check_names"]
+
+COLLISIONS = ("dynamics", "rigid", "virtual mass")
+MANY = 100  # scenarios or obstacles
+
+
+def check_apart(kind: str, names: Sequence[str]) -> None:
+    """InputError if there are too many things of a kind, or two of the same name."""
+    if len(names) > MANY:
+        raise InputError(
+            f"there are {len(names)} {kind}s; give at most {MANY}, each of which is part of the program"
+        )
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"two {kind}s are called {twice!r}: give each a name of its own")
+
+
+def check_at_rest(
+    robot: Robot, coordinates: StanceCoordinates, soles: Sequence[str], posture: NDArray[np.float64]
+) -> None:
+    """InputError if the posture's centre of mass is not above the held soles: it would fall at once."""
+    polygon = support_polygon(robot, coordinates)
+    if not len(polygon):
+        return
+    centre = np.array(pin.centerOfMass(robot.model, robot.model.createData(), posture))[:2]
+    inside = float(margin(polygon, centre[None])[0])
+    if inside < 0:
+        raise InputError(
+            f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm "
+            f"outside the support polygon of {', '.join(soles)}; start from a posture with its weight on "
+            "what is held, or hold more"
+        )
+
+
+def check_collision(problem: Any) -> None:
+    """InputError for a law, a target and a model of the collision that do not go together."""
+    for name, kind in (("law", ContactLaw), ("target", Target)):
+        thing = getattr(problem, name)
+        if not isinstance(thing, kind):
+            raise InputError(f"{name} must be a {kind.__name__} of impactopt.contact, not {thing!r}")
+    law = problem.law
+    rough = rough_at([lambda x, rate: law.branch(x, rate, True), lambda x, rate: law.branch(x, rate, False)])
+    if rough is not None:
+        raise InputError(
+            f"the law {type(law).__name__} has no finite force, slope or curvature at a penetration of "
+            f"{1e3 * rough:g} mm, where a plan's search passes: write its powers with "
+            "impactopt.contact.power, as power(x, 1.5)"
+        )
+    if problem.collision not in COLLISIONS:
+        near = did_you_mean(problem.collision, COLLISIONS)
+        raise InputError(f"unknown collision {problem.collision!r}{near}: there are {', '.join(COLLISIONS)}")
+    e = check_number("coefficient_of_restitution", problem.coefficient_of_restitution)
+    object.__setattr__(problem, "coefficient_of_restitution", e)
+    if not 0 <= e <= 1:
+        raise InputError(f"coefficient_of_restitution must be between 0 and 1, not {e}")
+    if e and problem.collision != "rigid":
+        raise InputError(
+            f'coefficient_of_restitution is for collision="rigid"; with {problem.collision!r} leave it out'
+        )
+    if problem.collision == "virtual mass" and not isinstance(problem.law, SpringDamper):
+        raise InputError(
+            'collision="virtual mass" has a closed form for the law SpringDamper only, not '
+            f"{type(problem.law).__name__}"
+        )
+    if problem.collision != "dynamics" and not isinstance(problem.target, (FreeMass, RigidWall)):
+        raise InputError(
+            f"collision={problem.collision!r} knows the targets FreeMass and RigidWall only, not "
+            f'{type(problem.target).__name__}; take collision="dynamics"'
+        )
+    if problem.collision == "dynamics":  # refuses what has switches
+        target = problem.target
+        target.smooth([0.0] * target.n_states, 0.0, 0)
+        if not target.turns and law.formula()[0] != law.formula()[1]:
+            raise InputError(
+                f"a plan for a {type(target).__name__} needs a law that is the same in compression and "
+                f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
+                "approach and part several times in a blow"
+            )
+
+
+def check_names(robot: Robot, term: Term) -> None:
+    """InputError for frames and joints of a term that the robot does not have."""
+    frames = [f.name for f in robot.model.frames]
+    wrong = [
+        f"{type(term).__name__}: {robot.name} has no {kind} {name!r}{did_you_mean(name, known)}"
+        for kind, names, known in (("frame", term.frames, frames), ("joint", term.joints, robot.joint_names))
+        for name in dict.fromkeys(names)
+        if name not in known
+    ]
+    if wrong:
+        raise InputError("\n".join(wrong), wrong)

@@ -1,0 +1,77 @@
+"""A problem as a short hash: the same for the same problem, however it was written down."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from impactopt.contact.custom import CustomLaw
+from impactopt.problem.terms import DEFAULT_TERMS
+from impactopt.robots.robot import Robot
+from impactopt.storage.hashing import canonical, model_hash
+
+__all__ = ["problem_hash"]
+
+DIGITS = 16  # 64 bits: two of a million problems share a hash once in 40 million times
+
+
+def problem_hash(problem: Any) -> str:
+    """Hexadecimal hash of all that shapes an `ImpactProblem`'s solution, the same in every process.
+
+    Names of the problem and the robot, the order of terms and objectives, postures that it does not start
+    from, and whether a default was given or left out make no difference. Numbers count to the last digit.
+    """
+    shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
+    own = {type(term): term for term in (*DEFAULT_TERMS, *problem.terms)}
+    shape |= {
+        "robot": _robot(problem.robot, problem.striker),
+        "law": _contact(problem.law),
+        "target": _contact(problem.target),
+        "start": problem.start_posture,
+        "terms": sorted(canonical(_plain(term)) for term in own.values()),
+        "objectives": sorted(canonical(_plain(objective)) for objective in problem.objectives),
+    }
+    return hashlib.sha256(canonical(_plain(shape)).encode()).hexdigest()[:DIGITS]
+
+
+def _robot(robot: Robot, striker: str) -> dict[str, Any]:
+    numbers = ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper")
+    hits = robot.striker(striker)
+    return {
+        "model": model_hash(robot.model),
+        **{name: getattr(robot, name) for name in numbers},
+        "soles": [(sole.name, sole.frame, sole.polygon) for sole in robot.soles],
+        "striker": (hits.frame, hits.point),
+        "disable_collisions": sorted(map(sorted, robot.disable_collisions)),
+    }
+
+
+def _contact(thing: Any) -> tuple[Any, ...]:
+    """A law or a target by its kind and numbers; one of a user's own by its formula too."""
+    kind = type(thing)
+    own = isinstance(thing, CustomLaw) or not kind.__module__.startswith("impactopt.contact.")
+    return kind.__name__, thing.parameters, thing.formula() if own else ()
+
+
+def _plain(item: Any) -> Any:
+    """An item in which equal numbers look the same: 5 and 5.0, 0.0 and -0.0, arrays and tuples."""
+    if isinstance(item, (np.ndarray, np.generic)):
+        item = item.tolist()
+    if isinstance(item, (bool, str)) or item is None:
+        return item
+    if isinstance(item, (int, float)):
+        return float(item) + 0.0
+    if isinstance(item, Mapping):
+        return {key: _plain(value) for key, value in item.items()}
+    if isinstance(item, (list, tuple)):
+        return tuple(map(_plain, item))
+    if dataclasses.is_dataclass(item):
+        fields = {f.name: _plain(getattr(item, f.name)) for f in dataclasses.fields(item)}
+        return type(item).__name__, fields
+    if hasattr(item, "__dict__") and not callable(item):  # a stance of a user's own, which is no dataclass
+        return type(item).__name__, _plain(vars(item))
+    raise TypeError(f"a problem holds {item!r}, which has no hash")

@@ -1,0 +1,390 @@
+"""The declarative problem: which robot hits what, where, and what it must respect meanwhile."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.bodies.clearance import Bodies
+from impactopt.bodies.shapes import Obstacle, TargetBody
+from impactopt.bodies.world import WorldBody, ground, obstacle_bodies, target_bodies
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
+from impactopt.errors import (
+    FARTHEST,
+    MOST,
+    InputError,
+    Mistakes,
+    check_array,
+    check_number,
+    check_whole,
+    raw_array,
+    shortened,
+)
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.stance import BothSoles, Stance
+from impactopt.problem.checks import COLLISIONS, check_apart, check_at_rest, check_collision, check_names
+from impactopt.problem.extra_terms import HandOrientation, HitCone
+from impactopt.problem.hashing import problem_hash
+from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import (
+    DEFAULT_TERMS,
+    Incidence,
+    KeepOut,
+    SelfCollision,
+    Term,
+    check_known,
+    kind_of,
+)
+from impactopt.robots.robot import Robot
+
+Array = NDArray[np.float64]
+__all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
+
+AnyTerm = TypeVar("AnyTerm", bound=Term)
+
+SHORTEST, LONGEST = 1e-3, 1e3  # [s] of a phase: no servo is faster, and no blow is prepared for longer
+FINEST = 2000  # intervals of a phase: nodes of a swing of 1 s come as often as a servo of 4 kHz samples
+STEEPEST = 1e3  # grading
+LONGEST_CONTACT = 100.0  # [s]
+MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """A phase of the motion: its duration and its spline.
+
+    ``duration`` [s] : (shortest, longest) or one number.  ``intervals`` : of the spline.
+    ``grading``: longest over shortest interval, the short ones at the contact. The program's nodes are the
+    intervals' ends and middles.
+    """
+
+    duration: tuple[float, float]
+    intervals: int = 12
+    grading: float = 3.0
+
+    def __post_init__(self) -> None:
+        one = raw_array("a phase's duration [s]", self.duration).ndim == 0
+        given: Any = (self.duration,) * 2 if one else self.duration
+        duration = check_array("a phase's duration [s]", given, (None,)).tolist()
+        if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
+            raise InputError(
+                f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
+                f"not {shortened(str(self.duration))}"
+            )
+        object.__setattr__(self, "duration", tuple(duration))
+        object.__setattr__(self, "grading", check_number("a phase's grading", self.grading))
+        if not 1 <= self.grading <= STEEPEST:
+            raise InputError(f"a phase's grading must be 1 to {STEEPEST:g}, not {self.grading:g}")
+        intervals = check_number("a phase's intervals", self.intervals)
+        if not 6 <= intervals <= FINEST or intervals != round(intervals):
+            raise InputError(
+                f"a phase needs 6 to {FINEST} spline intervals, a whole number, not "
+                f"{shortened(str(self.intervals))}"
+            )
+        object.__setattr__(self, "intervals", round(intervals))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImpactProblem:
+    """Maximize what ``robot`` does to ``target`` with ``striker``: by default the impulse.
+
+    Attributes
+    ----------
+    robot, striker : who hits, and with which of its strikers.
+    point (3,) [m] : where the striking point meets the target, world; the ground is z = 0 and the start
+        posture's soles are centred on the origin.
+    normal (3,) : unit vector of the blow, world: the target is pushed along it.
+    law, target : contact law and target. A plan breaks a `Board`, in compression; it drives a `Nail`
+        once, which stands again before the striker leaves it.
+    stance : which soles are held.
+    start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
+        configuration (nq,).
+    swing, follow : wind-up and strike; follow-through to rest.
+    contact_duration : bounds [s] of each of compression (until a nail stands) and restitution; what a break
+        or a start makes two of may each be shorter.
+    collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
+        sum to 1; those of compression before and after a break or a start. They are halved for a nail and a
+        board.
+    collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
+    collision : "dynamics", the whole equation of motion while the contact lasts; "rigid", an impact in no
+        time with ``coefficient_of_restitution`` (speed of separation over that of approach); "virtual mass",
+        the same with the restitution of two masses under the contact law. The last two know nothing of
+        torque, ZMP and servo during the impact: they are what others plan with, to compare.
+    scenarios : what else may be hit, or not, and has to be survived with the same swing.
+    body : what the target looks like, to all but the striking point.
+    obstacles : what else stands about, that nothing may touch.
+    terms : what must hold; those of DEFAULT_TERMS that are not given take their defaults.
+    objectives : what is maximized, a weighted sum.
+    smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
+        return_price: of ending away from the start posture [N s per rad^2]. They only make the optimum
+        unique, and its end natural.
+
+    Raises
+    ------
+    InputError : one message with all mistakes: a NaN, a wrong shape, an unknown striker or posture, a normal
+        that is not a unit vector, a start posture outside its limits or off the ground, a point out of reach.
+    """
+
+    robot: Robot
+    striker: str
+    point: Array
+    normal: Array
+    law: ContactLaw
+    target: Target
+    stance: Stance = field(default_factory=BothSoles)
+    start: str | Array = "half_sitting"
+    swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
+    follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
+    contact_duration: tuple[float, float] = (0.002, 0.2)
+    collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
+    collision_stages: int = 3
+    collision: str = "dynamics"
+    coefficient_of_restitution: float = 0.0
+    scenarios: tuple[Scenario, ...] = ()
+    body: TargetBody = field(default_factory=TargetBody)
+    obstacles: tuple[Obstacle, ...] = ()
+    terms: tuple[Term, ...] = ()
+    objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
+    smoothness: float = 1e-5
+    wrench_price: float = 1e-3
+    return_price: float = 0.1
+    name: str = "impact"
+
+    def __post_init__(self) -> None:
+        found = Mistakes()
+        hits = found.attempt(lambda: self.robot.striker(self.striker))
+        aimed = found.attempt(self._check_aim)
+        stands = found.attempt(self._check_stance) and found.attempt(self._check_start)
+        for check in (self._check_elements, self._check_prices, partial(check_collision, self)):
+            found.attempt(check)
+        if found.attempt(self._check_scenarios):
+            for scenario in self.scenarios:
+                found.attempt(partial(scenario.numbers, self.law, self.target))
+        found.attempt(self._check_world)
+        termed = found.attempt(self._check_terms)
+        if termed:
+            for term in self.terms:
+                found.attempt(partial(check_names, self.robot, term))
+        found.attempt(self._check_objectives)
+        if hits and aimed and stands and termed:
+            found.attempt(lambda: self.contact_posture)
+        found.raise_if_any("the problem")
+
+    def _check_aim(self) -> None:
+        object.__setattr__(self, "point", check_array("point [m]", self.point, (3,), most=FARTHEST))
+        normal = check_array("normal", self.normal, (3,))
+        if abs(np.linalg.norm(normal) - 1) > 1e-6:
+            length = float(np.linalg.norm(normal))
+            unit = f": did you mean {np.round(normal / length, 6).tolist()}?" if length > 0 else ""
+            raise InputError(f"normal must be a unit vector, its length is {length:.6g}{unit}")
+        object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
+
+    def _check_elements(self) -> None:
+        given: Any = self.collision_elements
+        given = given.tolist() if isinstance(given, np.ndarray) else given
+        if not isinstance(given, (list, tuple)) or len(given) != 2:
+            raise InputError(
+                "collision_elements are those of compression and those of restitution, two tuples, not "
+                f"{shortened(str(given))}"
+            )
+        elements = tuple(tuple(check_array("collision_elements", x, (None,)).tolist()) for x in given)
+        object.__setattr__(self, "collision_elements", elements)
+        stages = check_whole("collision_stages", self.collision_stages, least=2, most=3)
+        object.__setattr__(self, "collision_stages", stages)
+        for lengths in elements:
+            if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
+                raise InputError(
+                    f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
+                    f"{shortened(str(lengths))}"
+                )
+        lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,), most=LONGEST_CONTACT)
+        if not 0 < lo <= hi:
+            raise InputError(
+                f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
+            )
+
+    def _check_prices(self) -> None:
+        for name in ("smoothness", "wrench_price", "return_price"):
+            number = check_number(name, getattr(self, name))
+            object.__setattr__(self, name, number)
+            if not 0 <= number <= MOST:
+                raise InputError(f"{name} must be a number of 0 to {MOST:g}, not {getattr(self, name)}")
+
+    def _check_scenarios(self) -> None:
+        listed = isinstance(self.scenarios, (list, tuple))
+        if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
+            raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
+        object.__setattr__(self, "scenarios", tuple(self.scenarios))
+        if self.scenarios and self.collision != "dynamics":
+            raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
+        check_apart("scenario", [s.name for s in self.scenarios])
+
+    def _check_world(self) -> None:
+        if not isinstance(self.body, TargetBody):
+            raise InputError(f"body must be a TargetBody, not {self.body!r}")
+        if not isinstance(self.obstacles, (list, tuple)) or not all(
+            isinstance(o, Obstacle) for o in self.obstacles
+        ):
+            raise InputError(f"obstacles must be a tuple of Obstacle, not {self.obstacles!r}")
+        object.__setattr__(self, "obstacles", tuple(self.obstacles))
+        check_apart("obstacle", [o.name for o in self.obstacles])
+
+    def _check_stance(self) -> None:
+        if np.any(self.stance.compliance > 0):
+            raise InputError(
+                f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
+                "(base_mass, base_inertia), which is for collision models"
+            )
+        if self.stance.hand_frames(self.robot):
+            raise InputError(
+                f"a plan stands on soles only: give {type(self.stance).__name__} without hands, which are "
+                "for collision models"
+            )
+
+    def _check_terms(self) -> None:
+        listed = isinstance(self.terms, (list, tuple))
+        if not listed or not all(isinstance(t, Term) for t in self.terms):
+            raise InputError(f"terms must be a tuple of terms, such as (TorqueLimit(),), not {self.terms!r}")
+        check_known(self.terms, Term, "add_rows")
+        object.__setattr__(self, "terms", tuple(self.terms))
+        kinds = [kind_of(t, Term) for t in self.terms]
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise InputError(f"two terms of kind {kind.__name__}: give one")
+        if HitCone in kinds and Incidence in kinds:
+            raise InputError("HitCone takes the place of Incidence: give one of them")
+
+    def _check_objectives(self) -> None:
+        lasts, stands = self.collision == "dynamics", self.robot.floating
+        turns = not isinstance(self.target, Target) or self.target.turns
+        checked = check_objectives(self.objectives, contact=lasts, turns=turns, balance=stands)
+        object.__setattr__(self, "objectives", checked)
+
+    def _check_start(self) -> None:
+        posture = self.start_posture
+        self.robot.check_limits(posture, name="the start posture")
+        self.robot.check_stance(posture, self.stance.sole_names(self.robot))
+        check_at_rest(self.robot, self.coordinates, self.stance.sole_names(self.robot), posture)
+
+    @property
+    def brake_after(self) -> float | None:
+        """When after the planned contact [s] a robot that has felt nothing brakes; None: it feels nothing."""
+        return next((s.brake_after for s in self.scenarios if s.brake_after is not None), None)
+
+    def term(self, kind: type[AnyTerm]) -> AnyTerm:
+        """The term of a kind: the problem's own, or the default."""
+        for t in (*self.terms, *DEFAULT_TERMS):
+            if isinstance(t, kind):
+                return t
+        raise InputError(f"unknown kind of term {kind.__name__}")
+
+    def extra(self, kind: type[AnyTerm]) -> AnyTerm | None:
+        """The problem's own term of a kind that has no default; None if it has none."""
+        return next((t for t in self.terms if isinstance(t, kind)), None)
+
+    @cached_property
+    def hash(self) -> str:
+        """What this problem is, in 16 hexadecimal digits: see `impactopt.problem.hashing.problem_hash`."""
+        return problem_hash(self)
+
+    @cached_property
+    def start_posture(self) -> Array:
+        """pin configuration (nq,) of the start."""
+        if isinstance(self.start, str):
+            return np.array(self.robot.posture(self.start))
+        return self.robot.check_configuration(self.start, name="the start posture")
+
+    @cached_property
+    def coordinates(self) -> StanceCoordinates:
+        """Independent coordinates of the stance at the start posture."""
+        return StanceCoordinates(self.robot, self.stance.soles(self.robot), self.start_posture)
+
+    @cached_property
+    def contact_posture(self) -> Array:
+        """Some posture (nq,) with the striking point at ``point`` and the soles in place.
+
+        The hand has the orientation that is asked for, as nearly as may be.
+
+        Raises InputError if none is found: the point is out of reach.
+        """
+        given = self.coordinates, self.striker, self.point, self.start_posture
+        if (hand := self.extra(HandOrientation)) is not None:
+            direction = self.normal if hand.direction is None else np.array(hand.direction)
+            with suppress(InputError):
+                return reach(*given, facing=(np.array(hand.axis), direction))
+        return reach(*given)
+
+    @property
+    def self_collision(self) -> SelfCollision:
+        """Its term on its own links."""
+        return self.term(SelfCollision)
+
+    @property
+    def keep_out(self) -> KeepOut:
+        """Its term on the world."""
+        return self.term(KeepOut)
+
+    @property
+    def keeps_apart(self) -> bool:
+        """Whether any two bodies are not to touch."""
+        return self.self_collision.enabled or self.keep_out.enabled
+
+    @cached_property
+    def world(self) -> tuple[WorldBody, ...]:
+        """The bodies that are not the robot's: the ground, the target and what holds it, the obstacles."""
+        return (
+            ground(),
+            *target_bodies(self.body, self.target, self.point, self.normal),
+            *obstacle_bodies(self.obstacles),
+        )
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """All that can touch something: the robot's links and the world, and which pairs are not to.
+
+        Raises
+        ------
+        InputError : the start posture is in the target, in what holds it, or in an obstacle.
+        """
+        model = self.robot.model
+        soles = [model.getFrameId(sole.frame) for sole in self.stance.soles(self.robot)]
+        return Bodies(
+            self.robot,
+            self.world,
+            self.start_posture,
+            normal=self.normal,
+            striking=int(
+                model.frames[model.getFrameId(self.robot.striker(self.striker).model_frame)].parentJoint
+            ),
+            strict=self.keep_out.enabled,
+            standing=tuple(int(model.frames[k].parentJoint) for k in soles),
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """The problem in a few plain words and numbers, for reports."""
+        out: dict[str, Any] = {
+            "name": self.name,
+            "robot": self.robot.name,
+            "striker": self.striker,
+            "point_m": self.point.tolist(),
+            "normal": self.normal.tolist(),
+            "target": repr(self.target),
+            "law": repr(self.law),
+            "hash": self.hash,
+        }
+        if self.collision != "dynamics":
+            restitution = f", restitution {self.coefficient_of_restitution:g}"
+            out["collision"] = self.collision + (restitution if self.collision == "rigid" else "")
+        if self.scenarios:
+            out["scenarios"] = [str(s) for s in self.scenarios]
+        if self.objectives != DEFAULT_OBJECTIVES:
+            out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in self.objectives]
+        return out

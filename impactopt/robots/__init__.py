@@ -1,0 +1,4 @@
+"""`Robot`: how one is read from its files, checked and built, and the presets.
+
+Add a robot of the package in `presets`.
+"""

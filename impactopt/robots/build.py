@@ -1,0 +1,345 @@
+"""From files and values by joint to a `pin.Model` and arrays: what `Robot`'s constructors are made of."""
+
+from __future__ import annotations
+
+import contextlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+from xml.dom import expatbuilder
+from xml.parsers.expat import ExpatError
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
+from impactopt.robots.checks import HEAVIEST, check_frame
+from impactopt.robots.parts import Striker, Tool
+from impactopt.storage.files import is_plain_file
+
+Array = NDArray[np.float64]
+MANY = 100  # soles, strikers or tools
+# [kg m2] of moments of inertia, and relative: in a URDF decimals are rounded, and antennas are guessed
+_ROUNDED = 1e-6
+
+
+def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
+    """The model of a URDF, with an SRDF's reference configurations and rotors (as armature)."""
+    urdf = _existing(path, "URDF")
+    root = (pin.JointModelFreeFlyer(),) if floating else ()
+    try:
+        model = pin.buildModelFromUrdf(urdf, *root)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
+    _check_links(urdf)
+    if srdf is not None:
+        file = _existing(srdf, "SRDF")
+        try:
+            pin.loadReferenceConfigurations(model, file, False)
+            pin.loadRotorParameters(model, file, False)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"SRDF {file}: {error}") from error
+    return model
+
+
+def _check_links(urdf: str) -> None:
+    """InputError for a link that no matter is made of: what is fixed to another hides it in their sum.
+
+    Links without mass or inertia, as frames are, are none's trouble.
+    """
+    try:
+        # robots have tags of others with prefixes that no one declares: no trouble of theirs
+        root = expatbuilder.parse(urdf, namespaces=False).documentElement
+    except ExpatError as error:
+        raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+    for link in _children(root, "link"):
+        given = _children(link, "inertial")
+        masses = [mass for part in given for mass in _children(part, "mass")]
+        inertias = [inertia for part in given for inertia in _children(part, "inertia")]
+        if not masses or not inertias:
+            continue
+        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        entries = [_urdf_number(inertias[0].getAttribute(key)) for key in keys]
+        m, (xx, yy, zz, xy, xz, yz) = _urdf_number(masses[0].getAttribute("value")), entries
+        where = f"URDF {urdf}: the <inertial> of link {link.getAttribute('name')!r}"
+        numbers = np.array([m, *entries])
+        if not np.isfinite(numbers).all() or m < 0 or np.abs(numbers).max() > HEAVIEST:
+            raise InputError(
+                f"{where} has mass {m:g} kg and moments {xx:g}, {yy:g}, {zz:g} kg m2; give numbers from 0 to "
+                f"{HEAVIEST:g}"
+            )
+        least = float(np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))[0])
+        if least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
+            raise InputError(
+                f"{where} has a principal moment of inertia of {least:.3g} kg m2; correct its <inertia>, "
+                "which is about the centre of mass"
+            )
+
+
+def _children(element: Any, tag: str) -> list[Any]:
+    return [child for child in element.childNodes if getattr(child, "tagName", None) == tag]
+
+
+def _urdf_number(text: str) -> float:
+    """A number of a URDF; 0 for what its parser, which has read it before, has taken for none."""
+    try:
+        return float(text or 0.0)
+    except ValueError:
+        return 0.0
+
+
+def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
+    """The model without the locked joints, held at the given angles [rad] (0 for bare names)."""
+    if isinstance(locked, str):
+        raise InputError(
+            f"locked: give a list of joint names or a mapping to angles, not the text {locked!r}"
+        )
+    angles = dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
+    if not angles:
+        return model
+    names = joint_names(model)
+    for name in angles:
+        joint_index(names, name, "locked")
+    q = set_joints(model, pin.neutral(model), angles, "locked")
+    return pin.buildReducedModel(model, [model.getJointId(name) for name in angles], q)
+
+
+def is_floating(model: pin.Model) -> bool:
+    return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
+
+
+def joint_names(model: pin.Model) -> tuple[str, ...]:
+    """Names of the joints in the order of v, without the free-flyer."""
+    return tuple(str(name) for name in list(model.names)[2 if is_floating(model) else 1 :])
+
+
+def joint_index(names: Sequence[str], name: str, what: str) -> int:
+    if name not in names:
+        raise InputError(
+            f"{what}: no joint {name!r}{did_you_mean(name, names)}; joints are {', '.join(names)}"
+        )
+    return list(names).index(name)
+
+
+def per_joint(
+    what: str, value: float | Mapping[str, float] | ArrayLike | None, joints: Sequence[str], default: Array
+) -> Array:
+    """(n,) numbers: `default`, or one number for all, or a mapping by joint over it, or all given."""
+    result = np.array(default, dtype=np.float64)
+    if value is None:
+        return result
+    if isinstance(value, Mapping):
+        for name, number in value.items():
+            result[joint_index(joints, name, what)] = check_array(f"{what} of joint {name!r}", number, ())
+        return result
+    if raw_array(what, value).ndim == 0:
+        result[:] = check_array(what, value, ())
+        return result
+    return check_array(what, value, (len(joints),))
+
+
+def armature(
+    model: pin.Model,
+    joints: Sequence[str],
+    value: float | Mapping[str, float] | ArrayLike | None,
+    rotor: Mapping[str, tuple[float, float]],
+) -> Array:
+    """(n,) reflected rotor inertias [kg m2]: the model's, under those of `rotor`, under `value`."""
+    reflected = {}
+    for name, pair in rotor.items():
+        inertia, gear = check_array(f"rotor of joint {name!r} (inertia [kg m2], gear ratio)", pair, (2,))
+        reflected[name] = inertia * gear**2
+    own = np.array(model.armature[model.nv - len(joints) :], dtype=np.float64)
+    result = per_joint("armature", value, joints, per_joint("rotor", reflected, joints, own))
+    for name, number in zip(joints, result, strict=True):
+        if not 0 <= number <= HEAVIEST:
+            raise InputError(
+                f"armature of joint {name!r} is {number:g} kg m2; give rotor inertia x gear^2, "
+                f"0 to {HEAVIEST:g}"
+            )
+    return result
+
+
+def effort_limit(model: pin.Model) -> Array:
+    """(nv,) largest torques [N m]; renamed in Pinocchio 4."""
+    return np.array(model.upperEffortLimit if hasattr(model, "upperEffortLimit") else model.effortLimit)
+
+
+def velocity_limit(model: pin.Model) -> Array:
+    """(nv,) largest velocities [rad/s]; renamed in Pinocchio 4."""
+    return np.array(model.upperVelocityLimit if hasattr(model, "upperVelocityLimit") else model.velocityLimit)
+
+
+def position_limit(
+    model: pin.Model, joints: Sequence[str], value: Mapping[str, tuple[float, float]] | ArrayLike | None
+) -> tuple[Array, Array]:
+    """(n,) lower and upper joint positions [rad]; infinite for continuous joints unless given."""
+    limits = np.empty((len(joints), 2))
+    for row, joint in zip(limits, _joints(model), strict=True):
+        # Pinocchio bounds cosine and sine of a continuous joint by +-1.01
+        row[:] = (
+            (-np.inf, np.inf)
+            if joint.nq == 2
+            else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
+        )
+    if isinstance(value, Mapping):
+        for name, pair in value.items():
+            limits[joint_index(joints, name, "position_limit")] = check_array(
+                f"position_limit of joint {name!r} (lower, upper)", pair, (2,), finite=False
+            )
+    elif value is not None:
+        limits = check_array("position_limit", value, (len(joints), 2), finite=False)
+    return limits[:, 0].copy(), limits[:, 1].copy()
+
+
+def add_frame(model: pin.Model, name: str, parent: str, placement: Any, what: str) -> None:
+    """Add an OP_FRAME at `placement` (pin.SE3) in the frame `parent`."""
+    if model.existFrame(name):
+        raise InputError(
+            f"{what}: the model has a frame {name!r} already; choose another name, or leave out the parent"
+        )
+    above = check_frame(model, parent, what)
+    joint = model.frames[above].parentJoint
+    at = model.frames[above].placement * placement
+    model.addFrame(pin.Frame(name, joint, above, at, pin.FrameType.OP_FRAME))
+
+
+def add_striker(model: pin.Model, striker: Striker) -> None:
+    """Add the striker's frame, or move it when there is one."""
+    placement = pin.SE3(np.eye(3), striker.point)
+    if not model.existFrame(striker.model_frame):
+        add_frame(model, striker.model_frame, striker.frame, placement, f"striker {striker.name!r}")
+        return
+    above = model.frames[check_frame(model, striker.frame, f"striker {striker.name!r}")]
+    frame = model.frames[model.getFrameId(striker.model_frame)]
+    frame.parentJoint, frame.placement = above.parentJoint, above.placement * placement
+    frame.parentFrame = model.getFrameId(striker.frame)
+
+
+def add_tool(model: pin.Model, tool: Tool) -> None:
+    """Add the tool's mass to the link that holds it, and its striker's frame."""
+    frame = model.frames[check_frame(model, tool.frame, f"tool {tool.name!r}")]
+    if frame.parentJoint == 0:
+        raise InputError(
+            f"tool {tool.name!r}: no joint moves the frame {tool.frame!r}; give one of a link that moves"
+        )
+    body = pin.Inertia(tool.mass, tool.center, tool.inertia)
+    model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+    add_striker(model, tool.striker)
+
+
+def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Pairs of names of links; InputError for what is no pair, or no link."""
+    for pair in pairs:
+        if len(pair) != 2 or any(not isinstance(name, str) for name in pair):
+            raise InputError(f"disable_collisions: {pair!r} is no pair of links' names")
+        for name in pair:
+            check_frame(model, name, "disable_collisions")
+    return tuple((one, other) for one, other in pairs)
+
+
+def srdf_pairs(srdf: str | PathLike[str] | None) -> list[tuple[str, str]]:
+    """Pairs of links that an SRDF excludes from collisions.
+
+    Not those of the reason "Never", which an assistant has sampled: here they are looked at, which costs
+    little.
+    """
+    if srdf is None:
+        return []
+    try:
+        root = ElementTree.parse(fspath(srdf)).getroot()
+    except (OSError, ElementTree.ParseError):
+        return []
+    said = (e for e in root.findall("disable_collisions") if e.get("reason") != "Never")
+    return [(e.get("link1", ""), e.get("link2", "")) for e in said]
+
+
+def joint_positions(model: pin.Model, q: Array) -> Array:
+    """(n,) joint angles of a configuration."""
+    return np.array(
+        [
+            q[joint.idx_q] if joint.nq == 1 else np.arctan2(q[joint.idx_q + 1], q[joint.idx_q])
+            for joint in _joints(model)
+        ]
+    )
+
+
+def set_joints(model: pin.Model, q: Array, angles: Mapping[str, float], what: str) -> Array:
+    """A copy of the configuration with some joint angles set by name."""
+    q = np.array(q, dtype=np.float64)
+    names, joints = joint_names(model), _joints(model)
+    for name, value in angles.items():
+        joint = joints[joint_index(names, name, what)]
+        angle = float(check_array(f"{what}: joint {name!r}", value, ()))
+        q[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+    return q
+
+
+def reference_configurations(model: pin.Model) -> dict[str, Array]:
+    """The model's own named configurations (an SRDF's), with quaternions brought to unit norm."""
+    return {
+        str(entry.key()): pin.normalize(model, np.array(entry.data(), dtype=np.float64))
+        for entry in model.referenceConfigurations
+    }
+
+
+def lowest(model: pin.Model, q: Array, frames: Sequence[str], *, within: float = 0.01) -> list[str]:
+    """Those of the frames that are not higher than the lowest one by more than `within` [m]."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    heights = [float(data.oMf[check_frame(model, frame, "place")].translation[2]) for frame in frames]
+    return [frame for frame, z in zip(frames, heights, strict=True) if z <= min(heights) + within]
+
+
+def place(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
+    """The configuration with the mean of some frames at the origin, at yaw 0, by moving the free-flyer."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    poses = [data.oMf[check_frame(model, frame, "place")] for frame in frames]
+    forward = sum(pose.rotation[:2, 0] for pose in poses)
+    yaw = np.arctan2(forward[1], forward[0])
+    mean = np.mean([pose.translation for pose in poses], axis=0)
+    turn = pin.SE3(pin.utils.rotate("z", -yaw), np.zeros(3))
+    q = q.copy()
+    q[:7] = pin.SE3ToXYZQUAT(turn * pin.SE3(np.eye(3), -mean) * pin.XYZQUATToSE3(q[:7]))
+    return q
+
+
+def check_count(kind: str, things: Sequence[Any]) -> None:
+    """InputError if a robot has so many of them that it is none."""
+    if len(things) > MANY:
+        raise InputError(f"the robot has {len(things)} {kind}s; give at most {MANY}")
+
+
+def by_name(kind: str, things: Sequence[Any]) -> dict[str, Any]:
+    """The things by their names; InputError if two have the same."""
+    named = {thing.name: thing for thing in things}
+    if len(named) != len(things):
+        raise InputError(f"two {kind}s have the same name in {[thing.name for thing in things]}; rename one")
+    return named
+
+
+def pick(kind: str, name: str, options: Mapping[str, Any], robot: str) -> Any:
+    """The thing of that name, or an InputError that says what there is."""
+    if not isinstance(name, str) or name not in options:
+        known = ", ".join(map(repr, options)) or "none"
+        raise InputError(
+            f"robot {robot!r} has no {kind} {name!r}{did_you_mean(name, options)}; it has {known}"
+        )
+    return options[name]
+
+
+def _joints(model: pin.Model) -> list[Any]:
+    return list(model.joints)[2 if is_floating(model) else 1 :]
+
+
+def _existing(path: str | PathLike[str], kind: str) -> str:
+    file = Path(fspath(path))
+    with contextlib.suppress(RuntimeError):  # of a user that there is not
+        file = file.expanduser()
+    if not is_plain_file(file):
+        raise InputError(f"{kind} {shortened(str(file), 300)}: no such file")
+    return str(file)

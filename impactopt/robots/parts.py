@@ -1,0 +1,204 @@
+"""Soles, strikers and tools: the parts of a robot that touch the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import FARTHEST, InputError, check_array, raw_array
+from impactopt.robots import checks
+from impactopt.robots.checks import HEAVIEST
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sole:
+    """A flat, convex sole.
+
+    Attributes
+    ----------
+    name : what problems and messages call it.
+    frame : frame of the model at the sole: z up out of the ground, x forward.
+    polygon : (k, 2) corners [m] in the x-y plane of the frame, counter-clockwise seen from above, convex.
+    parent, placement : for a model without that frame: it is added at `placement` (pin.SE3) in the frame
+        `parent`.
+    """
+
+    name: str
+    frame: str
+    polygon: Array
+    parent: str | None = None
+    placement: Any = None
+
+    def __post_init__(self) -> None:
+        polygon = check_array(f"sole {self.name!r}: polygon [m]", self.polygon, (None, 2), most=FARTHEST)
+        checks.check_polygon(self.name, polygon)
+        object.__setattr__(self, "polygon", read_only(polygon))
+        if (self.parent is None) != (self.placement is None):
+            raise InputError(f"sole {self.name!r}: give parent and placement together, or neither")
+        if self.placement is not None:
+            check_array(f"sole {self.name!r}: placement [m]", self.placement.translation, (3,), most=FARTHEST)
+
+    @classmethod
+    def box(
+        cls,
+        *,
+        name: str,
+        frame: str,
+        length: float,
+        width: float,
+        center: ArrayLike = (0.0, 0.0),
+        **kwargs: Any,
+    ) -> Sole:
+        """A rectangle, `length` [m] along x and `width` [m] along y, about `center` (2,) [m]."""
+        half = np.array([length, width]) / 2
+        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half + np.asarray(center)
+        return cls(name=name, frame=frame, polygon=corners, **kwargs)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Striker:
+    """The point that hits: `point` (3,) [m] in the model's frame `frame`."""
+
+    name: str
+    frame: str
+    point: Array
+
+    def __post_init__(self) -> None:
+        point = check_array(f"striker {self.name!r}: point [m]", self.point, (3,), most=FARTHEST)
+        object.__setattr__(self, "point", read_only(point))
+
+    @property
+    def model_frame(self) -> str:
+        """Name of the frame that the robot's model has at this point."""
+        return f"striker:{self.name}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tool:
+    """A rigid body that a link holds firmly, and the point of it that hits. All in the model's frame `frame`.
+
+    Attributes
+    ----------
+    name : of the tool, and of the striker that it makes.
+    frame : frame of the model at the link that holds it.
+    mass [kg], center (3,) [m] : its centre of mass; inertia (3, 3) [kg m2] : about that, in the axes of
+        `frame`; three numbers are its diagonal.
+    head (3,) [m] : the point that hits.
+
+    Raises
+    ------
+    InputError : a mass that is not positive, an inertia that is not symmetric or negative. Whether it is one
+        of matter is checked with the link, by `Robot.with_tool`.
+    """
+
+    name: str
+    frame: str
+    mass: float
+    center: Array
+    inertia: Array
+    head: Array
+
+    def __post_init__(self) -> None:
+        what = f"tool {self.name!r}"
+        if not check_array(f"{what}: mass [kg]", self.mass, (), most=HEAVIEST) > 0:
+            raise InputError(f"{what}: mass is {self.mass:g} kg; give a number > 0")
+        inertia = raw_array(f"{what}: inertia [kg m2]", self.inertia)
+        inertia = check_array(
+            f"{what}: inertia [kg m2]",
+            np.diag(inertia) if inertia.shape == (3,) else inertia,
+            (3, 3),
+            most=HEAVIEST,
+        )
+        if not np.allclose(inertia, inertia.T, rtol=0, atol=1e-12):
+            raise InputError(f"{what}: its inertia is not symmetric; give the same number on both sides")
+        least = float(np.linalg.eigvalsh(inertia)[0])
+        if least < 0:
+            raise InputError(
+                f"{what}: its inertia has the principal moment {least:.3g} kg m2; give that of a body, >= 0"
+            )
+        object.__setattr__(self, "inertia", read_only(inertia))
+        for part in ("center", "head"):
+            point = check_array(f"{what}: {part} [m]", getattr(self, part), (3,), most=FARTHEST)
+            object.__setattr__(self, part, read_only(point))
+
+    @classmethod
+    def hammer(
+        cls,
+        *,
+        frame: str,
+        name: str = "hammer",
+        grip: ArrayLike = (0.0, 0.0, 0.0),
+        handle: ArrayLike = (0.0, 0.0, 1.0),
+        face: ArrayLike = (1.0, 0.0, 0.0),
+        length: float = 0.25,
+        handle_mass: float = 0.15,
+        head_mass: float = 0.5,
+        head_length: float = 0.1,
+        head_width: float = 0.03,
+    ) -> Tool:
+        """A thin rod with a square bar across its end; it hits with one end of the bar.
+
+        grip (3,) [m] : where the rod begins.  handle, face : the ways that the rod points and that the bar's
+        striking end looks, unit vectors at right angles.  length, head_length, head_width [m]; masses [kg].
+        """
+        rod = check_array("hammer: handle", handle, (3,))
+        bar = check_array("hammer: face", face, (3,))
+        if not np.allclose([rod @ rod, bar @ bar, rod @ bar], [1, 1, 0], rtol=0, atol=1e-9):
+            raise InputError(f"hammer: handle {rod} and face {bar} are no unit vectors at right angles")
+        along, across = np.outer(rod, rod), np.outer(bar, bar)
+        start = check_array("hammer: grip [m]", grip, (3,))
+        end = start + length * rod
+        parts = (
+            (handle_mass, start + length / 2 * rod, length**2 / 12 * (np.eye(3) - along)),
+            (
+                head_mass,
+                end,
+                head_length**2 / 12 * (np.eye(3) - across) + head_width**2 / 12 * (np.eye(3) + across),
+            ),
+        )
+        whole = sum((pin.Inertia(m, at, m * gyration) for m, at, gyration in parts), pin.Inertia.Zero())
+        return cls(
+            name=name,
+            frame=frame,
+            mass=float(whole.mass),
+            center=np.array(whole.lever),
+            inertia=np.array(whole.inertia),
+            head=end + head_length / 2 * bar,
+        )
+
+    @property
+    def striker(self) -> Striker:
+        """The striker that the tool makes of the link which holds it."""
+        return Striker(name=self.name, frame=self.frame, point=self.head)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Source:
+    """What a robot was made from, so that a problem file can name it.
+
+    Attributes
+    ----------
+    preset : name of one, or None.
+    urdf : path of a URDF, or None.
+    options : what else was given: to the preset, or to `Robot.from_urdf`.
+    tools : what the robot was given to hold after that.
+    """
+
+    preset: str | None = None
+    urdf: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    tools: tuple[Tool, ...] = ()
+
+
+def read_only(array: ArrayLike) -> Array:
+    """A float64 copy that cannot be written to."""
+    copy = np.array(array, dtype=np.float64)
+    copy.flags.writeable = False
+    return copy

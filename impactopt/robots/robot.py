@@ -1,0 +1,319 @@
+"""`Robot`: a Pinocchio model with what a URDF lacks: armature, servo, limits, soles, strikers, postures."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike, fspath
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.errors import InputError, check_array
+from impactopt.robots import build, checks
+from impactopt.robots.parts import Sole, Source, Striker, Tool, read_only
+
+__all__ = ["Robot", "Sole", "Striker", "Tool"]
+
+Array = NDArray[np.float64]
+PerJoint = float | Mapping[str, float] | ArrayLike | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Robot:
+    """A robot ready to strike; checked when built. Arrays are read-only; `dataclasses.replace` makes a
+    changed copy.
+
+    Arrays of length n run over the joints without the free-flyer, in the order of Pinocchio's v. Units are
+    those of revolute joints; for a prismatic joint read m, m/s, N, kg.
+
+    Attributes
+    ----------
+    name : of the robot.
+    model : pin.Model with locked joints removed, armature set, and an OP_FRAME per striker and added sole.
+    kp, kd : (n,) servo stiffness [N m/rad] and damping [N m s/rad].
+    torque_limit, velocity_limit : (n,) [N m], [rad/s], largest magnitudes.
+    lower, upper : (n,) position limits [rad]; infinite for a continuous joint.
+    soles : flat feet, in a fixed order.
+    strikers : by name.
+    postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
+        the mean of the soles it stands on is at the origin of the ground, at yaw 0 (`place`).
+    disable_collisions : pairs of links that may pass through each other: an SRDF's, and one's own.
+    tools : what it holds.
+    source : what it was made from, None where that was a model in Python.
+    urdf : file whose visual shapes a picture shows, None for simple ones.
+
+    Raises
+    ------
+    InputError : naming the link, joint or frame and the mend: non-physical inertias; limits that are missing,
+        zero or crossed; joints with several degrees of freedom; gains too fast for the inertia they act on;
+        postures outside the limits; unknown frames.
+    """
+
+    name: str
+    model: pin.Model
+    kp: Array
+    kd: Array
+    torque_limit: Array
+    velocity_limit: Array
+    lower: Array
+    upper: Array
+    soles: tuple[Sole, ...] = ()
+    strikers: Mapping[str, Striker] = field(default_factory=dict)
+    postures: Mapping[str, Array] = field(default_factory=dict)
+    disable_collisions: tuple[tuple[str, str], ...] = ()
+    tools: tuple[Tool, ...] = ()
+    source: Source | None = None
+    urdf: str | None = None
+
+    def __post_init__(self) -> None:
+        checks.check_joint_types(self.model)
+        checks.check_joints(self.joint_names, self.name)
+        for name in ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper"):
+            value = check_array(f"{name} of {self.name!r}", getattr(self, name), (self.n,), finite=False)
+            object.__setattr__(self, name, read_only(value))
+        object.__setattr__(self, "soles", tuple(self.soles))
+        object.__setattr__(self, "strikers", dict(self.strikers))
+        checks.check_inertias(self.model)
+        checks.check_limits(self.joint_names, self.torque_limit, self.velocity_limit, self.lower, self.upper)
+        for sole in self.soles:
+            checks.check_frame(self.model, sole.frame, f"sole {sole.name!r}")
+        for striker in self.strikers.values():
+            checks.check_frame(
+                self.model, striker.model_frame, f"striker {striker.name!r} (see Robot.with_striker)"
+            )
+        postures = {}
+        for name, q in self.postures.items():
+            posture = self.check_configuration(q, name=f"posture {name!r}")
+            self.check_limits(posture, name=f"posture {name!r}")
+            postures[name] = read_only(posture)
+        object.__setattr__(self, "postures", postures)
+        at = [pin.neutral(self.model), *postures.values()]
+        checks.check_gains(self.model, self.joint_names, self.kp, self.kd, at)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | PathLike[str],
+        *,
+        srdf: str | PathLike[str] | None = None,
+        name: str | None = None,
+        floating: bool = True,
+        locked: Iterable[str] | Mapping[str, float] = (),
+        **options: Any,
+    ) -> Robot:
+        """A robot from its URDF, and its SRDF's named postures and rotors when there is one.
+
+        Parameters
+        ----------
+        path, srdf : the files. Meshes are read by who draws the robot only.
+        name : the URDF's own name when left out.
+        floating : with a free-flyer at the root; else the root link is fixed to the world.
+        locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
+        options : as of `from_model`.
+        """
+        model = build.read_urdf(path, srdf, floating=floating)
+        model = build.lock_joints(model, locked)
+        robot = cls.from_model(model, name=name or model.name, **{"urdf": path, **options})
+        pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
+        robot = dataclasses.replace(robot, disable_collisions=pairs)
+        given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, **options}
+        return dataclasses.replace(robot, source=Source(urdf=fspath(path), options=given))
+
+    @classmethod
+    def from_model(
+        cls,
+        model: pin.Model,
+        *,
+        name: str | None = None,
+        armature: PerJoint = None,
+        rotor: Mapping[str, tuple[float, float]] | None = None,
+        kp: PerJoint = None,
+        kd: PerJoint = None,
+        torque_limit: PerJoint = None,
+        velocity_limit: PerJoint = None,
+        position_limit: Mapping[str, tuple[float, float]] | ArrayLike | None = None,
+        soles: Sequence[Sole] = (),
+        strikers: Sequence[Striker] = (),
+        postures: Mapping[str, Mapping[str, float] | ArrayLike] | None = None,
+        disable_collisions: Sequence[tuple[str, str]] = (),
+        urdf: str | PathLike[str] | None = None,
+    ) -> Robot:
+        """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
+
+        Values by joint are one number for all joints, a mapping from joint names, or (n,) numbers; joints
+        that a mapping leaves out keep the default.
+
+        Parameters
+        ----------
+        armature : reflected rotor inertia [kg m2]; default the model's own (an SRDF's rotors).
+        rotor : (rotor inertia [kg m2], gear ratio) by joint: armature = inertia x ratio^2. `armature` wins
+            over it.
+        kd : servo damping [N m s/rad]; default 1.5 s/rad times the torque limit, but at most 150.
+        kp : servo stiffness [N m/rad]; default 30 1/s times kd.
+        torque_limit, velocity_limit : default the model's.
+        position_limit : (lower, upper) [rad] by joint, or (n, 2); default the model's.
+        soles, strikers : as they are.
+        postures : by name: (nq,) configurations, or joint angles [rad] by name on top of the model's posture
+            of that name (an SRDF's), or else of zero. The model's other postures are kept.
+        disable_collisions : pairs of links that may pass through each other.
+        urdf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
+        """
+        build.check_count("sole", soles)
+        build.check_count("striker", strikers)
+        model = model.copy()
+        checks.check_joint_types(model)
+        joints = build.joint_names(model)
+        base = model.nv - len(joints)
+        model.armature[base:] = build.armature(model, joints, armature, rotor or {})
+        limit = build.per_joint("torque_limit", torque_limit, joints, build.effort_limit(model)[base:])
+        speed = build.per_joint("velocity_limit", velocity_limit, joints, build.velocity_limit(model)[base:])
+        lower, upper = build.position_limit(model, joints, position_limit)
+        damping = build.per_joint("kd", kd, joints, np.minimum(150.0, 1.5 * limit))
+        for sole in soles:
+            if sole.parent is not None:
+                build.add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
+        for striker in strikers:
+            build.add_striker(model, striker)
+        robot = cls(
+            name=name or model.name,
+            model=model,
+            kp=build.per_joint("kp", kp, joints, 30.0 * damping),
+            kd=damping,
+            torque_limit=limit,
+            velocity_limit=speed,
+            lower=lower,
+            upper=upper,
+            soles=tuple(soles),
+            strikers=build.by_name("striker", strikers),
+            disable_collisions=build.link_pairs(model, disable_collisions),
+            urdf=None if urdf is None else str(urdf),
+        )
+        build.by_name("sole", soles)
+        return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))
+
+    @property
+    def floating(self) -> bool:
+        """Whether the root is a free-flyer."""
+        return build.is_floating(self.model)
+
+    @property
+    def n(self) -> int:
+        """Number of joints, the free-flyer left out."""
+        return int(self.model.nv) - (6 if self.floating else 0)
+
+    @property
+    def nq(self) -> int:
+        return int(self.model.nq)
+
+    @property
+    def nv(self) -> int:
+        return int(self.model.nv)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return build.joint_names(self.model)
+
+    @property
+    def armature(self) -> Array:
+        """(n,) reflected rotor inertia [kg m2]; it lives in `model.armature`."""
+        return read_only(np.array(self.model.armature[self.nv - self.n :], dtype=np.float64))
+
+    def joint_index(self, name: str) -> int:
+        """Index of a joint in arrays of length n."""
+        return build.joint_index(self.joint_names, name, f"robot {self.name!r}")
+
+    def limb(self, frame: str) -> tuple[int, ...]:
+        """Indices (into arrays of length n) of the joints from the root to a frame."""
+        parent = self.model.frames[checks.check_frame(self.model, frame, f"robot {self.name!r}")].parentJoint
+        base = self.nv - self.n
+        first = 2 if self.floating else 1
+        return tuple(
+            int(self.model.joints[j].idx_v) - base for j in self.model.supports[parent] if j >= first
+        )
+
+    def striker(self, name: str) -> Striker:
+        return build.pick("striker", name, self.strikers, self.name)
+
+    def sole(self, name: str) -> Sole:
+        return build.pick("sole", name, {sole.name: sole for sole in self.soles}, self.name)
+
+    def posture(self, name: str) -> Array:
+        """A named configuration, (nq,), as a copy."""
+        return build.pick("posture", name, self.postures, self.name).copy()
+
+    def with_striker(self, striker: Striker) -> Robot:
+        """A copy of the robot that has `striker` too (or instead of its own one of that name)."""
+        model = self.model.copy()
+        build.add_striker(model, striker)
+        return dataclasses.replace(self, model=model, strikers={**self.strikers, striker.name: striker})
+
+    def with_tool(self, tool: Tool) -> Robot:
+        """A copy of the robot that holds `tool`: its mass on the link, and a striker of its name."""
+        if tool.name in self.strikers:
+            raise InputError(f"robot {self.name!r} has a striker {tool.name!r} already; rename the tool")
+        model = self.model.copy()
+        build.add_tool(model, tool)
+        source = self.source and dataclasses.replace(self.source, tools=(*self.source.tools, tool))
+        strikers = {**self.strikers, tool.name: tool.striker}
+        tools = (*self.tools, tool)
+        return dataclasses.replace(self, model=model, strikers=strikers, source=source, tools=tools)
+
+    def joint_positions(self, q: ArrayLike) -> Array:
+        """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""
+        return build.joint_positions(self.model, check_array("q", q, (self.nq,), finite=False))
+
+    def place(self, q: ArrayLike, soles: Sequence[Sole] | None = None) -> Array:
+        """The configuration with the base moved: mean of the soles at the origin of the ground, at yaw 0.
+
+        Roll and pitch of the base stay as they are. `soles` are those that it stands on; when left out, those
+        of the robot's own that are not higher than its lowest one by more than a centimetre.
+        """
+        q = self.check_configuration(q)
+        frames = [sole.frame for sole in (self.soles if soles is None else soles)]
+        if not self.floating or not frames:
+            return q
+        return build.place(self.model, q, build.lowest(self.model, q, frames) if soles is None else frames)
+
+    def check_configuration(self, q: ArrayLike, *, name: str = "q") -> Array:
+        """`q` as a float64 copy (nq,); InputError for another shape, NaN, or a quaternion not of norm 1."""
+        return checks.check_configuration(self.model, q, name)
+
+    def check_velocity(self, v: ArrayLike, *, name: str = "v") -> Array:
+        """`v` as a float64 copy (nv,); InputError if its shape is wrong or it has NaN."""
+        return check_array(name, v, (self.nv,))
+
+    def check_limits(self, q: ArrayLike, *, name: str = "q") -> None:
+        """InputError unless all joints of the configuration are inside their position limits."""
+        checks.check_positions(self.joint_names, self.joint_positions(q), self.lower, self.upper, name)
+
+    def check_stance(
+        self,
+        q: ArrayLike,
+        soles: Sequence[Sole | str] | None = None,
+        *,
+        height: float = 1e-3,
+        tilt: float = 1e-3,
+    ) -> None:
+        """InputError unless the soles lie flat on the ground, z = 0, within `height` [m] and `tilt` [rad].
+
+        `soles` are the robot's own, or some of them, or their names.
+        """
+        q = self.check_configuration(q)
+        chosen = self.soles if soles is None else [self.sole(s) if isinstance(s, str) else s for s in soles]
+        checks.check_stance(self.model, q, [(sole.name, sole.frame) for sole in chosen], height, tilt)
+
+    def _read_postures(self, given: Mapping[str, Mapping[str, float] | ArrayLike]) -> dict[str, Array]:
+        found = build.reference_configurations(self.model)
+        postures = dict(found)
+        for name, value in given.items():
+            what = f"posture {name!r}"
+            if isinstance(value, Mapping):
+                start = found.get(name, pin.neutral(self.model))
+                postures[name] = build.set_joints(self.model, start, value, what)
+            else:
+                postures[name] = checks.check_configuration(self.model, value, what)
+        return {name: self.place(q) for name, q in postures.items()}

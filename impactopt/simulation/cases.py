@@ -1,0 +1,338 @@
+"""Situations in which collision models are compared: postures of a given effective mass, and velocities.
+
+The paper's nine motions are three postures, whose virtual masses are 4, 6 and 8 kg, at three speeds (its
+Table I). It does not give the postures; `posture_of_effective_mass` finds some by optimization.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+
+from impactopt.collision import Collision, CollisionModel, effective_mass
+from impactopt.errors import MOST, InputError, check_array
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.stance import BothSoles, Stance, usual_stance
+from impactopt.kinematics.support import margin as margin_in
+from impactopt.kinematics.support import support_polygon
+from impactopt.robots.robot import Robot
+from impactopt.simulation.reference import holding_torque
+
+__all__ = [
+    "PAPER_MASSES",
+    "PAPER_SPEEDS",
+    "Case",
+    "errors_against",
+    "paper_motions",
+    "posture_of_effective_mass",
+    "striking_velocity",
+]
+
+Array = NDArray[np.float64]
+
+PAPER_MASSES = {"A": 4.0, "B": 6.0, "C": 8.0}  # [kg] by the motions' letters (paper, Table I)
+PAPER_SPEEDS = (0.4, 0.7, 1.0)  # [m/s] of the motions 1, 2, 3
+LEAST_WEIGHT = 50.0  # [N] on the ground; with less the ZMP is a quotient of small numbers
+_MASS_TOLERANCE = 1e-6  # [kg]
+_AXES = pin.LOCAL_WORLD_ALIGNED
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Case:
+    """A robot at the moment of contact.
+
+    Attributes
+    ----------
+    robot : what strikes.
+    name : of the motion, such as "A-1".
+    striker : name of the robot's striking point.
+    normal : (3,) unit vector along the blow, world axes.
+    q, v : (nq), (nv) at contact, Pinocchio's.
+    torque : (n) [N m] feed-forward.
+    effective_mass : [kg] along the normal.
+    speed : [m/s] of the striking point along the normal.
+    overrides : numbers of the collision other than the model's, by name, as of `CollisionModel.collide`; of
+        those, a model is given the ones that it has.
+    """
+
+    robot: Robot
+    name: str
+    striker: str
+    normal: Array
+    q: Array
+    v: Array
+    torque: Array
+    effective_mass: float
+    speed: float
+    overrides: Mapping[str, ArrayLike] = field(default_factory=dict)
+
+    def collide(self, model: CollisionModel, *, require_separation: bool = False) -> Collision:
+        """What a model says of it; a contact may outlast the horizon.
+
+        Raises
+        ------
+        InputError : as of `CollisionModel.collide`.
+        """
+        # a point mass has no servo, and the paper's SDC no stiffness
+        known = getattr(model, "settings", self.overrides)
+        given = {name: value for name, value in self.overrides.items() if name in known}
+        return model.collide(self.q, self.v, self.torque, require_separation=require_separation, **given)
+
+
+def paper_motions(
+    robot: Robot,
+    *,
+    striker: str = "right_hand",
+    normal: ArrayLike = (1.0, 0.0, 0.0),
+    masses: Mapping[str, float] = PAPER_MASSES,
+    speeds: Sequence[float] = PAPER_SPEEDS,
+) -> list[Case]:
+    """The paper's nine motions, A-1 to C-3 (its Table I), on a robot that stands on both soles.
+
+    Velocities are those of `striking_velocity`, torques those of `holding_torque`.
+
+    Raises
+    ------
+    InputError : as of `posture_of_effective_mass` and `striking_velocity`.
+    """
+    n, stance = check_array("normal", normal, (3,)), BothSoles()
+    mass = effective_mass(robot, striker=striker, normal=n, stance=stance)
+    postures = {
+        letter: posture_of_effective_mass(robot, wanted, striker, n, stance=stance)
+        for letter, wanted in masses.items()
+    }
+    cases = []
+    for (letter, q), (k, speed) in product(postures.items(), enumerate(speeds, 1)):
+        v = striking_velocity(robot, q, striker, n, speed, stance=stance)
+        cases.append(
+            Case(
+                robot=robot,
+                name=f"{letter}-{k}",
+                striker=striker,
+                normal=n,
+                q=q,
+                v=v,
+                torque=holding_torque(robot, q, v, stance=stance),
+                effective_mass=float(mass(q)),
+                speed=float(speed),
+            )
+        )
+    return cases
+
+
+# ---------------------------------------------------------------- velocity
+def striking_velocity(
+    robot: Robot,
+    q: ArrayLike,
+    striker: str,
+    normal: ArrayLike,
+    speed: float,
+    *,
+    stance: Stance | None = None,
+) -> Array:
+    """Velocity (nv) of least kinetic energy with the striking point at `speed` [m/s] along the normal.
+
+    What the stance holds (None: all soles, or the fixed base) is at rest, and so is the striking point across
+    the normal (3,); its rotation is free. The least energy makes heavy links move little, whatever the
+    joints' units.
+
+    Raises
+    ------
+    InputError : wrong shapes or NaN; an unknown striker; a stance the robot cannot take; a posture in which
+        the striking point cannot move like that.
+    """
+    q, n = robot.check_configuration(q), check_array("normal", normal, (3,), most=MOST)
+    speed = float(check_array("speed [m/s]", speed, (), most=MOST))
+    held_by = usual_stance(robot) if stance is None else stance
+    model, data = robot.model, robot.model.createData()
+    H = np.array(pin.crba(model, data, q))
+    H = np.triu(H) + np.triu(H, 1).T
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+
+    def jacobian(frame: str) -> Array:
+        J = pin.getFrameJacobian(model, data, model.getFrameId(frame), _AXES)
+        return np.reshape(J, (6, model.nv))
+
+    rows = [jacobian(frame) for frame in held_by.constraint_frames(robot)]
+    J = np.vstack([*rows, jacobian(robot.striker(striker).model_frame)[:3]])
+    wanted = np.concatenate([np.zeros(6 * len(rows)), float(speed) * n])
+    # v = H^-1 J' x; least squares, as a robot of few joints has rows that depend on each other
+    spread = np.linalg.solve(H, J.T)
+    v = spread @ np.linalg.lstsq(J @ spread, wanted, rcond=1e-12)[0]
+    off = float(np.abs(J @ v - wanted).max())
+    if not off <= 1e-6 * max(1.0, abs(speed)):
+        raise InputError(
+            f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with what is held at rest (off "
+            f"by {off:.2g} m/s): choose another posture"
+        )
+    return np.array(v)
+
+
+# ---------------------------------------------------------------- posture
+def posture_of_effective_mass(
+    robot: Robot,
+    mass: float,
+    striker: str,
+    normal: ArrayLike,
+    *,
+    stance: Stance | None = None,
+    start: ArrayLike | None = None,
+    inside: float = 0.06,
+) -> Array:
+    """A configuration (nq,) whose effective mass at the striking point is `mass` [kg], within 1e-6 kg.
+
+    The one found nearest to `start` (None: the posture half_sitting) by SLSQP, in the sum of squares of what
+    the joints move [rad], with held soles where they are, joints inside their limits by 0.02 rad, and the
+    centre of mass over the soles, `inside` [m] from their edge. Deterministic.
+
+    Raises
+    ------
+    InputError : a mass that is not positive; an unknown striker; a stance the robot cannot take; no such
+        posture found (with the nearest mass).
+    """
+    if not check_array("mass [kg]", mass, ()) > 0:
+        raise InputError(f"mass [kg]: {mass:g}; give a number > 0")
+    if start is None and "half_sitting" not in robot.postures:
+        raise InputError(f"robot {robot.name!r} has no posture half_sitting; give start=")
+    q0 = robot.posture("half_sitting") if start is None else robot.check_configuration(start, name="start")
+    search = _PostureSearch(robot, float(mass), striker, normal, stance, q0, inside)
+    d, off = np.zeros(robot.nv), np.inf
+    for _ in range(4):  # SLSQP gives up early where its estimate of curvature is off; from there it goes on
+        d = search.from_here(d)
+        off = search.mass_error(d)
+        if search.violation(d) <= 1.0:
+            return np.array(pin.integrate(robot.model, q0, d))
+    raise InputError(
+        f"mass [kg]: no posture near the start has an effective mass of {mass:g} kg at {striker!r} (nearest: "
+        f"{mass + off:.4g} kg): choose another mass or start"
+    )
+
+
+class _PostureSearch:
+    """Motions d (nv) from a configuration, in the basis of v, and what is asked of where they lead."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        mass: float,
+        striker: str,
+        normal: ArrayLike,
+        stance: Stance | None,
+        q0: Array,
+        inside: float,
+    ) -> None:
+        self.robot, self.model, self.q0, self.inside = robot, robot.model, q0, inside
+        self.wanted, self.data = mass, robot.model.createData()
+        held_by = usual_stance(robot) if stance is None else stance
+        self._mass = effective_mass(robot, striker=striker, normal=normal, stance=held_by)
+        frames = held_by.constraint_frames(robot)
+        pin.framesForwardKinematics(self.model, self.data, q0)
+        ids = [self.model.getFrameId(frame) for frame in frames]
+        self.held = [(i, self.data.oMf[i].copy()) for i in ids]
+        soles = held_by.soles(robot)
+        self.standing = bool(soles)
+        self.polygon = support_polygon(robot, StanceCoordinates(robot, soles, q0)) if soles else np.zeros(0)
+        joints = robot.joint_positions(q0)
+        free = np.full(robot.nv - robot.n, np.inf)
+        self.low = np.concatenate([-free, np.minimum(robot.lower + 0.02 - joints, 0.0)])
+        self.high = np.concatenate([free, np.maximum(robot.upper - 0.02 - joints, 0.0)])
+        # the base goes where the legs let it; a little weight keeps the search well posed
+        self.weight = np.concatenate([np.full(robot.nv - robot.n, 0.1), np.ones(robot.n)])
+
+    def mass_error(self, d: Array) -> float:
+        """[kg]"""
+        return float(self._mass(pin.integrate(self.model, self.q0, d))) - self.wanted
+
+    def equalities(self, d: Array) -> Array:
+        q = pin.integrate(self.model, self.q0, d)
+        pin.framesForwardKinematics(self.model, self.data, q)
+        off = [pin.log6(at.actInv(self.data.oMf[i])).vector for i, at in self.held]
+        return np.concatenate([*off, [np.log(float(self._mass(q)) / self.wanted)]])
+
+    def balance(self, d: Array) -> Array:
+        """(1,) [m] by which the centre of mass is farther inside the soles' hull than asked."""
+        com = pin.centerOfMass(self.model, self.data, pin.integrate(self.model, self.q0, d))
+        return np.asarray(margin_in(self.polygon, com[None, :2]) - self.inside)
+
+    def from_here(self, d: Array) -> Array:
+        """Where SLSQP goes."""
+        rules: list[dict[str, Any]] = [
+            {"type": "eq", "fun": self.equalities, "jac": lambda x: _slopes(self.equalities, x)}
+        ]
+        if self.standing:
+            rules.append({"type": "ineq", "fun": self.balance, "jac": lambda x: _slopes(self.balance, x)})
+        found = minimize(
+            lambda x: 0.5 * float(self.weight @ x**2),
+            d,
+            jac=lambda x: self.weight * x,
+            bounds=list(zip(self.low, self.high, strict=True)),
+            constraints=rules,
+            method="SLSQP",
+            options={"maxiter": 200, "ftol": 1e-12},
+        )
+        return np.clip(found.x, self.low, self.high)
+
+    def violation(self, d: Array) -> float:
+        """Largest violation over what is tolerated: 1e-6 kg, and 1e-8 m and rad."""
+        worst = abs(self.mass_error(d)) / _MASS_TOLERANCE
+        held = self.equalities(d)[:-1]
+        if held.size:
+            worst = max(worst, float(np.abs(held).max()) / 1e-8)
+        if self.standing:
+            worst = max(worst, -float(self.balance(d)[0]) / 1e-8)
+        return worst if np.isfinite(worst) else np.inf
+
+
+def _slopes(function: Any, x: Array, by: float = 1e-6) -> Array:
+    """Jacobian by central differences: a search asks no more of it than its direction."""
+    steps = by * np.eye(len(x))
+    return np.stack([(function(x + s) - function(x - s)) / (2 * by) for s in steps], axis=1)
+
+
+# ---------------------------------------------------------------- errors
+def errors_against(
+    result: Collision, reference: Collision, *, torque_limit: ArrayLike | None = None
+) -> dict[str, float | None]:
+    """How far a model's collision is from a reference's; None where one of them has no such history.
+
+    * impulse_error_pct, f_max_error_pct : 100 (result - reference) / reference, so positive where the model
+      promises too much. The paper's eq. (24) has the other sign.
+    * zmp_error_mm : largest distance of the ZMPs.
+    * torque_error_pct : largest difference of the servos' torques over `torque_limit` (n) [N m], all joints;
+      None without limits.
+
+    The last two are taken at the result's own instants while both are in contact, at equal times since
+    contact, between the reference's instants by straight lines; ZMPs only while both press on the ground with
+    more than 50 N.
+    """
+    time = result.time[result.time <= reference.time[-1]]
+    k = time.size
+
+    def of_reference(history: Array) -> Array:
+        return np.stack([np.interp(time, reference.time, column) for column in history.T], axis=1)
+
+    out: dict[str, float | None] = {
+        "impulse_error_pct": 100 * (result.impulse / reference.impulse - 1),
+        "f_max_error_pct": 100 * (result.peak_force / reference.peak_force - 1),
+        "zmp_error_mm": None,
+        "torque_error_pct": None,
+    }
+    if result.ground_wrench is not None and reference.ground_wrench is not None:
+        # the ZMP anew from wrenches: where the force is near zero it is not to be interpolated
+        ground = result.ground_wrench[:k], of_reference(reference.ground_wrench)
+        loaded = np.logical_and(*(wrench[:, 2] > LEAST_WEIGHT for wrench in ground))
+        if loaded.any():
+            own, true = (np.stack([-w[loaded, 4], w[loaded, 3]]) / w[loaded, 2] for w in ground)
+            out["zmp_error_mm"] = 1e3 * float(np.linalg.norm(own - true, axis=0).max())
+    if result.torque is not None and reference.torque is not None and torque_limit is not None:
+        off = np.abs(result.torque[:k] - of_reference(reference.torque))
+        out["torque_error_pct"] = 100 * float((off / np.asarray(torque_limit)).max())
+    return out

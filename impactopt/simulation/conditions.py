@@ -1,0 +1,94 @@
+"""How the world of a replay differs from the one that was planned for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from impactopt.contact.factors import scaled_numbers
+from impactopt.errors import FARTHEST, InputError, check_array, shortened
+from impactopt.simulation.result import Scene
+
+LARGEST = 1e6  # factor, friction, payload [kg]
+SLOWEST = 10.0  # [s] of the servo's clock and of the floor: longer than most motions
+LIGHTEST = 1e-6  # [kg] of a payload that is one: MuJoCo takes no body without inertia
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """What a replay finds; the defaults are what was planned, on a floor of friction 0.9.
+
+    mass, stiffness, damping : of the target, and of the contact law, as factors of the planned numbers.
+    distance [m] : how much farther along the normal the target waits; negative: it comes early.
+    missing : there is no target.
+    payload [kg] : a point mass at the striking point that the plan does not know of.
+    friction : coefficient between soles and floor.  floor_time [s] : time constant of the floor's contact
+        (MuJoCo's solref), the softness of floor and soles: a sole sinks by as much as its square grows.
+        MuJoCo does not go below two steps.
+    kp, kd, torque_limit : of the servo, as factors.
+    period [s] : the servo reads the joints and sets torques this often, and holds them between; 0: in every
+        step of the simulation.  delay [s] : between reading and setting. Both are rounded to steps.
+
+    Raises
+    ------
+    InputError : naming the number that is out of its range.
+    """
+
+    mass: float = 1.0
+    stiffness: float = 1.0
+    damping: float = 1.0
+    distance: float = 0.0
+    missing: bool = False
+    payload: float = 0.0
+    friction: float = 0.9
+    floor_time: float = 2e-3
+    kp: float = 1.0
+    kd: float = 1.0
+    torque_limit: float = 1.0
+    period: float = 0.0
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        most = {"distance": FARTHEST, **dict.fromkeys(("period", "delay", "floor_time"), SLOWEST)}
+        for f in fields(self):
+            if f.name == "missing":
+                if not isinstance(self.missing, (bool, np.bool_)):
+                    raise InputError(
+                        f"conditions: missing is {shortened(repr(self.missing))}; give True or False"
+                    )
+                continue
+            value = float(
+                check_array(
+                    f"conditions: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
+                )
+            )
+            if f.name != "distance" and value < 0:
+                raise InputError(f"conditions: {f.name} is {value:g}; give a number >= 0")
+        if 0 < self.payload < LIGHTEST:
+            raise InputError(f"conditions: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg")
+        for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"conditions: {name} is {getattr(self, name):g}; give a number > 0")
+
+    def scene(self, planned: Scene) -> Scene:
+        """The scene as it turns out.
+
+        Raises
+        ------
+        InputError : a factor of a number that the law or the target does not have.
+        """
+        law, target = planned.law, planned.target
+        of_law, of_target = scaled_numbers(
+            "conditions", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
+        )
+        way = self.distance * planned.normal
+        solids = planned.solids.moved(way) if self.distance else planned.solids
+        solids = solids.without_target() if self.missing else solids
+        return replace(
+            planned,
+            solids=solids,
+            point=planned.point + way,
+            law=type(law)(**of_law),
+            target=type(target)(**of_target),
+        )

@@ -1,0 +1,313 @@
+"""Replay in MuJoCo with nothing held: the robot is free on its soles.
+
+Unilateral contact with friction at the soles' corners, the servo with its limits, the target moved by the
+contact law's force. Shares no code with the planner: it reads a reference (times, positions, velocities,
+feed-forward), the robot's numbers and the scene's.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robots.robot import Robot
+from impactopt.simulation.besides import Besides
+from impactopt.simulation.conditions import Conditions
+from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.mujoco_world import Solver, build_world, mujoco_module, no_log_file
+from impactopt.simulation.result import Scene, Simulation
+from impactopt.simulation.servo import Servo
+from impactopt.simulation.soles import BEARS, sole_names, weight_of
+from impactopt.simulation.struck import Push, Struck
+from impactopt.simulation.touch import Touches
+
+Array = NDArray[np.float64]
+AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
+FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
+LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
+
+
+class _Replay:
+    def __init__(
+        self, robot: Robot, reference: Any, scene: Scene, conditions: Conditions, solver: Solver
+    ) -> None:
+        self.mujoco = mujoco_module()
+        self.robot, self.scene, self.conditions = robot, conditions.scene(scene), conditions
+        solids = self.scene.solids
+        near = solids.near(robot.model, reference)
+        self.world = build_world(robot, self.scene, conditions, solver, near)
+        self.besides = Besides(self.world, solids)
+        self.data = self.mujoco.MjData(self.world)
+        self.follow(reference)
+        joints = [self.world.joint(name) for name in robot.joint_names]
+        self.dof = np.array([joint.dofadr[0] for joint in joints])
+        self.place = np.array([joint.qposadr[0] for joint in joints])
+        self.floating = robot.model.nv > robot.n
+        self.site = self.world.site("striker").id
+        self.struck = Struck(self.scene)
+        self.target, self.travel = self.struck.at_rest, 0.0  # the target's state, and how far it has gone [m]
+        # its depth at the end of a step in contact; of the step before, hand speed and force
+        self.kept: float | None = None
+        self.before: tuple[float, float] | None = None
+        self.row = np.zeros((3, self.world.nv))
+        self.held = {name: k for k, name in enumerate(scene.soles)}
+        self.geom_sole = np.full(self.world.ngeom, -1)
+        for sole in robot.soles:
+            for k in range(len(sole.polygon)):
+                self.geom_sole[self.world.geom(f"sole {sole.frame} {k}").id] = self.held.get(sole.frame, -1)
+        frames = [robot.model.frames[robot.model.getFrameId(name)] for name in scene.soles]
+        self.sole_body = [self.world.body(f"body {robot.model.names[f.parentJoint]}").id for f in frames]
+        self.corners = [
+            np.array([f.placement.act(np.array([*c, 0.0])) for c in corners])
+            for f, corners in zip(frames, scene.corners, strict=True)
+        ]
+        self.start(self.reference_q[0])
+
+    def follow(self, reference: Any) -> None:
+        """What the servo follows from now on."""
+        world = self.conditions
+        self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
+        self.reference_q = np.asarray(reference.q)
+
+    def start(self, q: Array) -> None:
+        d = self.data
+        if self.floating:
+            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
+        d.qpos[self.place] = self.servo.angles(q)
+        self.mujoco.mj_forward(self.world, d)
+        self.start_corners = self.corner_places()
+
+    # ------------------------------------------------------------------ what a step needs
+    def hand_speed(self) -> float:
+        """Speed of the striking point along the normal [m/s]; leaves its Jacobian in ``row``."""
+        self.mujoco.mj_jacSite(self.world, self.data, self.row, None, self.site)
+        self.along = self.scene.normal @ self.row
+        return float(self.along @ self.data.qvel)
+
+    def push(self, speed: float, step: float) -> Push:
+        """The contact in the step that begins now; moves the target.
+
+        The hand gains speed as in the step before, where its soles and servos had the same to say.
+        """
+        struck, d = self.struck, self.data
+        place = d.site_xpos[self.site]
+        if self.kept is not None:
+            # the depth is the contact's: it is followed more exactly there than the arm is
+            along = struck.depth(place, 0.0)
+            self.travel = along - self.kept if np.isfinite(along) else self.travel
+        depth = -np.inf if self.conditions.missing else struck.depth(place, self.travel)
+        self.kept = None
+        if struck.near(depth, speed, self.target, step):
+            answer = np.zeros((1, self.world.nv))
+            self.mujoco.mj_solveM(self.world, d, answer, self.along[None])
+            yields = float(self.along @ answer[0])
+            gain = 0.0 if self.before is None else (speed - self.before[0]) / step
+            gain += 0.0 if self.before is None else self.before[1] * yields
+            push = struck.pushed(depth, speed, gain, yields, self.target, self.travel, step)
+            self.kept = push.depth
+        else:
+            state = struck.moved(self.target, 0.0, step)
+            travel = self.travel + step * struck.speed(state)
+            push = Push(force=0.0, half=0.0, peak=0.0, state=state, travel=travel, depth=depth)
+        self.before = (speed, push.force)
+        self.target, self.travel = push.state, push.travel
+        return push
+
+    def place_target(self) -> None:
+        """Its body goes with it; what a blow has broken is put away."""
+        broken = bool(self.scene.target.outcome(self.target).get("broken", False))
+        self.besides.place(self.data, self.travel * self.scene.normal + broken * AWAY)
+
+    # ------------------------------------------------------------------ what a record needs
+    def base(self) -> tuple[Array, Array, float]:
+        """Position (3,), rotation (3, 3) and speed [m/s] of the base."""
+        if not self.floating:
+            return np.zeros(3), np.eye(3), 0.0
+        rotation = np.zeros(9)
+        self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
+        return self.data.qpos[:3].copy(), rotation.reshape(3, 3), float(np.linalg.norm(self.data.qvel[:3]))
+
+    def state(self) -> tuple[Array, Array]:
+        """q (nq,), v (nv,) in Pinocchio's conventions."""
+        model, d = self.robot.model, self.data
+        q, v = np.zeros(model.nq), np.zeros(model.nv)
+        if self.floating:
+            _, rotation, _ = self.base()
+            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
+            v[:3], v[3:6] = rotation.T @ d.qvel[:3], d.qvel[3:6]
+        angles = d.qpos[self.place]
+        q[self.servo.place] = angles
+        for k in self.servo.continuous:
+            at = self.servo.place[k]
+            q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
+        v[-self.robot.n :] = d.qvel[self.dof]
+        return q, v
+
+    def corner_places(self) -> list[Array]:
+        """World places (k, 3) of each held sole's corners."""
+        d = self.data
+        return [
+            c @ d.xmat[b].reshape(3, 3).T + d.xpos[b]
+            for b, c in zip(self.sole_body, self.corners, strict=True)
+        ]
+
+    def sole_moves(self) -> tuple[list[float], list[float]]:
+        """Slip and lift [m] of each held sole."""
+        return slip_and_lift(self.corner_places(), self.start_corners)
+
+    def sole_ground(self) -> Array:
+        """(soles, 6) wrench of the floor on each held sole about the world's origin; after the step's forces
+        are known."""
+        out = np.zeros((len(self.held), 6))
+        contacts = self.data.contact
+        if not self.data.ncon:
+            return out
+        for geoms, frame, place, address in zip(
+            contacts.geom, contacts.frame, contacts.pos, contacts.efc_address, strict=True
+        ):
+            sole = max(self.geom_sole[geoms[0]], self.geom_sole[geoms[1]])
+            if address < 0 or sole < 0:
+                continue
+            # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
+            force = frame.reshape(3, 3).T @ self.data.efc_force[address : address + 3]
+            out[sole, :3] += force
+            out[sole, 3:] += np.cross(place, force)
+        return out
+
+    def fallen(self, q_planned: Array) -> str:
+        """Whether the base is far from where the reference (nq,) has it: a plan may bow deeply itself."""
+        if not self.floating:
+            return ""
+        place, lean = self.data.qpos[:3], self.base_error(q_planned)
+        if lean > FALLEN_TILT:
+            return f"fell: the base leans {lean:.1f} rad from where it should be"
+        if place[2] < (1 - FALLEN_DROP) * q_planned[2]:
+            return f"fell: the base is {place[2]:.2f} m high where it should be {q_planned[2]:.2f} m"
+        return ""
+
+    def planned(self, t: float) -> Array:
+        """The reference's configuration (nq,) at a time, or just before it."""
+        return self.reference_q[max(int(np.searchsorted(self.servo.time, t, side="right")) - 1, 0)]
+
+    def base_error(self, q_planned: Array) -> float:
+        """Angle [rad] between the verticals of the base and of a configuration's."""
+        planned = pin.Quaternion(q_planned[3:7]).toRotationMatrix()
+        return float(np.arccos(np.clip((self.base()[1] @ planned.T)[2, 2], -1.0, 1.0)))
+
+    def not_standing(self, sole_ground: Array, weight: float) -> str:
+        """Why the robot does not stand at the end, "" if it does."""
+        if not self.floating:
+            return ""
+        lean, speed = self.base_error(self.reference_q[-1]), self.base()[2]
+        if lean > LEANS:
+            return f"leans at the end: base {lean:.2f} rad from where it should be"
+        if speed > STIRS:
+            return f"still moves at the end: base at {speed:.2f} m/s"
+        for name, wrench in zip(sole_names(self.robot, self.scene), sole_ground, strict=True):
+            if wrench[2] < BEARS * weight:
+                return f"the sole {name!r} bears no load at the end"
+        return ""
+
+
+def simulate_mujoco(
+    robot: Robot,
+    reference: Any,
+    scene: Scene,
+    *,
+    step: float = 2e-4,
+    iterations: int = 100,
+    tolerance: float = 1e-10,
+    settle: float = 2.0,
+    record: int = 5,
+    conditions: Conditions | None = None,
+    missed: Any = None,
+    until: float = np.inf,
+) -> Simulation:
+    """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
+
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
+    :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
+    (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
+    recorded in contact. conditions : where the world differs from what was planned; default: nowhere.
+    missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
+        default: it does not notice.
+    until [s] : it ends, if that is earlier.
+
+    A fall ends the simulation early; the result says so.
+
+    Raises
+    ------
+    InputError : MuJoCo is not installed, or the simulation diverges (with the time at which it did).
+    """
+    if not step > 0:
+        raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    world = conditions if conditions is not None else Conditions()
+    replay = _Replay(robot, reference, scene, world, Solver(step, iterations, tolerance))
+    mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
+    hold = max(1, round(world.period / step))
+    waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
+    lag = round(world.delay / step)
+    demand = torque = np.zeros(robot.n)
+    ground = np.zeros((len(scene.soles), 6))
+    rows: list[tuple[Any, ...]] = []
+    touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
+    impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
+    with no_log_file():
+        for k in range(round(min(float(reference.end) + settle, until) / step)):
+            t = k * step
+            mujoco.mj_step1(model, data)
+            if missed is not None and t >= missed.contact_end and not touches.intervals:
+                replay.follow(missed)
+                servo, missed = replay.servo, None
+            if k % hold == 0:
+                asked = servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof])
+                # at rest before the start, it asked for the same
+                waiting.append((k + lag if k else 0, asked))
+            while waiting and waiting[0][0] <= k:
+                demand, torque = waiting.popleft()[1]
+            speed = replay.hand_speed()
+            target_speed = replay.struck.speed(replay.target)
+            push = replay.push(speed, step)
+            force = push.force
+            peak = max(peak, push.peak)
+            data.qfrc_applied[:] = -force * replay.along
+            data.qfrc_applied[replay.dof] += torque
+            touches.add(t, force, step, push.since)
+            saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
+            replay.place_target()
+            impulse += step * force
+            left = replay.target if force > 0 else left
+            kept = k % record == 0 or force > 0
+            state = replay.state() if kept else None
+            moves = replay.sole_moves() if kept else None
+            mujoco.mj_step2(model, data)
+            replay.besides.look(data, t)
+            if kept:
+                ground = replay.sole_ground()
+                assert state is not None and moves is not None
+                rows.append((t, *state, force, target_speed, speed, demand, torque, ground, *moves))
+                check_not_diverged(data.qvel, t, step)
+                fall = replay.fallen(replay.planned(t))
+                if fall:
+                    fall = f"{fall} at t = {t:.2f} s"
+                    break
+    return simulation_of(
+        robot,
+        replay.scene,
+        rows,
+        touches,
+        engine="mujoco",
+        impulse=impulse,
+        peak_force=peak,
+        outcome=replay.scene.target.outcome(left),
+        saturated=saturated,
+        posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
+        fall=fall or replay.not_standing(ground, weight_of(robot)),
+        touched=replay.besides.touched(),
+        missed=world.missing,
+    )

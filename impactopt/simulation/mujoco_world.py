@@ -1,0 +1,205 @@
+"""A robot and its floor as a MuJoCo model, built body by body from the robot's numbers."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robots.robot import Robot
+from impactopt.simulation.conditions import Conditions
+from impactopt.simulation.result import Scene
+from impactopt.simulation.solids import FLOOR, Solid
+
+Array = NDArray[np.float64]
+FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
+
+
+@dataclass(frozen=True)
+class Solver:
+    """MuJoCo's own settings: step [s], iterations and tolerance of its contact solver."""
+
+    step: float = 2e-4
+    iterations: int = 100
+    tolerance: float = 1e-10
+
+
+def mujoco_module() -> Any:
+    """MuJoCo, or an error that says how to get it."""
+    try:
+        import mujoco
+    except ImportError as error:
+        raise InputError(
+            "the engine 'mujoco' needs the package mujoco; run: pip install 'impactopt[validate]'"
+        ) from error
+    return mujoco
+
+
+@contextlib.contextmanager
+def no_log_file() -> Iterator[None]:
+    """MuJoCo's warnings are not written to a file in the user's directory: the engine raises its own."""
+    mujoco = mujoco_module()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def build_world(
+    robot: Robot,
+    scene: Scene,
+    conditions: Conditions,
+    solver: Solver,
+    near: Sequence[tuple[int, int]] = (),
+) -> Any:
+    """The compiled mujoco.MjModel.
+
+    Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
+    the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
+    anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid
+    <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
+    The contact law between target and striker is the engine's business.
+    """
+    mujoco = mujoco_module()
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.compiler.balanceinertia = False
+    spec.option.timestep = solver.step
+    spec.option.iterations = solver.iterations
+    spec.option.tolerance = solver.tolerance
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0  # friction as hard as the normal direction: no creep
+    # the engine says so itself when it diverges, and does not begin anew
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    spec.option.gravity = robot.model.gravity.linear
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
+    _surface(floor, conditions, sole=False)
+    bodies = _robot_bodies(mujoco, spec, robot, scene, conditions)
+    _solids(mujoco, spec, bodies, scene, near)
+    return spec.compile()
+
+
+def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Sequence[tuple[int, int]]) -> None:
+    """Geometry of the solids that are in a pair, and the pairs."""
+    solids = scene.solids.solids
+    target = spec.worldbody.add_body(name="target", mocap=True)
+    for k in sorted({k for pair in near for k in pair if k != FLOOR}):
+        solid = solids[k]
+        body = bodies[solid.joint] if solid.joint else (target if solid.moves else spec.worldbody)
+        if solid.vertices is not None:
+            spec.add_mesh(
+                name=f"solid {k}",
+                uservert=solid.vertices.astype(np.float32).ravel(),
+                inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
+            )
+            shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"solid {k}"}
+        else:
+            shape = _primitive(mujoco, solid)
+        body.add_geom(name=f"solid {k}", contype=0, conaffinity=0, mass=0.0, **shape)
+    for one, other in near:
+        spec.add_pair(
+            name=f"pair {one} {other}",
+            geomname1=f"solid {one}",
+            geomname2="floor" if other == FLOOR else f"solid {other}",
+            condim=3,
+            friction=[0.5, 0.5, 1e-3, 1e-4, 1e-4],
+            solref=[5e-3, 1.0],
+        )
+
+
+def _primitive(mujoco: Any, solid: Solid) -> dict[str, Any]:
+    half, radius = np.asarray(solid.half), solid.radius
+    place = {"pos": solid.place, "quat": _quaternion(solid.rotation)}
+    if not radius:
+        return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, **place}
+    if half[2] > 0:
+        return {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [radius, half[2], 0.0], **place}
+    return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0.0, 0.0], **place}
+
+
+def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions: Conditions) -> list[Any]:
+    model = robot.model
+    bodies = robot_bodies(mujoco, spec, robot)
+    for sole in robot.soles:
+        frame = model.frames[model.getFrameId(sole.frame)]
+        for k, corner in enumerate(sole.polygon):
+            centre = frame.placement.act(np.array([*corner, FOOT]))
+            sphere = bodies[frame.parentJoint].add_geom(
+                name=f"sole {sole.frame} {k}",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[FOOT, 0.0, 0.0],
+                pos=centre,
+                mass=0.0,
+            )
+            _surface(sphere, conditions, sole=True)
+    frame = model.frames[model.getFrameId(scene.striker)]
+    hand = bodies[frame.parentJoint]
+    hand.add_site(name="striker", pos=frame.placement.translation)
+    if conditions.payload > 0:
+        load = hand.add_body(name="payload", pos=frame.placement.translation)
+        _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
+    return bodies
+
+
+def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
+    """The robot's links and joints, without anything that touches; one body a joint of the model, in its
+    order, the world first. Names are ``body <joint>`` and the joints' own."""
+    model = robot.model
+    bodies = [spec.worldbody]
+    for j in range(1, model.njoints):
+        placement = model.jointPlacements[j]
+        body = bodies[model.parents[j]].add_body(
+            name=f"body {model.names[j]}", pos=placement.translation, quat=_quaternion(placement.rotation)
+        )
+        bodies.append(body)
+        inertia = model.inertias[j]
+        _inertial(body, inertia.mass, inertia.lever, inertia.inertia)
+        if model.joints[j].nv == 6:
+            body.add_freejoint(name=model.names[j])
+            continue
+        data = model.joints[j].createData()
+        model.joints[j].calc(data, pin.neutral(model))
+        subspace = np.asarray(data.S).reshape(6)
+        turns = bool(np.any(subspace[3:]))
+        body.add_joint(
+            name=model.names[j],
+            type=mujoco.mjtJoint.mjJNT_HINGE if turns else mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=subspace[3:] if turns else subspace[:3],
+            armature=float(model.armature[model.joints[j].idx_v]),
+        )
+    return bodies
+
+
+def _surface(geom: Any, conditions: Conditions, *, sole: bool) -> None:
+    geom.contype, geom.conaffinity = int(sole), int(not sole)  # soles meet the floor, not each other
+    geom.friction = [conditions.friction, 1e-3, 1e-4]
+    geom.condim = 3
+    geom.solref = [conditions.floor_time, 1.0]
+    # as soft as a rubber sole: with more impedance the corners leave the floor by micrometres, many times a
+    # millisecond, and the force and ZMP of one step say nothing (the motion hardly changes). One impedance at
+    # all depths makes a linear floor.
+    geom.solimp = [0.5, 0.5, 5e-4, 0.5, 2.0]
+
+
+def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
+    body.explicitinertial = True
+    body.mass = float(mass)
+    body.ipos = centre
+    i = np.asarray(inertia)
+    body.fullinertia = [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]
+
+
+def _quaternion(rotation: Any) -> list[float]:
+    """(w, x, y, z), as MuJoCo has it."""
+    x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
+    return [w, x, y, z]

@@ -1,0 +1,237 @@
+"""Full dynamics in numeric Pinocchio.
+
+Soles are bilateral constraints, the servo saturates, the target is moved by the contact law's force. Shares
+no code with the planner: it reads a reference (times, positions, velocities, feed-forward), the robot's
+numbers and the scene's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.robots.robot import Robot
+from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.result import Scene, Simulation
+from impactopt.simulation.servo import Servo
+from impactopt.simulation.struck import Push, Struck
+from impactopt.simulation.touch import Touches
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _State:
+    q: Array
+    v: Array
+    x: float  # the target's travel [m]
+    target: Array  # and state
+    impulse: float  # that it was given [N s]
+
+
+@dataclass(frozen=True)
+class _Rates:
+    v: Array
+    a: Array
+    vt: float  # the target's speed [m/s]
+    force: float
+    hand_speed: float
+    demand: Array
+    torque: Array
+    push: Push | None  # what the contact comes to in the step that begins here
+
+
+class _World:
+    def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
+        self.robot, self.scene = robot, scene
+        self.model, self.data = robot.model, robot.model.createData()
+        self.base = robot.model.nv - robot.n
+        self.hand = self.model.getFrameId(scene.striker)
+        self.servo, self.struck = Servo(robot, reference), Struck(scene)
+        self.contacts = pin.StdVec_RigidConstraintModel()
+        for name in scene.soles:
+            frame = self.model.frames[self.model.getFrameId(name)]
+            self.contacts.append(
+                pin.RigidConstraintModel(
+                    pin.ContactType.CONTACT_6D,
+                    self.model,
+                    frame.parentJoint,
+                    frame.placement,
+                    0,
+                    pin.SE3.Identity(),
+                    pin.LOCAL,
+                )
+            )
+        self.contact_data = pin.StdVec_RigidConstraintData()
+        for contact in self.contacts:
+            self.contact_data.append(contact.createData())
+        pin.initConstraintDynamics(self.model, self.data, self.contacts, self.contact_data)
+        self.proximal = pin.ProximalSettings(1e-12, 1e-12, 1)
+        self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
+
+    def contact(self, s: _State) -> tuple[float, float, Array]:
+        """Depth [m] and hand speed [m/s] along the normal, and the row (nv,) of the Jacobian."""
+        model, data = self.model, self.data
+        pin.computeJointJacobians(model, data, s.q)
+        jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)
+        jac = np.reshape(jac, (6, model.nv))[:3]  # pin drops an axis where nv is 1
+        point = pin.updateFramePlacement(model, data, self.hand).translation
+        row = self.scene.normal @ jac
+        return self.struck.depth(point, s.x), float(row @ s.v), row
+
+    def accelerate(self, s: _State, torque: Array, row: Array, force: float) -> Array:
+        tau = -row * force
+        tau[self.base :] += torque
+        if not self.sole_ids:
+            return np.array(pin.aba(self.model, self.data, s.q, s.v, tau))
+        return np.array(
+            pin.constraintDynamics(
+                self.model, self.data, s.q, s.v, tau, self.contacts, self.contact_data, self.proximal
+            )
+        )
+
+    def rates(self, t: float, s: _State, *, force: float | None = None, step: float = 0.0) -> _Rates:
+        """At a state under the force [N] of its step, or that of the step [s] that begins here."""
+        depth, speed, row = self.contact(s)
+        demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
+        push, struck = None, self.struck
+        if force is None:
+            force = struck.force(depth, speed, s.target)
+            if struck.near(depth, speed, s.target, step):
+                a = self.accelerate(s, torque, row, 0.0)
+                yields = float(row @ (a - self.accelerate(s, torque, row, 1.0)))
+                push = struck.pushed(depth, speed, self.drift(s, a), yields, s.target, s.x, step)
+        return _Rates(
+            v=s.v.copy(),
+            a=self.accelerate(s, torque, row, force),
+            vt=struck.speed(s.target),
+            force=force,
+            hand_speed=speed,
+            demand=demand,
+            torque=torque,
+            push=push,
+        )
+
+    def drift(self, s: _State, a: Array) -> float:
+        """[m/s2] of the striking point along the normal, at these accelerations (nv,)."""
+        pin.forwardKinematics(self.model, self.data, s.q, s.v, a)
+        drift = pin.getFrameClassicalAcceleration(self.model, self.data, self.hand, pin.LOCAL_WORLD_ALIGNED)
+        return float(self.scene.normal @ drift.linear)
+
+    def ground(self) -> Array:
+        """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
+        ``rates``.
+        """
+        out = np.zeros((len(self.sole_ids), 6))
+        for k, i in enumerate(self.sole_ids):
+            m = pin.updateFramePlacement(self.model, self.data, i)
+            wrench = self.data.lambda_c[6 * k : 6 * k + 6]
+            out[k, :3] = m.rotation @ wrench[:3]
+            out[k, 3:] = m.rotation @ wrench[3:] + np.cross(m.translation, out[k, :3])
+        return out
+
+    def corners(self) -> list[Array]:
+        """World places (k, 3) of each held sole's corners."""
+        placements = [pin.updateFramePlacement(self.model, self.data, i) for i in self.sole_ids]
+        return [
+            np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
+            for m, c in zip(placements, self.scene.corners, strict=True)
+        ]
+
+    def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
+        """A step of the midpoint rule from a state with its rates, under the contact's mean force in it."""
+        push = first.push
+        a = first.a
+        if push is not None and push.half != first.force:
+            depth_row = self.contact(s)[2]
+            a = self.accelerate(s, first.torque, depth_row, push.half)
+        half = _State(
+            q=pin.integrate(self.model, s.q, h / 2 * s.v),
+            v=s.v + h / 2 * a,
+            x=s.x,
+            target=s.target,
+            impulse=s.impulse,
+        )
+        middle = self.rates(t + h / 2, half, force=push.force if push is not None else 0.0)
+        after = _State(
+            q=pin.integrate(self.model, s.q, h * middle.v),
+            v=s.v + h * middle.a,
+            x=s.x + h * first.vt,
+            target=self.struck.moved(s.target, 0.0, h) if push is None else push.state,
+            impulse=s.impulse + h * middle.force,
+        )
+        if push is None:
+            return after
+        # the depth is the contact's: it is followed more exactly there than the arm is
+        placed = replace(after, x=0.0)
+        along = self.contact(placed)[0]
+        return replace(after, x=along - push.depth if np.isfinite(along) else push.travel)
+
+
+def simulate_pinocchio(
+    robot: Robot,
+    reference: Any,
+    scene: Scene,
+    *,
+    step: float = 1e-4,
+    settle: float = 0.3,
+    record: int = 5,
+    until: float = np.inf,
+) -> Simulation:
+    """The whole motion from the reference's first posture at rest, in constrained forward dynamics.
+
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
+    :class:`impactopt.transcription.plan.Trajectory`. step [s] : of the explicit midpoint rule (second
+        order).  settle [s] : simulated beyond the end of the reference's motion.
+    until [s] : it ends, if that is earlier.
+    record : steps between recorded instants; every step is recorded in contact.
+
+    Raises
+    ------
+    InputError : the simulation diverges (with the time at which it did).
+    """
+    world = _World(robot, scene, reference)
+    struck = world.struck
+    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, struck.at_rest, 0.0)
+    left = state.target  # as the last touch has left it
+    end = min(float(reference.end) + settle, until)
+    rows: list[tuple[Any, ...]] = []
+    saturated = peak = 0.0
+    start: list[Array] | None = None
+    touches = Touches()
+    for k in range(round(end / step)):
+        t = k * step
+        first = world.rates(t, state, step=step)
+        push = first.push
+        saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
+        if push is None:
+            touches.add(t, 0.0, step)
+        else:
+            touches.add(t, push.force, step, push.since)
+        peak = max(peak, first.force if push is None else push.peak)
+        if touches.touching or k % record == 0:
+            corners = world.corners()
+            start = corners if start is None else start
+            motion = (state.q, state.v, first.force, first.vt, first.hand_speed)
+            moves = slip_and_lift(corners, start)
+            rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves))
+        before, state = state, world.step(t, state, first, step)
+        left = state.target if state.impulse > before.impulse else left
+        check_not_diverged(state.v, t, step)
+    return simulation_of(
+        robot,
+        scene,
+        rows,
+        touches,
+        engine="pinocchio",
+        impulse=state.impulse,
+        peak_force=peak,
+        outcome=scene.target.outcome(left),
+        saturated=saturated,
+        posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
+        fall=None,
+    )

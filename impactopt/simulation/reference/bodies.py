@@ -1,0 +1,174 @@
+"""The held robot's acceleration, with H, J and bias anew at every call: two ways to the same numbers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robots.robot import Robot
+
+__all__ = ["FORMS", "Body", "DenseBody", "PinocchioBody"]
+
+Array = NDArray[np.float64]
+_AXES = pin.LOCAL_WORLD_ALIGNED
+
+
+class Body(ABC):
+    """A robot held by some of its frames, struck at another.
+
+    Parameters
+    ----------
+    robot : what moves.
+    frames : held in all six directions.
+    compliance : (6,) of each held frame, as `Stance.compliance`.
+    striker : the striking frame.
+    normal : (3,) of the blow.
+    """
+
+    def __init__(
+        self, robot: Robot, frames: tuple[str, ...], compliance: Array, striker: str, normal: Array
+    ) -> None:
+        self.model, self.n, self.nv = robot.model, robot.n, robot.nv
+        self.data: Any = robot.model.createData()
+        self.frames = [self.model.getFrameId(frame) for frame in frames]
+        self.compliance, self.normal = np.tile(compliance, len(frames)), normal
+        self.hand = self.model.getFrameId(striker)
+        self.row = np.zeros(self.nv)
+
+    @abstractmethod
+    def look(self, q: Array, v: Array) -> float:
+        """Speed of the striking point along the normal [m/s] at q (nq), v (nv), to which it goes."""
+
+    @abstractmethod
+    def accelerate(self, torque: Array, force: float) -> tuple[Array, Array]:
+        """(acceleration (nv), wrenches on the held frames (6 a frame), world axes) where it has been last.
+
+        torque : (n) [N m] at the joints, friction included.
+        force : [N] of the contact, pushing the hand against the normal.
+        """
+
+    def places(self) -> Array:
+        """(held frames, 3) [m]: their origins in the world, where it has been last."""
+        return np.array(
+            [pin.updateFramePlacement(self.model, self.data, i).translation for i in self.frames]
+        ).reshape(-1, 3)
+
+    def _jacobian(self, frame: int) -> Array:
+        J = pin.getFrameJacobian(self.model, self.data, frame, _AXES)
+        return np.reshape(J, (6, self.nv))  # a single column comes without its second dimension
+
+    def _push(self, torque: Array, force: float) -> Array:
+        push = -force * self.row
+        push[-self.n :] += torque
+        return push
+
+
+class DenseBody(Body):
+    """Steps 1a to 4a of the paper (fig. 2a): H by the composite-rigid-body algorithm, all Jacobians, and one
+    dense system for accelerations and wrenches, solved by LU:
+
+        [H  -J_c'] [a]   [S' tau - j' f - c - g]
+        [J_c Gamma] [w] = [-dJ_c/dt v          ]
+    """
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        size = self.nv + 6 * len(self.frames)
+        self._matrix, self._right = np.zeros((size, size)), np.zeros(size)
+        self._matrix[self.nv :, self.nv :] = np.diag(self.compliance)
+        self._none = np.zeros(self.nv)
+
+    def look(self, q: Array, v: Array) -> float:
+        model, data, nv = self.model, self.data, self.nv
+        pin.forwardKinematics(model, data, q, v, self._none)
+        pin.computeJointJacobians(model, data)
+        for k, i in enumerate(self.frames):
+            rows = slice(nv + 6 * k, nv + 6 * k + 6)
+            J = self._jacobian(i)
+            self._matrix[rows, :nv] = J
+            self._matrix[:nv, rows] = -J.T
+            self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
+        self.row = self.normal @ self._jacobian(self.hand)[:3]
+        self._matrix[:nv, :nv] = pin.crba(model, data, q)
+        self._bias = pin.nonLinearEffects(model, data, q, v)
+        return float(self.row @ v)
+
+    def accelerate(self, torque: Array, force: float) -> tuple[Array, Array]:
+        self._right[: self.nv] = self._push(torque, force) - self._bias
+        found = np.array(np.linalg.solve(self._matrix, self._right), dtype=np.float64)
+        return found[: self.nv], found[self.nv :]
+
+    def fastest_rate(self, damping: Array) -> float:
+        """[1/s] Largest rate at which joint damping (n, n) alone slows the joints, where it has been last."""
+        right = np.zeros((len(self._matrix), self.n))
+        right[self.nv - self.n : self.nv] = np.eye(self.n)
+        joints = np.linalg.solve(self._matrix, right)[self.nv - self.n : self.nv]
+        return float(np.abs(np.linalg.eigvals(joints @ damping)).max())
+
+
+class PinocchioBody(Body):
+    """Pinocchio's own way along the tree: its constrained dynamics, or the articulated-body algorithm where
+    nothing is held.
+
+    Raises
+    ------
+    InputError : a compliant stance, for which Pinocchio has no place.
+    """
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        if np.any(self.compliance):
+            raise InputError(
+                "form 'pinocchio': holds soles exactly only; take form='lagrange' for a virtual base, "
+                "or a stance without base_mass and base_inertia"
+            )
+        model = self.model
+        self._constraints = pin.StdVec_RigidConstraintModel()
+        self._found = pin.StdVec_RigidConstraintData()
+        for i in self.frames:
+            frame = model.frames[i]
+            constraint = pin.RigidConstraintModel(
+                pin.ContactType.CONTACT_6D,
+                model,
+                frame.parentJoint,
+                frame.placement,
+                0,
+                pin.SE3.Identity(),
+                pin.LOCAL,
+            )
+            self._constraints.append(constraint)
+            self._found.append(constraint.createData())
+        self._dynamics = model.createData()
+        if self.frames:
+            pin.initConstraintDynamics(model, self._dynamics, self._constraints, self._found)
+        self._proximal = pin.ProximalSettings(1e-14, 1e-12, 5)
+
+    def look(self, q: Array, v: Array) -> float:
+        self._at = q, v
+        pin.forwardKinematics(self.model, self.data, q, v)
+        pin.computeJointJacobians(self.model, self.data)
+        self.row = self.normal @ self._jacobian(self.hand)[:3]
+        return float(self.row @ v)
+
+    def accelerate(self, torque: Array, force: float) -> tuple[Array, Array]:
+        push, model = self._push(torque, force), self.model
+        if not self.frames:
+            return np.array(pin.aba(model, self._dynamics, *self._at, push)), np.zeros(0)
+        a = pin.constraintDynamics(
+            model, self._dynamics, *self._at, push, self._constraints, self._found, self._proximal
+        )
+        wrench = np.empty(6 * len(self.frames))
+        for k, i in enumerate(self.frames):
+            R = pin.updateFramePlacement(model, self.data, i).rotation
+            local = self._found[k].contact_force
+            wrench[6 * k : 6 * k + 3] = R @ local.linear
+            wrench[6 * k + 3 : 6 * k + 6] = R @ local.angular
+        return np.array(a), wrench
+
+
+FORMS: dict[str, type[Body]] = {"lagrange": DenseBody, "pinocchio": PinocchioBody}

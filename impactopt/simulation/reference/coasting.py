@@ -1,0 +1,89 @@
+"""How a reference that coasts with its soles in place bends: what a plan's servo holds on to in contact."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.collision.settings import REFERENCE_ORDER, no_bend
+from impactopt.errors import InputError, check_array
+from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
+
+__all__ = ["coasting_reference"]
+
+Array = NDArray[np.float64]
+_NODES = 3 * REFERENCE_ORDER
+_SHORTEST = 1e-3  # [s]
+_SHORTER = 0.9
+_OFF = 1e-4  # [rad/s] of a fit that is good
+
+
+def coasting_reference(
+    coordinates: StanceCoordinates, q: ArrayLike, v: ArrayLike, *, until: float = 0.1
+) -> dict[str, NDArray[np.float64]]:
+    """The settings of a collision whose servo's reference keeps the soles in place.
+
+    A plan's reference goes on in contact at the rates ydot of its independent coordinates: the base's pose
+    and the joints outside the legs. So the legs' joint velocities change, as the soles stay where they are.
+    What they gain is fitted by t, t^2, ... t^10, exact in the acceleration at contact, and else best at all
+    times up to one between `until` and half of it: the longest for which the fit is within 1e-4 rad/s, as
+    legs that are all but straight soon ask for velocities without end. What they reach for less, bends less
+    long.
+
+    Parameters
+    ----------
+    coordinates : where the soles are held, such as `ImpactProblem.coordinates`.
+    q, v : (nq), (nv) at contact, Pinocchio's, with the soles in place and at rest.
+    until : [s] since contact; twice as long as that lasts is good.
+
+    Returns
+    -------
+    reference (n, 10) [rad/s^(k + 1)], reference_until [s] : by name, as `collide` takes them.
+
+    Raises
+    ------
+    InputError : wrong shapes or NaN; soles that are not in place; a time that is not positive.
+    """
+    c, robot = coordinates, coordinates.robot
+    q, v = robot.check_configuration(q), robot.check_velocity(v)
+    if not check_array("until [s]", until, ()) > 0:
+        raise InputError(f"until [s]: {until:g}; give a number > 0")
+    if not c.legs:
+        return no_bend(robot.n)
+    y, legs = c.split(q)
+    rates, shortest = _rates(c, y, v), until / 2
+    _, start, bend = c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))
+    orders = np.arange(2, REFERENCE_ORDER + 1)
+    while True:
+        # Chebyshev's nodes: a fit at them is nearly the best at all times
+        times = until * (1 - np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)) / 2
+        try:
+            there = np.array([_at(c, y + rates * t, rates, legs) for t in times])
+        except InputError:
+            if until < _SHORTEST:
+                raise
+        else:
+            left = (there - start - np.outer(times, bend))[:, -robot.n :]
+            share = (times / until)[:, None] ** orders
+            fitted = np.linalg.lstsq(share, left, rcond=None)[0]
+            if np.abs(share @ fitted - left).max() < _OFF or until * _SHORTER < shortest:
+                break
+        until *= _SHORTER
+    reference = np.column_stack([bend[-robot.n :], fitted.T / until**orders])
+    return {"reference": reference, "reference_until": np.array(until)}
+
+
+def _rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
+    """ydot (ny) of a Pinocchio velocity."""
+    rates, b = np.zeros(c.ny), c.base
+    if b:
+        # v is linear in them
+        columns = [base_motion(y[:6], unit, np.zeros(6))[0] for unit in np.eye(6)]
+        rates[:6] = np.linalg.solve(np.transpose(columns), v[:6])
+    rates[b:] = v[b + c.independent]
+    return rates
+
+
+def _at(c: StanceCoordinates, y: Array, rates: Array, near: Array) -> Array:
+    """v (nv) there; `near` are leg joints that inverse kinematics begins with."""
+    return c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, near))[1]

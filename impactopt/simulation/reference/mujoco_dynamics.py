@@ -1,0 +1,242 @@
+"""Full dynamics of a collision in MuJoCo: a second opinion, from other algorithms and another integrator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.collision.result import Collision
+from impactopt.errors import InputError
+from impactopt.robots.robot import Robot
+from impactopt.simulation.mujoco_world import mujoco_module, no_log_file, robot_bodies
+from impactopt.simulation.reference.base import ReferenceModel, converge
+from impactopt.simulation.reference.forces import Forces, Phase
+from impactopt.simulation.reference.motion import Instant
+from impactopt.simulation.reference.record import collision_from
+
+__all__ = ["MujocoDynamics"]
+
+Array = NDArray[np.float64]
+# MuJoCo's own limits: impedance of a constraint, and its time constant in steps
+_IMPEDANCE, _TIME_CONSTANT = 0.9999, 2.0
+_RECORD = 5e-5  # [s] between instants that are kept
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MujocoDynamics(ReferenceModel):
+    """A robot hits a target, in MuJoCo.
+
+    The held frames are welded to the world, as hard as MuJoCo lets them be: their time constant is two steps,
+    so that they get rigid as the step goes to zero. Servo, friction and contact act as applied forces, in
+    MuJoCo's semi-implicit Euler steps. All this is of first order in the step; `converged` extrapolates.
+    The contact's end is found to within a step.
+
+    Attributes
+    ----------
+    friction : of the joints.
+    kp, kd : (n) or (n, n) gains in place of the robot's.
+    step : [s] of the integration.
+
+    Raises
+    ------
+    InputError : as of `CollisionModel`; MuJoCo is not installed; a virtual base, which this has not; gains of
+        a wrong shape or sign; a step that is not positive; in `collide`, a motion that diverges.
+    """
+
+    step: float = 4e-5
+    _stable: ClassVar[float] = 1.8  # of the semi-implicit Euler method: 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        mujoco_module()
+        if np.any(self.held_by.compliance):
+            raise InputError(
+                "MujocoDynamics holds soles exactly only: take FullDynamics for a virtual base, or a stance "
+                "without base_mass and base_inertia"
+            )
+
+    def converged(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None = None,
+        *,
+        tolerance: float = 1e-4,
+        require_separation: bool = True,
+        **overrides: ArrayLike,
+    ) -> tuple[Collision, float]:
+        """(the collision with impulse, energy and velocity extrapolated to steps without length, from the two
+        shortest; what the last halving has changed in this impulse [N s]).
+
+        Steps are halved until that is less than `tolerance`, relative. The histories, and the rest, are
+        those of the shortest steps.
+
+        Raises
+        ------
+        InputError : as of `collide`; no convergence after eight halvings.
+        """
+
+        def extrapolated(fine: Collision, coarse: Collision) -> Collision:
+            return replace(
+                fine,
+                impulse=2 * fine.impulse - coarse.impulse,
+                energy=2 * fine.energy - coarse.energy,
+                velocity=2 * fine.velocity - coarse.velocity,
+            )
+
+        def at(step: float) -> Collision:
+            return self._collide(step, q, v, torque, require_separation, overrides)
+
+        return converge(self.step, at, tolerance, extrapolated)
+
+    def _run(self, step: float, q: Array, v: Array, forces: Forces, normal: Array) -> Collision:
+        robot, frames, _, striker = self._held
+        with no_log_file():
+            world = _World(robot, frames, striker, step)
+            world.start(q, v)
+            return _march(world, forces, normal, self.horizon, len(self.held_by.sole_names(robot)))
+
+
+class _World:
+    """The robot with welded frames, in MuJoCo, in Pinocchio's conventions."""
+
+    def __init__(self, robot: Robot, frames: tuple[str, ...], striker: str, step: float) -> None:
+        self.mujoco, self.robot, self.step = mujoco_module(), robot, step
+        mujoco, spec = self.mujoco, self.mujoco.MjSpec()
+        spec.compiler.degree = False
+        spec.compiler.balanceinertia = False
+        spec.option.timestep = step
+        spec.option.iterations, spec.option.tolerance = 50, 0.0
+        spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        spec.option.gravity = robot.model.gravity.linear
+        bodies = robot_bodies(mujoco, spec, robot)
+        for name in dict.fromkeys((*frames, striker)):
+            frame = robot.model.frames[robot.model.getFrameId(name)]
+            bodies[frame.parentJoint].add_site(
+                name=name, pos=frame.placement.translation, quat=_quaternion(frame.placement.rotation)
+            )
+        for name in frames:
+            spec.worldbody.add_site(name=f"ground {name}")
+            weld = spec.add_equality()
+            weld.type, weld.objtype = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_SITE
+            weld.name1, weld.name2 = name, f"ground {name}"
+            weld.solref = [_TIME_CONSTANT * step, 1.0]
+            weld.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        joints = [self.model.joint(name) for name in robot.joint_names]
+        self.dof = np.array([joint.dofadr[0] for joint in joints])
+        self.place = np.array([joint.qposadr[0] for joint in joints])
+        self.frames = [self.model.site(name).id for name in frames]
+        self.ground = [self.model.site(f"ground {name}").id for name in frames]
+        self.model.site_sameframe[self.ground] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # they are moved
+        self.hand = self.model.site(striker).id
+        self._row = np.zeros((3, self.model.nv))
+        self._wrench_map = np.zeros((6, self.model.nv))
+
+    def start(self, q: Array, v: Array) -> None:
+        """Configuration and velocity at contact; the welds hold what they find."""
+        d, robot = self.data, self.robot
+        if robot.floating:
+            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
+            rotation = pin.Quaternion(q[3:7]).toRotationMatrix()
+            d.qvel[:3], d.qvel[3:6] = rotation @ v[:3], v[3:6]
+        d.qpos[self.place] = robot.joint_positions(q)
+        d.qvel[self.dof] = v[-robot.n :]
+        self._q, self._at_start = q, d.qpos.copy()
+        self.mujoco.mj_kinematics(self.model, d)
+        for frame, ground in zip(self.frames, self.ground, strict=True):
+            self.model.site_pos[ground] = d.site_xpos[frame]
+            quaternion = np.zeros(4)
+            self.mujoco.mju_mat2Quat(quaternion, d.site_xmat[frame])
+            self.model.site_quat[ground] = quaternion
+
+    def look(self, normal: Array) -> float:
+        """Speed of the striking point along the normal [m/s]; leaves its row of the Jacobian."""
+        self.mujoco.mj_step1(self.model, self.data)
+        self.mujoco.mj_jacSite(self.model, self.data, self._row, None, self.hand)
+        self.row = normal @ self._row
+        return float(self.row @ self.data.qvel)
+
+    def push(self, torque: Array, force: float) -> None:
+        """Apply them, and go on by a step."""
+        self.data.qfrc_applied[:] = -force * self.row
+        self.data.qfrc_applied[self.dof] += torque
+        self.mujoco.mj_step2(self.model, self.data)
+
+    def wrenches(self) -> tuple[Array, Array]:
+        """Of the ground on the welded frames (6 a frame), and their places, at the last step's start."""
+        d, J = self.data, self._wrench_map
+        rows = np.reshape(d.efc_J, (-1, self.model.nv))
+        out, places = np.empty((len(self.frames), 6)), np.empty((len(self.frames), 3))
+        for k, frame in enumerate(self.frames):
+            its = slice(6 * k, 6 * k + 6)
+            self.mujoco.mj_jacSite(self.model, d, J[:3], J[3:], frame)
+            # the rows of a weld are in coordinates of its own
+            out[k] = np.linalg.lstsq(J.T, rows[its].T @ d.efc_force[its], rcond=None)[0]
+            places[k] = d.site_xpos[frame]
+        return out.ravel(), places
+
+    def state(self) -> tuple[Array, Array]:
+        """q (nq), v (nv)."""
+        d, robot = self.data, self.robot
+        moved, v = np.zeros(robot.nv), np.zeros(robot.nv)
+        moved[-robot.n :] = (d.qpos - self._at_start)[self.place]
+        v[-robot.n :] = d.qvel[self.dof]
+        q = np.array(pin.integrate(robot.model, self._q, moved))
+        if robot.floating:
+            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
+            rotation = pin.Quaternion(q[3:7]).toRotationMatrix()
+            v[:3], v[3:6] = rotation.T @ d.qvel[:3], d.qvel[3:6]
+        return q, v
+
+
+def _march(world: _World, forces: Forces, normal: Array, horizon: float, soles: int) -> Collision:
+    data, step = world.data, world.step
+    every = max(1, round(_RECORD / step))
+    instants: list[Instant] = []
+    impulse = travel = peak = 0.0
+    target = np.zeros(forces.target.n_states)
+    angles = data.qpos[world.place].copy()
+    k = 0
+    while True:
+        speed = world.look(normal)
+        if k == 0:
+            start = float(normal @ data.site_xpos[world.hand])
+        if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
+            raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
+        time, velocity = k * step, data.qvel[world.dof].copy()
+        target_speed = forces.target_speed(target)
+        rate = speed - target_speed
+        depth = float(normal @ data.site_xpos[world.hand]) - start - travel
+        demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
+        phase: Phase = forces.phase(demand, velocity, depth, rate, target)
+        force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0
+        torque = forces.torque(demand, phase)
+        ends = not phase.touching or time >= horizon * (1 - 1e-9)
+        if ends:
+            end = world.state()
+        world.push(torque - forces.friction(velocity, phase), force)
+        peak = max(peak, force)
+        if ends or k % every == 0:
+            held = world.wrenches()
+            instants.append(Instant(time, force, depth, speed, target_speed, velocity, torque, demand, *held))
+        if ends:
+            return collision_from(instants, *end, impulse, target, soles, forces, not phase.touching)
+        impulse += step * force
+        target = target + step * np.array(forces.target_rates(target, force), dtype=float)
+        travel += step * forces.target_speed(target)
+        k += 1
+
+
+def _quaternion(rotation: Any) -> list[float]:
+    """(w, x, y, z), as MuJoCo has it."""
+    x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
+    return [w, x, y, z]

@@ -1,0 +1,118 @@
+"""Where a motion's links are at some instants, and what its fist weighs at contact: for pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.robot import Robot
+from impactopt.transcription.plan import Trajectory
+
+__all__ = ["Poses", "inverse_mass", "poses_of"]
+
+Array = NDArray[np.float64]
+BEFORE, AFTER = 4, 2  # poses up to contact, and after the one at the contact's end
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Poses:
+    """A motion in a few poses, world frame.
+
+    time (m,) [s]; links (m, l, 2, 3) [m], ends of each link; strikes (l,): whether a link is of the limb that
+    strikes; contact: which of the poses is the first in contact; path (k, 3) [m] of the striking point, at
+    the k instants of the reference; point (3,) [m], normal (3,): of the blow; inverse_mass (3, 3) [1/kg] of
+    the striking point at contact.
+    """
+
+    time: Array
+    links: Array
+    strikes: NDArray[np.bool_]
+    contact: int
+    path: Array
+    point: Array
+    normal: Array
+    inverse_mass: Array
+
+
+def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
+    """Poses from the start over contact and its end to rest, and the striking point's way."""
+    robot = problem.robot
+    begin, end = reference.contact_start, reference.contact_end
+    after = np.linspace(end, reference.end, AFTER + 1)[1:]
+    wanted = np.concatenate([np.linspace(0.0, begin, BEFORE), [end] * (end > begin), after])
+    # the first of two instants at the same time is the one before the reference jumps
+    chosen = np.searchsorted(reference.time, wanted - 1e-9).clip(0, len(reference.time) - 1)
+    at_contact = reference.q[chosen[BEFORE - 1]]
+    links = [_links(robot, problem.striker, reference.q[k]) for k in chosen]
+    strikes = set(robot.model.supports[_striker(robot, problem.striker).parentJoint])
+    moved = [j in strikes for _, j in _bones(robot)]
+    return Poses(
+        time=reference.time[chosen],
+        links=np.array(links),
+        strikes=np.array([True, *moved, *[False] * (2 * len(robot.soles))]),
+        contact=BEFORE - 1,
+        path=np.array([_place(robot, problem.striker, q) for q in reference.q]),
+        point=problem.point,
+        normal=problem.normal,
+        inverse_mass=inverse_mass(problem, at_contact),
+    )
+
+
+def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
+    """J P J' (3, 3) [1/kg] of the striking point, world axes: P is the inverse inertia of the held robot.
+
+    Joints are free, as no servo acts at once; n' J P J' n is one over the effective mass along n (the paper's
+    virtual mass, its section III).
+    """
+    robot = problem.robot
+    model, data = robot.model, robot.model.createData()
+    inverse = np.linalg.inv(pin.crba(model, data, q, pin.Convention.WORLD))
+    held, _ = problem.coordinates.sole_jacobians(q)
+    if len(held):
+        back = inverse @ held.T
+        inverse = inverse - back @ np.linalg.solve(held @ back, back.T)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    frame = model.getFrameId(robot.striker(problem.striker).model_frame)
+    jac = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+    return np.asarray(jac @ inverse @ jac.T)
+
+
+def _bones(robot: Robot) -> list[tuple[int, int]]:
+    """Pairs of joints with a link between them; a free-flyer is no link."""
+    first = 2 if robot.floating else 1
+    return [(int(robot.model.parents[j]), j) for j in range(first, robot.model.njoints)]
+
+
+def _striker(robot: Robot, name: str) -> pin.Frame:
+    return robot.model.frames[robot.model.getFrameId(robot.striker(name).model_frame)]
+
+
+def _links(robot: Robot, striker: str, q: Array) -> list[Array]:
+    """Ends (2, 3) of each link: to the striking point, between joints, then each sole's two."""
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    hand = _striker(robot, striker)
+    ends = [(data.oMi[hand.parentJoint].translation, _point(data, model, hand))]
+    ends += [(data.oMi[a].translation, data.oMi[b].translation) for a, b in _bones(robot)]
+    for sole in robot.soles:
+        frame = model.getFrameId(sole.frame)
+        place, ankle = data.oMf[frame], data.oMi[model.frames[frame].parentJoint].translation
+        heel, toe = (np.array([f(sole.polygon[:, 0]), 0.0, 0.0]) for f in (np.min, np.max))
+        ends += [(ankle, place.translation), (place.act(heel), place.act(toe))]
+    return [np.array(pair) for pair in ends]
+
+
+def _point(data: pin.Data, model: pin.Model, frame: pin.Frame) -> Array:
+    return np.array(data.oMf[model.getFrameId(frame.name)].translation)
+
+
+def _place(robot: Robot, striker: str, q: Array) -> Array:
+    """Where the striking point is (3,) [m]."""
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return _point(data, model, _striker(robot, striker))

@@ -1,0 +1,222 @@
+"""What a re-simulation is given and what it gives back: numbers only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
+from impactopt.errors import InputError
+from impactopt.simulation.solids import Solids, Touched
+
+Array = NDArray[np.float64]
+PHASES = ("swing", "collision", "follow")
+REPORT = (
+    "engine",
+    "standing",
+    "reason",
+    "impulse_Ns",
+    "impulse_error_pct",
+    "step_error_pct",
+    "peak_force_N",
+    "contact_ms",
+    "zmp_margin_m",
+    "sole_slip_mm",
+    "sole_lift_mm",
+    "torque_ratio",
+    "saturated_ms",
+    "final_posture_error_rad",
+    "zmp_margin_by_phase_m",
+    "torque_ratio_by_phase",
+    "sole_lift_collision_mm",
+    "min_normal_force_N",
+    "hand_speed_m_s",
+    "sole_cop_margin_m",
+    "target",
+    "clearance_mm",
+    "nearest",
+    "contacts_besides",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """The target, its contact and the ground.
+
+    point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; law, target:
+    the contact's force and the target's motion; striker: frame of the model that hits; soles: frames of the
+    model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
+    counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
+    else can touch.
+    """
+
+    point: Array
+    normal: Array
+    law: ContactLaw
+    target: Target
+    striker: str
+    soles: tuple[str, ...]
+    corners: tuple[Array, ...]
+    polygon: Array
+    solids: Solids = field(default_factory=Solids)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """Histories over ``time`` (k,) [s] of a re-simulated motion, and when contact began and ended.
+
+    q (k, nq) and v (k, nv), pin's; force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m]
+    servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
+    each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; soles:
+    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, nan
+    where it bears no load; slip, lift (k, soles) [m]: how far the corner of a sole that moved most went along
+    the ground, and rose.
+    contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
+    integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
+    outcome: what the target has of it, as its last touch has left it, by name and unit (``speed_m_s``,
+    ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
+    than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
+    engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
+    that ends farthest from the reference's last posture.  touched: what touched that should not have, where
+    the engine's solids push back.  clearance [m], nearest: the least distance of any two bodies that are not
+    to touch, by exact geometry, and which two.  missed: there was no target.  touches: start and end [s] and
+    impulse [N s] of each.  step_error: relative, of the impulse, what the engine's steps leave uncertain, as
+    an estimate; nan where it was not asked for, or nothing was hit.
+    """
+
+    engine: str
+    time: Array
+    q: Array
+    v: Array
+    force: Array
+    target_speed: Array
+    hand_speed: Array
+    demand: Array
+    torque: Array
+    sole_ground: Array
+    soles: tuple[str, ...]
+    cop_margin: Array
+    slip: Array
+    lift: Array
+    contact_start: float
+    contact_end: float
+    impulse: float
+    peak_force: float
+    outcome: dict[str, float]
+    saturated: float
+    posture_error: float
+    fall: str | None
+    touched: tuple[Touched, ...] = ()
+    clearance: float = np.nan
+    nearest: tuple[str, ...] = ()
+    missed: bool = False
+    touches: tuple[tuple[float, float, float], ...] = ()
+    step_error: float = np.nan
+
+    @property
+    def ground(self) -> Array:
+        """Ground wrench (k, 6) about the world's origin [N, N m]."""
+        return np.asarray(self.sole_ground.sum(axis=1))
+
+    @property
+    def sole_normal(self) -> Array:
+        """Normal force (k, soles) [N] of each sole, negative where the ground would have to pull."""
+        return self.sole_ground[:, :, 2]
+
+    @property
+    def standing(self) -> bool | None:
+        """Whether the robot stands at the end; None where the engine holds its soles to the ground."""
+        return None if self.fall is None else not self.fall
+
+    def zmp(self) -> Array:
+        """Zero moment point (k, 2) [m] on the ground; nan where nothing presses on it."""
+        return centre_of_pressure(self.ground)
+
+    def sole_cop(self) -> Array:
+        """Centre of pressure (k, soles, 2) [m] of each sole, world; nan where it does not press."""
+        return centre_of_pressure(self.sole_ground)
+
+    def phase(self) -> NDArray[np.intp]:
+        """0 swing, 1 collision, 2 follow-through, by the contact that happened."""
+        start = self.contact_start if np.isfinite(self.contact_start) else np.inf
+        end = self.contact_end if np.isfinite(self.contact_end) else np.inf
+        return np.asarray((self.time >= start).astype(int) + (self.time >= end).astype(int))
+
+    def summary(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
+        """Impulse, force, margins and demand by phase, soles, standing; keys as in ``summary.json``."""
+        hit = bool(np.isfinite(self.contact_start))
+        if not hit and self.fall is None:
+            raise InputError("the simulated motion never touched the target")
+        phase, known = self.phase(), bool(np.isfinite(self.clearance))
+        out: dict[str, Any] = {
+            "engine": self.engine,
+            "standing": self.standing,
+            "reason": "the soles are held: only an engine with free soles can tell"
+            if self.fall is None
+            else self.fall,
+            "impulse_Ns": self.impulse,
+            "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1),
+            "target": self.outcome,
+            "step_error_pct": None if np.isnan(self.step_error) else 100 * self.step_error,
+            "peak_force_N": self.peak_force,
+            "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
+            # a target that comes early may touch at once
+            "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]),
+            "saturated_ms": 1e3 * self.saturated,
+            "final_posture_error_rad": self.posture_error,
+            "clearance_mm": 1e3 * self.clearance if known else None,
+            "nearest": " and ".join(self.nearest),
+            "contacts_besides": [touched.summary() for touched in self.touched] if known else None,
+        }
+        ratio = np.abs(self.demand / torque_limit).max(axis=1)
+        out["torque_ratio"] = {
+            n: float(ratio[phase == k].max()) for k, n in enumerate(PHASES) if (phase == k).any()
+        }
+        if len(polygon):
+            inside = distance_inside(polygon, self.zmp())
+            out["zmp_margin_m"] = {
+                n: float(np.nanmin(inside[phase == k]))
+                for k, n in enumerate(PHASES)
+                if np.isfinite(inside[phase == k]).any()
+            }
+            out["min_normal_force_N"] = float(self.sole_normal.min())  # of any one sole
+            out["sole_cop_margin_m"] = {
+                n: float(np.nanmin(m))
+                for n, m in zip(self.soles, self.cop_margin.T, strict=True)
+                if np.isfinite(m).any()
+            }
+            out["sole_slip_mm"] = 1e3 * float(self.slip.max())
+            out["sole_lift_mm"] = 1e3 * float(self.lift.max())
+            collision = self.lift[phase == 1]
+            out["sole_lift_collision_mm"] = 1e3 * float(collision.max()) if collision.size else 0.0
+        return out
+
+    def report(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
+        """The summary with one number for the whole motion where that one has one for each phase.
+
+        Keys as `impactopt validate --json` prints them: ``zmp_margin_m`` is the least, ``torque_ratio`` the
+        largest; ``zmp_margin_by_phase_m`` and ``torque_ratio_by_phase`` are the summary's.
+        """
+        given = self.summary(torque_limit=torque_limit, polygon=polygon, planned_impulse=planned_impulse)
+        margins, ratios = given.get("zmp_margin_m", {}), given["torque_ratio"]
+        given["zmp_margin_m"] = min(margins.values(), default=None)
+        given["torque_ratio"] = max(ratios.values())
+        given |= {"zmp_margin_by_phase_m": margins, "torque_ratio_by_phase": ratios}
+        return {name: given.get(name) for name in REPORT}
+
+
+def centre_of_pressure(wrench: Array) -> Array:
+    """(..., 2) [m] on the ground of (..., 6) wrenches about the world's origin; nan where f_z <= 0."""
+    normal = np.where(wrench[..., 2] > 1e-6, wrench[..., 2], np.nan)
+    return np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / normal[..., None]
+
+
+def distance_inside(polygon: Array, points: Array) -> Array:
+    """Distance (k,) [m] of points (k, 2) from a counter-clockwise polygon's nearest edge, < 0 outside."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    return np.asarray((points @ inward.T - (inward * polygon).sum(axis=1)).min(axis=1))

@@ -1,0 +1,290 @@
+"""Does it stand, and hit, when the world is not quite as planned? Replays under drawn conditions."""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError, check_array, check_whole, shortened
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.robot import Robot
+from impactopt.simulation import Conditions, Scene, scene_of, simulate_mujoco
+from impactopt.simulation.mujoco_world import mujoco_module
+from impactopt.simulation.workers import map_on_workers
+
+__all__ = ["Robustness", "Spread", "draw_conditions", "robustness"]
+
+Array = NDArray[np.float64]
+Z95 = 1.959964  # of the normal distribution: 95 % lie within
+STEP = 5e-4  # [s]: tells who stands as 1e-4 does, and costs a fifth
+MOST_DRAWS = 1_000_000  # each is a replay of a second
+LOGARITHMIC = ("mass", "stiffness", "kp", "kd")  # factors: half is as far from 1 as twice
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Between which bounds conditions are drawn, independently; what they mean: :class:`Conditions`.
+
+    mass, stiffness, kp, kd : factors, log-uniform.  distance [m], payload [kg], friction, torque_limit
+        (a factor) : uniform.
+    period [s] : of the servo, in every draw: a real servo is sampled.
+
+    Raises
+    ------
+    InputError : naming the range whose bounds are crossed, or that no condition could come from.
+    """
+
+    mass: tuple[float, float] = (0.5, 2.0)
+    stiffness: tuple[float, float] = (0.3, 3.0)
+    distance: tuple[float, float] = (-0.02, 0.02)
+    payload: tuple[float, float] = (0.0, 1.0)
+    friction: tuple[float, float] = (0.6, 1.0)
+    kp: tuple[float, float] = (0.7, 1.4)
+    kd: tuple[float, float] = (0.7, 1.4)
+    torque_limit: tuple[float, float] = (0.85, 1.0)
+    period: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name, bounds in self.ranges().items():
+            low, high = check_array(f"spread: {name}", bounds, (2,)).tolist()
+            object.__setattr__(self, name, (low, high))
+            if not low <= high:
+                raise InputError(f"spread: {name} is from {low:g} to {high:g}; give the lower bound first")
+            if name in LOGARITHMIC and not low > 0:
+                raise InputError(f"spread: {name} starts at {low:g}; a factor that is drawn must be > 0")
+            for bound in (low, high):
+                _changed(Conditions(), {name: bound})  # refuses what is out of range
+        Conditions(period=self.period)
+
+    def of(self, scene: Scene) -> Spread:
+        """This spread, without factors of numbers that the scene's law or target does not have."""
+        has = {"mass": scene.target.parameters, "stiffness": scene.law.parameters}
+        none: dict[str, Any] = {name: (1.0, 1.0) for name, numbers in has.items() if name not in numbers}
+        return replace(self, **none)
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """What is drawn, by name, with its bounds."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "period"}
+
+
+def draw_conditions(n: int, seed: int = 0, spread: Spread | None = None) -> list[Conditions]:
+    """n conditions from a spread; of one seed, fewer draws are the first of more.
+
+    Raises
+    ------
+    InputError : n is not at least 1, or the seed is negative.
+    """
+    n = check_whole("draws", n, least=1, most=MOST_DRAWS)
+    seed = check_whole("seed", seed, least=0, most=2**63)
+    if spread is not None and not isinstance(spread, Spread):
+        raise InputError(f"spread: {shortened(repr(spread))}; give a Spread")
+    chosen = spread if spread is not None else Spread()
+    ranges = chosen.ranges()
+    unit = np.random.default_rng(seed).random((n, len(ranges)))
+    columns, planned = {}, Conditions(period=chosen.period)
+    for (name, (low, high)), u in zip(ranges.items(), unit.T, strict=True):
+        value = low * (high / low) ** u if name in LOGARITHMIC else low + (high - low) * u
+        columns[name] = np.clip(value, low, high)  # rounding does not leave the range
+    return [_changed(planned, {name: float(value[k]) for name, value in columns.items()}) for k in range(n)]
+
+
+def _changed(conditions: Conditions, numbers: dict[str, Any]) -> Conditions:
+    return replace(conditions, **numbers)
+
+
+class Row(NamedTuple):
+    """What one replay gave: impulse [N s], largest slip and lift of a sole [m]; nan where it has none."""
+
+    standing: bool
+    reason: str
+    impulse: float = np.nan
+    slip: float = np.nan
+    lift: float = np.nan
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Robustness:
+    """Replays under n drawn conditions.
+
+    standing (n,); reason (n,): why a robot does not stand, or a replay has no result, "" else; impulse (n,)
+    [N s]; slip, lift (n,) [m]: the most that a corner of a sole did; nan where a replay has no result.
+    planned_impulse [N s].
+    """
+
+    conditions: Sequence[Conditions] = field(repr=False)
+    spread: Spread
+    standing: NDArray[np.bool_]
+    reason: Sequence[str]
+    impulse: Array
+    slip: Array
+    lift: Array
+    planned_impulse: float
+
+    @property
+    def draws(self) -> int:
+        return len(self.conditions)
+
+    @property
+    def rate(self) -> float:
+        """Share of the draws that stand; a replay without a result does not."""
+        return float(np.mean(self.standing))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the rate at which the plan stands under the spread."""
+        n, p = self.draws, self.rate
+        middle = (p + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
+        half = Z95 / (1 + Z95**2 / n) * np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n**2))
+        return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+
+    @property
+    def impulse_mean(self) -> float:
+        """[N s] of all draws, falls too; nan if no replay has a result."""
+        known = self.impulse[np.isfinite(self.impulse)]
+        return float(known.mean()) if known.size else float("nan")
+
+    @property
+    def impulse_std(self) -> float:
+        """Standard deviation [N s] of the same draws' impulses."""
+        known = self.impulse[np.isfinite(self.impulse)]
+        return float(known.std()) if known.size else float("nan")
+
+    def reasons(self) -> dict[str, int]:
+        """How often each kind of reason came, most often first; numbers in it are left out."""
+        kinds = (re.sub(r"(?<= )[-+]?(\d[\d.e+-]*|nan|inf)(?=[ ,;:]|$)", "...", text) for text in self.reason)
+        return dict(Counter(kind for kind in kinds if kind).most_common())
+
+    def table(self) -> dict[str, Array]:
+        """What was drawn, (n,) by name."""
+        return {name: np.array([getattr(c, name) for c in self.conditions]) for name in self.spread.ranges()}
+
+    def separation(self) -> dict[str, dict[str, float]]:
+        """By parameter, its mean among draws that stand and that do not (of factors: the geometric mean), and
+        how far apart these are in standard deviations of the draws; nan where there are none.
+        """
+        out = {}
+        for name, value in self.table().items():
+            factor = name in LOGARITHMIC
+            x = np.log(value) if factor else value
+            stands, falls = (
+                float(x[mask].mean()) if mask.any() else float("nan")
+                for mask in (self.standing, ~self.standing)
+            )
+            spread = float(x.std())
+            out[name] = {
+                "stands": float(np.exp(stands)) if factor else stands,
+                "falls": float(np.exp(falls)) if factor else falls,
+                "apart": (falls - stands) / spread if spread > 0 else float("nan"),
+            }
+        return out
+
+    def by_third(self) -> dict[str, list[float]]:
+        """By parameter, the share that stands of draws in the lower, middle and upper third of its range (of
+        factors: of its logarithm): what means hide where both ends fall; nan where there are none.
+        """
+        out = {}
+        for name, value in self.table().items():
+            low, high = self.spread.ranges()[name]
+            x, ends = (np.log(a) if name in LOGARITHMIC else a for a in (value, np.array([low, high])))
+            width = max(float(ends[1] - ends[0]), np.finfo(float).tiny)
+            third = np.clip(np.floor(3 * (x - ends[0]) / width), 0, 2)
+            groups = [self.standing[third == k] for k in range(3)]
+            out[name] = [float(g.mean()) if g.size else float("nan") for g in groups]
+        return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shared:
+    """What every replay needs."""
+
+    robot: Robot
+    reference: Any
+    scene: Scene
+    step: float
+
+
+def replay(shared: _Shared, conditions: Conditions) -> Row:
+    """One draw; what goes wrong is its reason."""
+    try:
+        s = simulate_mujoco(
+            shared.robot, shared.reference, shared.scene, step=shared.step, conditions=conditions
+        )
+    except InputError as error:
+        return Row(standing=False, reason=str(error))
+    except Exception as error:  # whatever MuJoCo raises: other draws may still work
+        return Row(standing=False, reason=f"{type(error).__name__}: {error}")
+    moves = (float(m.max(initial=0.0)) for m in (s.slip, s.lift))
+    return Row(bool(s.standing), s.fall or "", s.impulse, *moves)
+
+
+def _crashed(code: int) -> Row:
+    return Row(standing=False, reason=f"the process of the replay died (exit code {code})")
+
+
+def _check_travels(scene: Scene) -> None:
+    try:
+        pickle.dumps((scene.law, scene.target))
+    except Exception as error:  # as its kind is pickle's or Python's, by what is in the way
+        raise InputError(
+            f"the law or target cannot go to other processes ({error}); define its functions at the top of a "
+            "module, no lambdas, or ask for workers=1"
+        ) from error
+
+
+def robustness(
+    problem: ImpactProblem,
+    reference: Any,
+    planned_impulse: float,
+    *,
+    draws: int = 200,
+    seed: int = 0,
+    spread: Spread | None = None,
+    workers: int = 2,
+    step: float = STEP,
+    progress: Callable[[int, int], None] | None = None,
+) -> Robustness:
+    """Replay a reference in MuJoCo, on free soles, under drawn conditions; numbers do not depend on workers.
+
+    reference : as of :class:`impactopt.transcription.plan.Trajectory`.  planned_impulse [N s].
+    draws, seed, spread : as of :func:`draw_conditions`; a wall has no mass, so none is drawn.
+    workers : processes. A script that asks for more than 1 needs `if __name__ == "__main__":`.
+    step [s] : of the simulation.
+    progress : called with how many replays are done, of how many.
+
+    A replay that diverges, or whose process dies, is a draw that does not stand, with its reason. Ctrl-C ends
+    the processes and is raised.
+
+    Raises
+    ------
+    InputError : draws, seed, workers or step out of range; MuJoCo is not installed; the processes do not
+        start, or a law or target of one's own cannot go to them.
+    """
+    scene = scene_of(problem)
+    chosen = (spread if spread is not None else Spread()).of(scene)
+    conditions = draw_conditions(draws, seed, chosen)
+    if workers < 1:
+        raise InputError(f"{workers} workers; ask for at least 1")
+    if not (np.isfinite(step) and step > 0):
+        raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    mujoco_module()
+    if workers > 1:
+        _check_travels(scene)
+    shared = _Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
+    rows = map_on_workers(replay, shared, conditions, workers=workers, crashed=_crashed, progress=progress)
+    return Robustness(
+        conditions=tuple(conditions),
+        spread=chosen,
+        standing=np.array([row.standing for row in rows]),
+        reason=tuple(row.reason for row in rows),
+        impulse=np.array([row.impulse for row in rows]),
+        slip=np.array([row.slip for row in rows]),
+        lift=np.array([row.lift for row in rows]),
+        planned_impulse=float(planned_impulse),
+    )

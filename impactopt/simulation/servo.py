@@ -1,0 +1,56 @@
+"""The robot's servo as it follows a reference: what both engines apply to the joints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.robots.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class Servo:
+    """Feed-forward, stiffness and damping about a sampled reference, saturated.
+
+    reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n). An instant that stands twice is a jump.
+    kp, kd, limit : factors of the robot's kp, kd and torque limit.
+    """
+
+    def __init__(
+        self, robot: Robot, reference: Any, *, kp: float = 1.0, kd: float = 1.0, limit: float = 1.0
+    ) -> None:
+        self.n = robot.n
+        self.kp, self.kd, self.limit = kp * robot.kp, kd * robot.kd, limit * robot.torque_limit
+        self.time = np.asarray(reference.time)
+        joints = list(robot.model.joints)[-robot.n :]
+        self.place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
+        # a continuous joint's angle is kept as (cosine, sine)
+        self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
+        angles = np.array([self.angles(q) for q in reference.q])
+        angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
+        self.reference = np.hstack([angles, reference.v[:, -robot.n :], reference.torque])
+
+    def angles(self, q: Array) -> Array:
+        """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""
+        out = q[self.place]
+        for k in self.continuous:
+            out[k] = np.arctan2(q[self.place[k] + 1], q[self.place[k]])
+        return out
+
+    def target(self, t: float) -> Array:
+        """Reference angles, rates and feed-forward (3 n,) at a time; at a jump, what comes after it."""
+        i = min(max(int(np.searchsorted(self.time, t, side="right")) - 1, 0), len(self.time) - 2)
+        f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
+        return np.asarray((1 - f) * self.reference[i] + f * self.reference[i + 1])
+
+    def torque(self, t: float, angles: Array, rates: Array) -> tuple[Array, Array]:
+        """Torque demand (n,) [N m] and what saturation leaves of it."""
+        row, n = self.target(t), self.n
+        error = row[:n] - angles
+        if self.continuous.size:
+            error[self.continuous] = np.remainder(error[self.continuous] + np.pi, 2 * np.pi) - np.pi
+        demand = row[2 * n :] + self.kp * error + self.kd * (row[n : 2 * n] - rates)
+        return demand, np.clip(demand, -self.limit, self.limit)

@@ -1,0 +1,102 @@
+"""What can be set on the SQP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.solvers.sqp.qp_solvers import QP_SOLVERS
+
+HESSIANS = ("exact", "bfgs")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SQPOptions:
+    """Options of `solve_sqp`; the defaults suit variables and rows of order one.
+
+    Attributes
+    ----------
+    qp_solver : "interior": every QP is taken one interior-point step towards its solution; or a name in
+        `QP_SOLVERS`, which solves every QP to its end. What is of no use to the one is said below.
+    hessian : "exact" (made convex) or "bfgs" (damped; dense, for some hundred variables at most).
+    violation_tolerance : largest violation of a row or bound at a solution.
+    kkt_tolerance : largest scaled stationarity and complementarity at a solution.
+    complementarity_tolerance : with "interior", the largest multiplier x distance to a bound there, in its
+        place. The objective is off by that times the number of bounds that hold, at most.
+    acceptable_tolerance : the same, for the status ACCEPTABLE where no further step helps.
+    max_iterations, time_limit [s] : limits; the best iterate is returned.
+    radius, radius_max : of the trust region |d|_inf <= radius, at the start and at most.
+    price, price_max : of a unit of violation in the merit function f + price * sum of violations, at the
+        start and at most. It rises above the multipliers; too low a start costs iterations, too low a maximum
+        may end in an infeasible point.
+    levenberg : multiple of the identity always added to the Hessian. It rises by itself where the QP solver
+        struggles: OSQP takes fewer iterations, the SQP more.
+    augmentation : weight of the active rows (in multiples of the Hessian's norm) in making the Hessian
+        convex.
+    curvature_floor : least eigenvalue, in multiples of the Hessian's norm, after making it convex.
+    dense_limit : most variables for which matrices are treated as dense: the Hessian made convex by its
+        eigenvalues rather than by a shift, QPs solved by the dense active-set method.
+    second_order_correction : whether a refused step is corrected for the curvature of the rows.
+    barrier, barrier_warm : with "interior", of the first QP's barrier, without and with multipliers given.
+    push : with "interior", how far the start is moved inside its bounds.
+    """
+
+    qp_solver: str = "interior"
+    hessian: str = "exact"
+    violation_tolerance: float = 1e-6
+    kkt_tolerance: float = 1e-6
+    complementarity_tolerance: float = 1e-6
+    acceptable_tolerance: float = 1e-4
+    max_iterations: int = 500
+    time_limit: float | None = None
+    radius: float = 1.0
+    radius_max: float = 100.0
+    price: float = 100.0
+    price_max: float = 1e5
+    levenberg: float = 0.0
+    augmentation: float = 10.0
+    curvature_floor: float = 1e-6
+    dense_limit: int = 300
+    second_order_correction: bool = True
+    barrier: float = 3e-2
+    barrier_warm: float = 1e-5
+    push: float = 1e-2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant.
+
+        Raises
+        ------
+        InputError : an unknown name, or a number out of its range.
+        """
+        for name, value, known in (
+            ("qp_solver", self.qp_solver, ("interior", *QP_SOLVERS)),
+            ("hessian", self.hessian, HESSIANS),
+        ):
+            if value not in known:
+                raise InputError(
+                    f"{name}: no '{value}'{did_you_mean(value, known)}; there are: {', '.join(sorted(known))}"
+                )
+        if self.qp_solver == "interior" and self.hessian != "exact":
+            raise InputError(
+                'hessian: with qp_solver "interior" it is "exact"; for "bfgs" give another qp_solver, '
+                'such as "active_set"'
+            )
+        may_be_zero = {"levenberg", "augmentation", "max_iterations", "dense_limit"}
+        for option in fields(self):
+            value, default = getattr(self, option.name), option.default
+            if isinstance(default, (bool, str)) or (value is None and default is None):
+                if default is not None and not isinstance(value, type(default)):
+                    wanted = "text" if isinstance(default, str) else "true or false"
+                    raise InputError(f"{option.name}: {value!r}; give {wanted}")
+                continue
+            number = float(check_array(option.name, value, ()))
+            if isinstance(default, int) and number != int(number):
+                raise InputError(f"{option.name}: {value!r}; give a whole number")
+            if not (value > 0 or (value == 0 and option.name in may_be_zero)):
+                raise InputError(f"{option.name}: {value} is out of range; it must be positive")
+        for low, high in (("radius", "radius_max"), ("price", "price_max")):
+            if getattr(self, low) > getattr(self, high):
+                raise InputError(
+                    f"{low} ({getattr(self, low):g}) must not exceed {high} ({getattr(self, high):g})"
+                )

@@ -1,0 +1,45 @@
+"""What one solve is, whatever its steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+from impactopt.solvers.program import Callback, NonlinearProgram, Status, Vector
+from impactopt.solvers.sqp.options import SQPOptions
+from impactopt.solvers.sqp.point import TimedProgram
+from impactopt.solvers.sqp.report import Report
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Task:
+    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds."""
+
+    program: NonlinearProgram
+    options: SQPOptions
+    callback: Callback | None
+    x: Vector
+    y: Vector
+    z: Vector
+
+
+class Run(ABC):
+    """One solve: the program and the point that it has come to, with its multipliers.
+
+    Attributes
+    ----------
+    point : the last iterate. y (m,), z (n,) : multipliers of its rows and bounds.
+    """
+
+    def __init__(self, task: Task):
+        self.report = Report(task.program, task.options.violation_tolerance, task.callback)
+        self.program, self.options = TimedProgram(task.program), task.options
+        self.point = self.program.unknown(task.x)
+        self.y, self.z = task.y, task.z
+
+    @abstractmethod
+    def iterate(self) -> Status:
+        """From the start until a status is reached."""
+
+    def _out_of_time(self) -> bool:
+        return self.options.time_limit is not None and self.report.elapsed() > self.options.time_limit

@@ -1,0 +1,62 @@
+"""A nonlinear program by sequential quadratic programming: the way in."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from impactopt.errors import check_array
+from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, check_program
+from impactopt.solvers.sqp.interior import InteriorRun
+from impactopt.solvers.sqp.options import SQPOptions
+from impactopt.solvers.sqp.run import Task
+from impactopt.solvers.sqp.sl1qp import Sl1QPRun
+
+
+def solve_sqp(
+    program: NonlinearProgram,
+    x0: npt.ArrayLike,
+    *,
+    options: SQPOptions | None = None,
+    callback: Callback | None = None,
+    multipliers: npt.ArrayLike | None = None,
+    bound_multipliers: npt.ArrayLike | None = None,
+) -> SolverResult:
+    """Solve a nonlinear program by sequential quadratic programming.
+
+    Parameters
+    ----------
+    program : the program; its rows and variables should be of order one.
+    x0 : start (n,); moved into the variables' bounds, where every iterate stays.
+    options : see `SQPOptions`.
+    callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
+    multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
+
+    Returns
+    -------
+    The result; infeasible programs, interruption (Ctrl-C) and limits are statuses, not exceptions.
+
+    Raises
+    ------
+    InputError : wrong shapes, NaN, crossing bounds.
+    """
+    x0 = check_program(program, x0)
+    y = np.zeros(program.m) if multipliers is None else check_array("multipliers", multipliers, (program.m,))
+    z = (
+        np.zeros(program.n)
+        if bound_multipliers is None
+        else check_array("bound_multipliers", bound_multipliers, (program.n,))
+    )
+    x0 = np.clip(x0, program.x_lower, program.x_upper)
+    options = options or SQPOptions()
+    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z)
+    interior = options.qp_solver == "interior"
+    run = (InteriorRun if interior else Sl1QPRun)(task)
+    # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
+    with threadpool_limits(limits=1 if interior else None, user_api="blas"):
+        try:
+            status = run.iterate()
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+    return run.report.result(status, run.program, run.point, run.y, run.z)

@@ -1,0 +1,1 @@
+"""Studies of the package itself: `impactopt bench` and `impactopt reproduce`, on the public API."""

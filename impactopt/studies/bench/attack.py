@@ -1,0 +1,194 @@
+"""Does anything break it, or make it silently wrong? Seeded attacks, each judged by something independent.
+
+Mutated problem files, URDFs, command lines with damaged results, and public calls with odd numbers: an answer
+is an `InputError` or is sound, and comes within five seconds. Random collisions: as the same physics by
+another way says, or refused. A case depends on the seed and its number alone: `case` does it again.
+"""
+
+from __future__ import annotations
+
+import signal
+import tempfile
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impactopt.simulation.workers import map_on_workers
+from impactopt.studies.bench.attack_calls import attack_call
+from impactopt.studies.bench.attack_cases import FINE, LATE, REFUSED, TRACEBACK, UNSOUND, Found, pick
+from impactopt.studies.bench.attack_collisions import LAWS, ROBOTS, TARGETS, Struck, strike
+from impactopt.studies.bench.attack_commands import attack_command, make_result
+from impactopt.studies.bench.attack_files import attack_file, texts
+from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
+from impactopt.studies.bench.report import Report, Say, make_table
+
+__all__ = ["COUNTS", "case", "run"]
+
+# files, URDFs, command lines, calls, collisions a robot
+COUNTS = {"file": 20_000, "urdf": 2500, "command": 1000, "call": 5000, "collision": 1000}
+QUICK = {"file": 300, "urdf": 60, "command": 20, "call": 200, "collision": 16}
+NAMES = {"file": "files", "urdf": "urdfs", "command": "commands", "call": "calls"}
+_KINDS = tuple(NAMES)
+_CHUNK = {"file": 50, "urdf": 50, "command": 10, "call": 50}  # cases of one job
+HUNG = 60.0  # [s] after which a case is given up, and its process with it
+_SHOWN = 50
+
+
+def case(kind: str, seed: int, number: int, *, folder: Path, result: Path | None = None) -> Found:
+    """One case: "file", "urdf", "command" or "call" of a seed and a number.
+
+    folder : to work in.  result : a saved one, for command lines; None: none of them has one.
+    """
+    rng = np.random.default_rng([seed, _KINDS.index(kind), number])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # odd numbers overflow
+        if kind == "file":
+            return attack_file(pick(rng, texts()), folder, rng)
+        if kind == "urdf":
+            return attack_urdf(pick(rng, URDFS), folder, rng)
+        if kind == "command":
+            return attack_command(folder / "none" if result is None else result, folder, rng)
+        return attack_call(rng)
+
+
+def run(
+    say: Say,
+    *,
+    quick: bool = False,
+    seed: int = 0,
+    workers: int = 2,
+    counts: dict[str, int] | None = None,
+) -> Report:
+    """How many cases there were, and how many of them ended as none may.
+
+    counts : of cases by kind, and of collisions a robot, in place of the usual ones.
+    """
+    many = {**(QUICK if quick else COUNTS), **(counts or {})}
+    with tempfile.TemporaryDirectory(prefix="impactopt-attack-") as scratch:
+        folder = Path(scratch)
+        result = None
+        if many["command"]:
+            say("planning what is to be damaged")
+            result = make_result(folder)
+        jobs = [
+            (kind, seed, first, min(_CHUNK[kind], many[kind] - first))
+            for kind in _KINDS
+            for first in range(0, many[kind], _CHUNK[kind])
+        ]
+        found = _all(jobs, (folder, result), workers, say)
+    struck = _collisions(many["collision"], seed, workers, say)
+    return report(found, struck)
+
+
+# ------------------------------------------------------------ on several processes
+def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, say: Say) -> list[Found]:
+    def told(done: int, of: int) -> None:
+        say(f"{done} of {of} parts of the attack")
+
+    alarm = workers > 1
+    parts = map_on_workers(
+        _job, (*shared, alarm), jobs, workers=workers, crashed=lambda code: None, progress=told
+    )
+    found = [one for part in parts if part is not None for one in part]
+    # of a part whose process has died or hung, each case in a process of its own
+    lost = [job for job, part in zip(jobs, parts, strict=True) if part is None]
+    single = [(kind, seed, first + k, 1) for kind, seed, first, count in lost for k in range(count)]
+    if single:
+        again = map_on_workers(
+            _job, (*shared, alarm), single, workers=workers, crashed=lambda code: [_dead(code)]
+        )
+        for job, part in zip(single, again, strict=True):
+            found += [_placed(one, job) for one in part or []]
+    return found
+
+
+def _job(shared: Any, job: tuple[str, int, int, int]) -> list[Found] | None:
+    folder, result, alarm = shared
+    kind, seed, first, count = job
+    found = []
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        for number in range(first, first + count):
+            if alarm:  # the kernel's: nothing else stops compiled code
+                signal.setitimer(signal.ITIMER_REAL, HUNG)
+            one = case(kind, seed, number, folder=Path(own), result=result)
+            found.append(_placed(one, (kind, seed, number, 1)))
+    if alarm:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    return found
+
+
+def _placed(found: Found, job: tuple[str, int, int, int]) -> Found:
+    """With the numbers that make it again, and without what cannot be of use any more."""
+    kind, seed, number, _ = job
+    kept = found.case if found.verdict not in (FINE, REFUSED) else ""
+    return Found(
+        kind=kind,
+        verdict=found.verdict,
+        reason=f"{found.reason} (seed {seed}, number {number})" if kept or not found.kind else "",
+        case=kept,
+        seconds=found.seconds,
+    )
+
+
+def _dead(code: int) -> Found:
+    if code == -signal.SIGALRM:
+        return Found(kind="", verdict=LATE, reason=f"no answer within {HUNG:g} s")
+    return Found(kind="", verdict=TRACEBACK, reason=f"the process died ({code})")
+
+
+def _collisions(count: int, seed: int, workers: int, say: Say) -> list[Struck]:
+    """So many a robot, shared by laws and targets."""
+    every = [(robot, law, target) for robot in ROBOTS for law in LAWS for target in TARGETS]
+    pairs = len(LAWS) * len(TARGETS)
+    shares = [count // pairs + (k % pairs < count % pairs) for k in range(len(every))]
+    jobs = [(*what, share, seed) for what, share in zip(every, shares, strict=True) if share]
+    return map_on_workers(
+        _strike,
+        None,
+        jobs,
+        workers=workers,
+        crashed=lambda code: Struck(collisions=1, off=1, faults=(f"the process died ({code})",)),
+        progress=lambda done, of: say(f"{done} of {of} models struck"),
+    )
+
+
+def _strike(_shared: None, job: tuple[str, str, str, int, int]) -> Struck:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the equation's solver tries what overflows
+        return strike(*job)
+
+
+# ------------------------------------------------------------ what came out
+def report(found: Sequence[Found], struck: Sequence[Struck]) -> Report:
+    """Counts for JSON; for the screen also every fault, with what makes it again."""
+    counts = Counter((one.kind, one.verdict) for one in found)
+    cases = Counter(one.kind for one in found)
+    numbers: dict[str, Any] = {name: cases[kind] for kind, name in NAMES.items()}
+    numbers["tracebacks"] = sum(counts[kind, TRACEBACK] for kind in NAMES)
+    numbers["slow"] = sum(counts[kind, LATE] for kind in NAMES)
+    numbers["unsound"] = sum(counts[kind, UNSOUND] for kind in NAMES)
+    for name in ("collisions", "off", "refused"):
+        numbers[name] = sum(getattr(one, name) for one in struck)
+    verdicts = (FINE, REFUSED, TRACEBACK, LATE, UNSOUND)
+    rows = [
+        [name, str(cases[kind]), *(str(counts[kind, v]) for v in verdicts)] for kind, name in NAMES.items()
+    ]
+    tables = [make_table("attacks", ["of", "cases", *verdicts], rows)]
+    told = [f"{sum(one.unjudged for one in struck)}", f"{max((s.largest for s in struck), default=0.0):.0e}"]
+    row = [str(numbers[name]) for name in ("collisions", "off", "refused")] + told
+    heads = ["", "collisions", "off", "refused", "too slow to judge", "largest error"]
+    tables.append(make_table("collisions by another way", heads, [["all", *row]]))
+    faults = [
+        [one.kind, one.verdict, one.reason, one.case[:300]]
+        for one in found
+        if one.verdict not in (FINE, REFUSED)
+    ]
+    faults += [["collision", "off", "", text] for one in struck for text in one.faults]
+    if faults:
+        shown = f"faults ({len(faults)})" + (f", the first {_SHOWN}" if len(faults) > _SHOWN else "")
+        tables.append(make_table(shown, ["of", "verdict", "what", "case"], faults[:_SHOWN]))
+    return Report(name="attack", numbers=numbers, tables=tables)

@@ -1,0 +1,136 @@
+"""CasADi's `sqpmethod` on a numeric program: a line-search SQP with the same exact derivatives as ours.
+
+A peer to measure against; plans are not solved by it.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from impactopt.solvers.ipopt_functions import BufferFunction, Functions, Pattern, Progress
+from impactopt.solvers.program import (
+    NonlinearProgram,
+    SolverResult,
+    Status,
+    Vector,
+    max_violation,
+    stationarity,
+)
+
+__all__ = ["solve_sqpmethod"]
+
+MAX_ITERATIONS = 500
+_STATUS = {
+    "Solve_Succeeded": Status.SOLVED,
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+}
+_SILENT = {"print_header": False, "print_iteration": False, "print_status": False, "print_time": False}
+_QP_OPTIONS: dict[str, dict[str, Any]] = {
+    "qpoases": {"printLevel": "none"},
+    "piqp": {},
+}
+
+
+def solve_sqpmethod(
+    program: NonlinearProgram, x0: Vector, time_limit: float, *, qp: str = "qpoases"
+) -> SolverResult:
+    """Solve by CasADi's `sqpmethod`, its Hessian shifted until it is convex, elastic where rows contradict.
+
+    qp : CasADi's name of the QP solver.  time_limit [s] : looked at once an iteration and in the functions.
+    """
+    began = time.perf_counter()
+    functions = Functions(program, 1e-6, began + time_limit)
+    functions.start(x0)
+    progress = Progress(functions, None, began)
+    solver, _alive = _build(functions, progress, x0, qp)
+    bounds = {
+        "lbx": program.x_lower, "ubx": program.x_upper, "lbg": program.g_lower, "ubg": program.g_upper
+    }  # fmt: skip
+    seconds_qp = np.nan
+    x, y, z = x0, np.zeros(program.m), np.zeros(program.n)
+    try:
+        answer = solver(x0=x0, **bounds)
+        stats = solver.stats()
+        outcome, seconds_qp = str(stats["return_status"]), float(stats.get("t_wall_QP", np.nan))
+        x, y, z = (np.array(answer[key]).ravel() for key in ("x", "lam_g", "lam_x"))
+    except RuntimeError as error:  # its QP solver gave up
+        outcome = str(error).strip().splitlines()[-1]
+    if functions.error is not None:
+        raise functions.error
+    status = Status.TIME_LIMIT if functions.out_of_time else _STATUS.get(outcome, Status.FAILED)
+    if not status.usable and functions.best.x is not None:
+        x = functions.best.x
+    seconds = time.perf_counter() - began
+    g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
+    return SolverResult(
+        x=x,
+        multipliers=y,
+        bound_multipliers=z,
+        objective=float(program.objective(x)),
+        status=status,
+        iterations=max(len(progress.history) - 1, 0),
+        seconds=seconds,
+        seconds_functions=functions.seconds,
+        seconds_qp=seconds_qp,
+        max_violation=max_violation(program, x, g),
+        kkt=stationarity(gradient, jacobian, y, z),
+        message="out of time" if functions.out_of_time else outcome,
+    )
+
+
+def _build(functions: Functions, progress: Progress, x0: Vector, qp: str) -> tuple[Any, list[Any]]:
+    """The nlpsol object, and what has to stay alive as long as it does."""
+    program = functions.program
+    n, m = program.n, program.m
+    column, none = ca.Sparsity.dense, ca.Sparsity.dense(0, 1)
+    functions.jacobian_pattern = Pattern(program.jacobian(x0))
+    functions.hessian_pattern = Pattern(program.hessian(x0, 1.0, np.zeros(m)))
+    point = {"x": column(n, 1), "p": none}
+    f = BufferFunction("f", {"x": column(n, 1)}, {"f": column(1, 1)}, functions.objective)
+    g = BufferFunction("g", {"x": column(n, 1)}, {"g": column(m, 1)}, functions.constraints)
+    derivatives = BufferFunction(
+        "nlp_jac_fg",
+        point,
+        {
+            "f": column(1, 1),
+            "grad_f_x": column(n, 1),
+            "g": column(m, 1),
+            "jac_g_x": functions.jacobian_pattern.casadi(),
+        },
+        functions.objective,
+        functions.gradient,
+        functions.constraints,
+        functions.jacobian,
+    )
+    hessian = BufferFunction(
+        "nlp_hess_l",
+        {**point, "lam_f": column(1, 1), "lam_g": column(m, 1)},
+        {"hess_gamma_x_x": functions.hessian_pattern.casadi()},
+        functions.hessian,
+    )
+    outputs = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": 0}
+    watch = BufferFunction(
+        "progress", {k: column(v, 1) for k, v in outputs.items()}, {"stop": column(1, 1)}, progress
+    )
+    x = ca.MX.sym("x", n)
+    options = {
+        **_SILENT,
+        "qpsol": qp,
+        "qpsol_options": {"error_on_fail": False, **_QP_OPTIONS[qp]},
+        "jac_fg": derivatives,
+        "hess_lag": hessian,
+        "iteration_callback": watch,
+        "convexify_strategy": "regularize",
+        "elastic_mode": True,
+        "max_iter": MAX_ITERATIONS,
+        "error_on_fail": False,
+        "show_eval_warnings": False,
+        "no_nlp_grad": True,
+    }
+    solver = ca.nlpsol("sqpmethod", "sqpmethod", {"x": x, "f": f(x), "g": g(x)}, options)
+    return solver, [f, g, derivatives, hessian, watch]

@@ -1,0 +1,176 @@
+"""The methods and settings that the bench of collisions times, each ready to run, and what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from impactopt.collision import SDC, Collision, VirtualMass
+from impactopt.errors import InputError
+from impactopt.simulation.reference import FullDynamics
+from impactopt.studies.bench.clock import runner
+from impactopt.studies.bench.peers import cvodes, mujoco_loop, mujoco_steps, pinocchio_calls
+from impactopt.studies.bench.report import Say
+from impactopt.studies.bench.scene import EVALUATION, Scene, graph, inputs, outcome, run_of
+
+__all__ = ["Entry", "entries"]
+
+PAPER_STEPS = (1e-3, 1e-4, 1e-5, 2e-6)  # [s]; 1e-6 would be more steps than a model allows
+TAYLOR_STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)
+OUR_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
+FREEZES = (1, 2, 4, 8)
+FULL_STEPS = (4e-4, 2e-4, 1e-4)
+MUJOCO_STEPS = (1e-3, 2e-4, 1e-4, 5e-5)
+TOLERANCES = (1e-4, 1e-6, 1e-8)
+COLUMN = 1e-3  # [s] between instants of the histories, the same for all that are not longer steps
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Entry:
+    """A method and setting: what runs it once, and what came out, where that is known."""
+
+    method: str
+    setting: str
+    run: Callable[[], Any]
+    result: Collision | None = None
+    impulse: float | None = None
+    note: str | None = None
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return self.method, self.setting
+
+
+def entries(scene: Scene, true: Collision, say: Say, quick: bool) -> tuple[list[Entry], list[dict[str, Any]]]:
+    """What can be run, and rows of what cannot."""
+    found: list[Entry] = []
+    refused: list[dict[str, Any]] = []
+    case, ours = scene.case, _ours(scene, say, found, refused)
+    usual = f"tolerance {scene.model(SDC).tolerance:g}"
+    ours("virtual mass", usual, lambda: scene.model(VirtualMass))
+    paper = partial(scene.model, SDC.paper)
+    for step in (1e-4,) if quick else PAPER_STEPS:
+        ours("paper, by hand", f"{step:g} s", partial(_stepped, paper, step))
+    for tolerance in (1e-7,) if quick else OUR_TOLERANCES:
+        ours("sdc", f"tolerance {tolerance:g}", partial(scene.model, SDC, tolerance=tolerance))
+    for step in (2.5e-4,) if quick else TAYLOR_STEPS:
+        taylor = partial(scene.model, SDC, method="events", step=step)
+        ours("sdc, Taylor's steps", f"{_plain(step)} s", taylor)
+    for freezes in (2,) if quick else FREEZES:
+        ours(f"sdc, {freezes} freezes", usual, partial(scene.model, SDC, freezes=freezes))
+    found += _by_graph(scene, paper, say)
+    exact = scene.model(SDC, method="exact")
+    frozen = exact.collide(case.q, case.v, case.torque)
+    found.append(
+        Entry(
+            method="exact",
+            setting="in Python",
+            run=lambda: exact.collide(case.q, case.v, case.torque),
+            result=frozen,
+        )
+    )
+    found += _peers(scene, true, frozen, say, quick)
+    return found, refused
+
+
+def _ours(
+    scene: Scene, say: Say, found: list[Entry], refused: list[dict[str, Any]]
+) -> Callable[[str, str, Callable[[], Any]], None]:
+    """Adds a model of ours, which it makes, to what is found, or the reason against it to what is refused."""
+    case = scene.case
+
+    def add(method: str, setting: str, make: Callable[[], Any]) -> None:
+        say(f"{scene.name}: {method}, {setting}")
+        try:
+            model = make()
+            longest = model.stable_step(case.q)
+            if model.stepping != "implicit" and model.step_length >= longest:
+                raise InputError(f"unstable: the longest stable step is {longest:.2g} s")
+        except InputError as error:
+            refused.append({"method": method, "setting": setting, "note": str(error)})
+            return
+        every = max(1, round(COLUMN / model.step_length))
+        wanted = tuple(name for name in EVALUATION if name in model.available)
+        run = run_of(model, case, wanted, every=every)
+        result = outcome(model, case, every=every)
+        found.append(Entry(method=method, setting=setting, run=run, result=result))
+
+    return add
+
+
+def _stepped(make: Callable[..., Any], step: float) -> Any:
+    return replace(make(), step=step)
+
+
+def _plain(step: float) -> str:
+    return {2.5e-4: "2.5e-4", 5e-4: "5e-4"}.get(step, f"{step:g}")
+
+
+def _by_graph(scene: Scene, paper: Callable[..., Any], say: Say) -> list[Entry]:
+    """The paper's scheme and ours by CasADi's route: from the graph to C, at -O1."""
+    made = []
+    taylor = scene.model(SDC, method="events")
+    for method, model in (("paper, CasADi's C", paper()), ("sdc, CasADi's C", taylor)):
+        say(f"{scene.name}: {method}")
+        wanted = tuple(name for name in EVALUATION if name in model.available)
+        run = runner(graph(model, wanted), inputs(model, scene.case))
+        made.append(
+            Entry(
+                method=method,
+                setting=f"{_plain(model.step_length)} s",
+                run=run,
+                result=outcome(model, scene.case),
+            )
+        )
+    return made
+
+
+def _peers(scene: Scene, true: Collision, frozen: Collision, say: Say, quick: bool) -> list[Entry]:
+    case, made = scene.case, []
+    for tolerance in (1e-7,) if quick else TOLERANCES:
+        run, impulse = cvodes(scene, frozen.duration, tolerance)
+        note = "frozen; its end is given to it; the freeze is not in the time"
+        made.append(
+            Entry(
+                method="CVODES by CasADi",
+                setting=f"tolerance {tolerance:g}",
+                run=run,
+                impulse=impulse(),
+                note=note,
+            )
+        )
+    calls = pinocchio_calls(scene)["constrained dynamics"]
+    for step in (1e-4,) if quick else FULL_STEPS:
+        say(f"{scene.name}: full dynamics, {step:g} s")
+        model = scene.model(FullDynamics, step=step, form="pinocchio")
+        try:
+            result = model.collide(case.q, case.v, case.torque)
+        except InputError:
+            continue  # the servo's fastest mode needs a shorter one
+        run = partial(model.collide, case.q, case.v, case.torque)
+        setting = f"{step:g} s"
+        made.append(Entry(method="Pinocchio, loop in Python", setting=setting, run=run, result=result))
+        times = 4 * round(true.duration / step)
+        alone: Callable[[], Any] = partial(_many, calls, times)
+        note = "constraintDynamics alone, four times a step: a bound from below"
+        made.append(Entry(method="Pinocchio, calls alone", setting=setting, run=alone, note=note))
+    for step in (1e-4,) if quick else MUJOCO_STEPS:
+        say(f"{scene.name}: MuJoCo, {step:g} s")
+        setting = f"{step:g} s"
+        alone = mujoco_steps(scene, step, true.duration)
+        note = "mj_step alone, without servo, law and records: a bound from below"
+        made.append(Entry(method="MuJoCo, steps alone", setting=setting, run=alone, note=note))
+        loop = mujoco_loop(scene, step)
+        try:
+            result = loop()
+        except InputError:
+            continue
+        made.append(Entry(method="MuJoCo, loop in Python", setting=setting, run=loop, result=result))
+    return made
+
+
+def _many(call: Callable[[], Any], times: int) -> None:
+    for _ in range(times):
+        call()

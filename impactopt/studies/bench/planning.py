@@ -1,0 +1,42 @@
+"""From a problem file to a plan that is worth measuring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from impactopt.errors import InputError
+from impactopt.files.problem_file import read_problem_file
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.studies.bench.report import Say
+
+DEMO = Path("problems/punch.toml")
+
+
+def plan_of(file: Path, say: Say) -> Solution:
+    """The solution of a problem file, by the solver that it names.
+
+    Raises
+    ------
+    InputError : the file is wrong, or its problem is not solved.
+    """
+    solution = solved(file, say)
+    if not solution.status.usable:
+        raise InputError(
+            f"the plan of {file} is not usable ({solution.result.message}); see what "
+            f"`impactopt solve {file}` says of it"
+        )
+    return solution
+
+
+def solved(file: Path, say: Say) -> Solution:
+    """The same, whatever the solver made of it."""
+    read = read_problem_file(file)
+    say(f"planning {file}")
+    solver = read.solver.name
+    options: Mapping[str, Any] | None = read.solver.options.get(solver)
+    solution = solve(read.build(), solver=solver, options=options, time_limit=read.solver.time_limit)
+    say(f"{file}: {solution.status.value}, {solution.impulse:.2f} N s, {solution.solve_seconds:.1f} s")
+    return solution

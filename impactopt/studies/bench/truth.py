@@ -1,0 +1,143 @@
+"""Is what is planned what happens? Punches, planned and then replayed with held soles and with free ones.
+
+One row a problem: how the solver ended; from the replay with held soles (Pinocchio) the impulse's error, the
+least ZMP margin, the largest torque demand over limit and the least normal force of a sole; from the replay
+with free soles (MuJoCo) the impulse's error, slip, lift in the collision, and whether the robot stands at the
+end. What fails stays in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
+from impactopt.errors import InputError
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.robots.presets import talos
+from impactopt.studies.bench.planning import DEMO, solved
+from impactopt.studies.bench.report import Report, Say, columns_table
+
+TIME_LIMIT = 60.0  # [s] of the solver, for the variants
+
+# what differs from the demo's punch
+VARIANTS: dict[str, dict[str, Any]] = {
+    "demo": {},
+    "nearer": {"point": [0.55, -0.2, 1.05]},
+    "higher": {"point": [0.55, -0.3, 1.25]},
+    "20 kg": {"target": FreeMass(mass=20.0)},
+    "1 kg": {"target": FreeMass(mass=1.0)},
+    "10 x stiffer": {"law": SpringDamper(stiffness=1e5, damping=300.0)},
+    "left hand": {"striker": "left_hand", "point": [0.6, 0.25, 1.1]},
+    "free durations": {
+        "swing": Phase(duration=(0.5, 1.0)),
+        "follow": Phase(duration=(0.6, 1.4), intervals=10),
+    },
+}
+
+HELD = (
+    ("problem", "problem", 0),
+    ("status", "status", 0),
+    ("steps", "iterations", 0),
+    ("s", "solve_seconds", 1),
+    ("N s", "impulse_planned_Ns", 2),
+    ("error %", "impulse_error_pct", 2),
+    ("ZMP mm", "zmp_margin_mm", 1),
+    ("torque", "torque_ratio", 2),
+    ("force N", "min_normal_force_N", 0),
+    ("apart mm", "clearance_mm", 1),
+    ("touches", "touches", 0),
+)
+FREE = (
+    ("problem", "problem", 0),
+    ("error %", "replay_impulse_error_pct", 2),
+    ("slip mm", "replay_slip_mm", 1),
+    ("lift mm", "replay_lift_collision_mm", 2),
+    ("apart mm", "replay_clearance_mm", 1),
+    ("touches", "replay_touches", 0),
+    ("stands", "standing", 0),
+)
+
+
+def run(say: Say, *, folder: Path = DEMO.parent) -> Report:
+    """Every problem file of the folder, and the variants of the demo's punch."""
+    rows = [row(name, solution, say) for name, solution in problems(folder, say)]
+    margins = [r.get("zmp_margin_m") for r in rows]
+    shown = [
+        {**r, "zmp_margin_mm": None if m is None else 1e3 * m} for r, m in zip(rows, margins, strict=True)
+    ]
+    tables = (
+        columns_table("planned, and replayed on held soles", HELD, shown),
+        columns_table("replayed on free soles", FREE, shown),
+    )
+    return Report(name="truth", numbers={"rows": rows}, tables=tables)
+
+
+def problems(folder: Path, say: Say) -> Iterator[tuple[str, Callable[[], Solution]]]:
+    """Names, and what solves them."""
+    files = sorted(folder.glob("*.toml"))
+    for file in files:
+        yield file.name, lambda file=file: solved(file, say)  # type: ignore[misc]
+    for name, changes in VARIANTS.items():
+        if name != "demo" or folder / DEMO.name not in files:
+            yield name, lambda name=name, changes=changes: _variant(name, changes, say)  # type: ignore[misc]
+
+
+def _variant(name: str, changes: dict[str, Any], say: Say) -> Solution:
+    options: dict[str, Any] = {
+        "robot": talos(),
+        "striker": "right_hand",
+        "point": [0.6, -0.25, 1.1],
+        "normal": [1.0, 0.0, 0.0],
+        "law": SpringDamper(stiffness=1e4, damping=300.0),
+        "target": FreeMass(mass=5.0),
+    }
+    say(f"planning {name}")
+    return solve(ImpactProblem(**{**options, **changes}), time_limit=TIME_LIMIT)
+
+
+def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
+    """What one problem gives; an error is its status, and ends what can be said of it.
+
+    clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
+    """
+    out: dict[str, Any] = {"problem": name}
+    try:
+        solution = plan()
+        summary = solution.outcome()
+        out |= {key: summary[key] for key in ("status", "iterations", "solve_seconds")}
+        out["impulse_planned_Ns"] = solution.impulse
+        told = solution.summary(solution.validate())
+        held = told["simulated"]
+        out |= {
+            "clearance_mm": min(told["clearance_mm"], held["clearance_mm"]),
+            "touches": len(told["contacts_besides"]) + len(held["contacts_besides"]),
+            "impulse_error_pct": held["impulse_error_pct"],
+            "zmp_margin_m": min(held.get("zmp_margin_m", {}).values(), default=None),
+            "torque_ratio": max(held["torque_ratio"].values()),
+            "min_normal_force_N": held.get("min_normal_force_N"),
+        }
+    except InputError as error:
+        out["status"] = out.get("status", "error")
+        out["error"] = str(error)
+        say(f"{name}: {error}")
+        return out
+    try:
+        free = solution.summary(solution.validate(engine="mujoco"))["simulated"]
+    except InputError as error:
+        out |= {"standing": None, "reason": str(error)}
+        return out
+    out |= {
+        "replay_impulse_error_pct": free["impulse_error_pct"],
+        "replay_slip_mm": free.get("sole_slip_mm"),
+        "replay_lift_collision_mm": free.get("sole_lift_collision_mm"),
+        "replay_clearance_mm": free["clearance_mm"],
+        "replay_touches": len(free["contacts_besides"] or ()),
+        "standing": free["standing"],
+        "reason": free["reason"],
+    }
+    return out

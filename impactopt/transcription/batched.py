@@ -1,0 +1,142 @@
+"""Compiled functions called for many instances through buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impactopt.transcription.layout import Affine, Array, stack
+from impactopt.transcription.rows import Index
+
+# of functions that take one instance a call: those in lanes are done before a thread has started
+THREADS = 2
+
+
+class BatchedFunction:
+    """A CasADi function of ``count`` instances, called through its buffer: no copies, no Python lists.
+
+    The function takes as many instances a call as z has columns.
+    """
+
+    def __init__(self, function: Any, count: int, parameters: Array) -> None:
+        self._function = function
+        self.columns = columns = function.size2_in(0)
+        calls = -(-count // columns)
+        threads = ("thread", THREADS) if columns == 1 else ()
+        self._mapped = function.map(calls, *threads) if calls > 1 else function
+        self._buffer, self._run = self._mapped.buffer()
+        # instances beyond `count` fill the last call up: they are the last one, again
+        self.inputs = [np.zeros((calls * columns, function.size1_in(i))) for i in range(function.n_in())]
+        self.inputs[1][...] = parameters[np.minimum(np.arange(calls * columns), count - 1)]
+        self.count, self._shape = count, (calls * columns, function.nnz_out(0) // columns)
+        for i, a in enumerate(self.inputs):
+            if a.size:
+                self._buffer.set_arg(i, a.data)
+        self.write_to(np.zeros(self.size))
+
+    def copy(self) -> BatchedFunction:
+        """The same, with numbers of its own."""
+        return BatchedFunction(self._function, self.count, self.inputs[1][: self.count])
+
+    @property
+    def size(self) -> int:
+        """Numbers that a call writes: those of the instances, and behind them what fills the last call up."""
+        return self._shape[0] * self._shape[1]
+
+    def write_to(self, numbers: Array) -> None:
+        """From now on calls write to these (size,)."""
+        self._all = numbers.reshape(self._shape)
+        self.output = self._all[: self.count]
+        if numbers.size:
+            self._buffer.set_res(0, self._all.data)
+
+    def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
+        """Rows are instances: z (count, n_z) -> (count, nnz of the output).
+
+        The result is overwritten by the next call.
+        """
+        self.inputs[0][: self.count] = z
+        self.inputs[0][self.count :] = z[-1:]
+        if multipliers is not None:
+            self.inputs[2][: self.count] = multipliers
+        self._run()
+        return self.output
+
+    @property
+    def pattern(self) -> tuple[Index, Index]:
+        """Rows and columns of an instance's nonzeros, in CasADi's (column-major) order."""
+        rows, columns = pattern(self._mapped.sparsity_out(0))
+        return rows[: self.output.shape[1]], columns[: self.output.shape[1]]
+
+
+def pattern(sparsity: Any) -> tuple[Index, Index]:
+    """Rows and columns of a CasADi sparsity's nonzeros, in its (column-major) order."""
+    start = np.array(sparsity.colind(), dtype=np.intp)
+    columns = np.repeat(np.arange(sparsity.size2()), start[1:] - start[:-1])
+    return np.array(sparsity.row(), dtype=np.intp), columns
+
+
+@dataclass
+class Block:
+    """``count`` instances of a compiled function  out = f(z), its Jacobian and the Hessian of lambda.out."""
+
+    name: str
+    value: BatchedFunction
+    jacobian: BatchedFunction
+    hessian: BatchedFunction
+    n_in: int
+    n_out: int
+    count: int
+    lift: Affine  # (count * n_in)
+    jac_pattern: tuple[Index, Index]
+    hess_pattern: tuple[Index, Index]
+
+    def copy(self) -> Block:
+        """The same for another program: a program tells its functions where to write."""
+        parts = {name: getattr(self, name).copy() for name in ("value", "jacobian", "hessian")}
+        return replace(self, **parts)
+
+    @classmethod
+    def make(
+        cls,
+        name: str,
+        functions: dict[str, Any],
+        instances: Sequence[Sequence[Affine]],
+        parameters: ArrayLike,
+    ) -> Block:
+        """``functions``: of one instance, or `in_lanes`; ``instances``: of each, the slots that make up z.
+
+        ``parameters``: (n_p,) for all or (count, n_p).
+        """
+        n_in = functions[name].size1_in(0)
+        lifts = [stack(slots) for slots in instances]
+        for lift in lifts:
+            if lift.size != n_in:
+                raise ValueError(f"block {name} takes {n_in} inputs, was given {lift.size}")
+        return cls.of_lift(name, functions, stack(lifts), len(lifts), parameters)
+
+    @classmethod
+    def of_lift(
+        cls, name: str, functions: dict[str, Any], lift: Affine, count: int, parameters: ArrayLike
+    ) -> Block:
+        """As :meth:`make`, of all instances' z (count * n_in) as one expression."""
+        f, j, h = functions[name], functions[f"{name}_jac"], functions[f"{name}_hess"]
+        n_in, n_out = f.size1_in(0), f.size1_out(0)
+        p = np.broadcast_to(np.asarray(parameters, dtype=float), (count, f.size1_in(1)))
+        value, jacobian, hessian = (BatchedFunction(function, count, p) for function in (f, j, h))
+        return cls(
+            name=name,
+            value=value,
+            jacobian=jacobian,
+            hessian=hessian,
+            n_in=n_in,
+            n_out=n_out,
+            count=count,
+            lift=lift,
+            jac_pattern=jacobian.pattern,
+            hess_pattern=hessian.pattern,
+        )

@@ -1,0 +1,228 @@
+"""How far a planned contact is from the one that its equations have, and the elements that bring it nearer.
+
+The contact is integrated once more from the plan's state at contact, by the same equations on elements half
+as long, over the same time, and by the contact law with its switches in place of one branch a phase. What
+its impulse then is another by, the plan is wrong by. Where its force falls below zero within a phase, or does
+not fall to zero at the end, the plan has missed an event: the bodies part, and may meet again.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.blocks import DEPTH_SCALE, RESTITUTING
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.finer_contact import carry_contact, same_places
+from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.mesh import Elements, halved
+from impactopt.transcription.rows import Index
+from impactopt.transcription.structured import StructuredProgram
+
+ASKED = 0.5  # [%] of the impulse: the error that is not worth another solve
+_MISSED = 0.02  # of the peak force: how far it may be below zero within a phase, or above it at the end
+_TURNED = 1e-3  # of the peak force: what the law's other branch may differ by where it is the right one
+_STEPS, _MET = 8, 1e-7  # of Newton's method, and the residual at which it is done
+_SWITCHES = 6  # at most: how often points change the branch of the law that they are on
+_ORDER = 5  # of which the error of an element is in its length, at best
+_PARTS = 4  # an element is cut into, at most
+_MOST = 16  # elements of a phase
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactError:
+    """Of a plan's contact, the worst of those with its targets.
+
+    pct : error of the impulse [%]; inf where an event is missed, or no contact was found.
+    coarse : what of it is the elements'; the rest is that phases hold to one branch of the law.
+    of_elements : what each element of each phase adds to `coarse` [%].
+    missed : whether an event is missed.
+    """
+
+    pct: float
+    coarse: float
+    of_elements: Elements
+    missed: bool
+
+
+def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
+    """The error of the contact of solver variables (n,); None of an impact without duration."""
+    if not isinstance(t.expected, Collision):
+        return None
+    again = _Again(t, x)
+    try:
+        branches, law = again.integrated(x)
+    except ArithmeticError:
+        unknown = tuple((np.inf,) * len(phase) for phase in t.elements)
+        return ContactError(pct=np.inf, coarse=np.inf, of_elements=unknown, missed=False)
+    coarse, grown, errors = [], [], []
+    for new, old in zip(again.collisions, t.collisions, strict=True):
+        assert isinstance(new, Collision) and isinstance(old, Collision)
+        coarse.append(_off(new, old, branches, x))
+        grown.append(_grown(new, old, branches, x))
+        errors.append(_off(new, old, law, x))
+    ends = np.cumsum([len(phase) for phase in t.elements])[:-1]
+    return ContactError(
+        pct=max(errors, key=abs),
+        coarse=max(coarse, key=abs),
+        of_elements=tuple(tuple(map(float, phase)) for phase in np.split(np.max(grown, axis=0), ends)),
+        missed=bool(np.isinf(errors).any()),
+    )
+
+
+def refined_elements(error: ContactError | None, elements: Elements, asked: float = ASKED) -> Elements | None:
+    """Elements for a contact with less error than is asked for [%]; None where it has less, or no more help.
+
+    Those with much of the error are cut, into more parts the more they have; all where an event is missed.
+    """
+    if error is None or (abs(error.coarse) <= asked and not error.missed):
+        return None
+    share = asked / sum(map(len, elements))
+    out = []
+    for lengths, errors in zip(elements, error.of_elements, strict=True):
+        phase: list[float] = []
+        for h, e in zip(lengths, errors, strict=True):
+            parts = int(np.clip(np.ceil((e / share) ** (1 / _ORDER)), 1, _PARTS))
+            parts = max(parts, 2) if error.missed else parts
+            phase += [h / parts] * parts
+        out.append(tuple(phase) if len(phase) <= max(_MOST, len(lengths)) else lengths)
+    refined = tuple(out)
+    return None if refined == elements else refined
+
+
+class _Again(ContactProgram):
+    """The contact alone on elements half as long, from a state at contact that is given, for as long."""
+
+    def __init__(self, t: ContactProgram, x: Array) -> None:
+        super().__init__(t.problem, t.coordinates, t.functions)
+        self._of, self.elements = t, halved(t.elements)
+
+        def given(e: Affine) -> Affine:
+            return Affine.constant(e.evaluate(x))
+
+        y, y1, y2 = t.contact_state
+        self.contact_state = given(y), given(y1), given(y2)
+        self.contact_T, self.contact_legs = given(t.contact_T), given(t.contact_legs)
+        self.contact_w = given(t.contact_w)
+        self._hit(after=False)
+        self._collision_rows()
+        # a plan has no law where contact ends, as force is zero there; here it is what it comes to
+        law = self._first_output("force") + self.parts("force")["law"]
+        outputs = next(b for b in self.blocks if b.name == "force").n_out
+        for k in range(len(self.collisions)):
+            last = (k + 1) * len(self.stages) - 1
+            self.equal("contact law", "end", ["force"], law + last * outputs)
+        n = self.layout.n
+        self.program = StructuredProgram(
+            self.layout,
+            self.blocks,
+            self.rows,
+            objective=Affine.zeros(1),
+            quadratic=sp.csr_array((n, n)),
+            linear=np.zeros(n),
+        )
+
+    def _first_output(self, block: str) -> int:
+        names = [b.name for b in self.blocks]
+        return sum(b.count * b.n_out for b in self.blocks[: names.index(block)])
+
+    def integrated(self, x: Array) -> tuple[Array, Array]:
+        """Variables (n,) of the contact that starts as in those of the plan: with the branches of the law
+        that its phases hold to, and with those that its rates ask for.
+
+        Raises
+        ------
+        ArithmeticError : Newton's method finds none.
+        """
+        z, t, program = np.zeros(self.layout.n), self._of, self.program
+        self.u0.write(z, t.u0.read(x))
+        self.feedforward.write(z, t.feedforward.read(x))
+        held = [self.u0.index(0), self.feedforward.index(0)]
+        for new, old in zip(self.collisions, t.collisions, strict=True):
+            assert isinstance(new, Collision) and isinstance(old, Collision)
+            carry_contact(new, old, z, x)
+            held += [group.index(0) for group in new.T]
+            held += [new.after.index(0)] if new.after.count else []
+        free = np.setdiff1d(np.arange(program.n), np.concatenate(held))
+        ends = {*self.problem.target.events, "end of compression", "separation"}
+        equal = program.g_lower == program.g_upper
+        rows = np.flatnonzero([e and o.term not in ends for e, o in zip(equal, program.origins, strict=True)])
+        self._newton(z, free, rows)
+        branches = z.copy()
+        for _ in range(_SWITCHES if self.law_switches else 0):
+            if not self._turned(z):
+                break
+            self._newton(z, free, rows)
+        return branches, z
+
+    def _newton(self, z: Array, free: Index, rows: Index) -> None:
+        """Change the free ones among the variables until these rows are met."""
+        program = self.program
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")  # a matrix that is singular is a method that fails
+            for _ in range(_STEPS):
+                off = (program.constraints(z) - program.g_lower)[rows]
+                if np.abs(off).max() < _MET:
+                    return
+                try:
+                    z[free] -= splu(sp.csc_matrix(program.jacobian(z)[rows][:, free])).solve(off)
+                except RuntimeError as error:
+                    raise ArithmeticError("no contact: the matrix is singular") from error
+        raise ArithmeticError(f"no contact after {_STEPS} steps")
+
+    def _turned(self, z: Array) -> bool:
+        """Put points on the branch of the law that their rates ask for; whether any was on the other."""
+        block, part = next(b for b in self.blocks if b.name == "force"), self.parts("force")
+        of = self.program.outputs(z)["force"]
+        depth, rate = DEPTH_SCALE * of[:, part["penetration"][0]], of[:, part["rate"][0]]
+        restituting = block.value.inputs[1][: block.count, RESTITUTING] > 0
+        law, n = self.problem.law, len(self.stages)
+        wrong = np.zeros(block.count, dtype=bool)
+        for k, collision in enumerate(self.collisions):
+            assert isinstance(collision, Collision)
+            mine = slice(k * n, (k + 1) * n)
+            force = collision.f.read(z)[:, 0]
+            other = [
+                float(law.branch(a, b, bool(back), collision.law))
+                for a, b, back in zip(depth[mine], rate[mine], restituting[mine], strict=True)
+            ]
+            differs = np.abs(np.array(other) - force) > _TURNED * np.abs(force).max()
+            wrong[mine] = differs & (restituting[mine] == (rate[mine] > 0))
+        for function in (block.value, block.jacobian):
+            function.inputs[1][: block.count, RESTITUTING] = restituting ^ wrong
+        return bool(wrong.any())
+
+
+def _scale(old: Collision, x: Array) -> float:
+    """From impulses [N s] to [%] of that of a plan (n,)."""
+    return 100 / max(abs(float(old.p.read(x)[-1, 0])), 1e-9)
+
+
+def _grown(new: Collision, old: Collision, z: Array, x: Array) -> Array:
+    """What each element adds to the error of the impulse [%]: (elements,)."""
+    planned, found = old.p.read(x)[:, 0], new.p.read(z)[:, 0]
+    ends = [
+        float(found[i] - planned[k])
+        for i, k in same_places(new.stages, old.stages)
+        if k == old.stages[k].members[-1]
+    ]
+    return np.asarray(np.abs(np.diff([0.0, *ends])) * _scale(old, x))
+
+
+def _off(new: Collision, old: Collision, z: Array, x: Array) -> float:
+    """Error of the impulse [%]; inf where bodies part within a phase, or do not part at its end."""
+    force, last = new.f.read(z)[:, 0], list(new.stages[-1].members)
+    duration, peak = float(new.T[-1].read(z)[0, 0]), float(np.abs(force).max())
+    # it falls to zero a little earlier or later than planned
+    places = duration * np.array([new.stages[k].place for k in last])
+    slope = float(np.polyval(np.polyder(np.polyfit(places, force[last], len(last) - 1)), places[-1]))
+    apart = force[: last[0]].min(initial=0.0) < -_MISSED * peak
+    if apart or (slope >= 0 and force[-1] > _MISSED * peak):
+        return float(np.inf)
+    left = 0.5 * float(force[-1]) ** 2 / -slope if slope < 0 else 0.0
+    return _scale(old, x) * (float(new.p.read(z)[-1, 0] - old.p.read(x)[-1, 0]) + left)

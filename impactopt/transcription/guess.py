@@ -1,0 +1,160 @@
+"""Where the search for a contact starts: a point mass in the robot's place meets the target.
+
+The law and the target are the true ones, switches and all, integrated by SciPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import solve_ivp
+
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.nail import Nail
+from impactopt.contact.targets import FreeMass, Target
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.transcription.layout import Array
+
+LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
+AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as long
+FASTER, TRIES = 1.3, 12  # the blow is made harder until a board breaks, or a nail moves
+# a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
+# robot's; and the shortest blow [s] that it stands for
+PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
+
+
+@dataclass(frozen=True)
+class Blow:
+    """A contact at k collocation points. ``durations`` [s] of its phases; the others at the points:
+
+    speed (k,) of the point mass over that at contact, way (k,) [s]: its integral in the phase so far; force
+    (k,) [N]; impulse (k,) [N s]; state (k, n), travel (k,) [m] of the target in the phase.
+    """
+
+    durations: Array
+    speed: Array
+    way: Array
+    force: Array
+    impulse: Array
+    state: Array
+    travel: Array
+
+
+def effective_mass(
+    c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array, rates: Array
+) -> tuple[float, float]:
+    """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s]."""
+    model, data = c.model, c.model.createData()
+    q, still = c.join(y, legs), np.zeros(c.ny)
+    ways = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    inertia = np.array(pin.crba(model, data, q))
+    inertia = np.triu(inertia) + np.triu(inertia, 1).T
+    pin.computeJointJacobians(model, data, q)
+    frame = model.getFrameId(f"striker:{striker}")
+    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
+    row = normal @ jacobian @ ways
+    mass = 1 / float(row @ np.linalg.solve(ways.T @ inertia @ ways, row))
+    return mass, max(float(row @ rates), 0.1)
+
+
+def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:
+    """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
+
+    A target with events is met as fast as it takes for all of them to happen.
+    """
+    ends: Array | None = None
+    for _ in range(TRIES if target.events else 1):
+        time, rows = _histories(law, target, mass, speed)
+        ends = _phases(time, rows, target)
+        if ends is not None:
+            break
+        speed *= FASTER
+    if ends is None:  # somewhere, where the solver has to mend it
+        ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.events else [0.0, 0.5, 1.0])
+    at = ends[phase] + place * np.diff(ends)[phase]
+
+    def sample(values: Array) -> Array:
+        return np.stack([np.interp(at, time, row) for row in values], axis=1)
+
+    def since(values: Array) -> Array:
+        return np.interp(at, time, values) - np.interp(ends[phase], time, values)
+
+    x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
+    state = sample(rows[3:-1]) if target.n_states else np.zeros((len(at), 0))
+    if isinstance(target, FreeMass) and ends[-1] > SOFT:
+        return push(target.mass, phase, place)
+    return Blow(
+        durations=np.diff(ends),
+        speed=np.interp(at, time, v) / v[0],
+        way=since(x) / v[0],
+        force=np.interp(at, time, force),
+        impulse=mass * (v[0] - np.interp(at, time, v)),
+        state=state,
+        travel=since(travel),
+    )
+
+
+def push(mass: float, phase: Array, place: Array) -> Blow:
+    """A uniform force on a free mass [kg].
+
+    Where a contact with one is soft, plans with much else to meet converge more surely from here than from
+    its true blow.
+    """
+    total = float(PUSH.sum())
+    before = np.array([0.0, PUSH[0]])[phase]
+    elapsed = before + place * PUSH[phase]
+    fraction = elapsed / total
+    ramp = (before / total + fraction) / 2 * place * PUSH[phase]  # the fraction's integral in the phase
+    force = np.full(len(phase), mass * PUSHED / total)
+    return Blow(
+        durations=PUSH,
+        speed=1 - (1 - LEFT) * fraction,
+        way=place * PUSH[phase] - (1 - LEFT) * ramp,
+        force=force,
+        impulse=force * elapsed,
+        state=PUSHED * fraction[:, None],
+        travel=PUSHED * ramp,
+    )
+
+
+def _histories(law: ContactLaw, target: Target, mass: float, speed: float) -> tuple[Array, Array]:
+    """Instants (k,) [s], and rows of the mass's position and speed, the target's travel and state, force."""
+
+    def force(y: Array) -> float:
+        return float(law.force(float(y[0] - y[2]), float(y[1] - target.velocity(y[3:]))))
+
+    def flow(_: float, y: Array) -> list[float]:
+        f = force(y)
+        return [y[1], -f / mass, float(target.velocity(y[3:])), *map(float, target.derivative(y[3:], f))]
+
+    def apart(_: float, y: Array) -> float:
+        rate = float(y[1] - target.velocity(y[3:]))
+        return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate))
+
+    apart.terminal, apart.direction = True, -1.0  # type: ignore[attr-defined]
+    start = [0.0, speed, 0.0, *np.zeros(target.n_states)]
+    # explicit: what switches, as a nail does, makes stiff solvers stall
+    span, options = (0.0, LONGEST), {"method": "RK23", "rtol": 1e-4, "atol": 1e-8}
+    found = solve_ivp(flow, span, start, events=apart, max_step=LONGEST / 400, **options)
+    return found.t, np.vstack([found.y, [force(y) for y in found.y.T]])
+
+
+def _phases(time: Array, rows: Array, target: Target) -> Array | None:
+    """Start and ends of the phases [s]; None if the target's events have not happened in their order."""
+    deepest = int(np.argmax(rows[0] - rows[2]))
+    ends = [0.0, time[deepest], time[-1]]
+    if isinstance(target, Nail):
+        moves = np.flatnonzero(rows[3] > 0)
+        if not moves.size:
+            return None
+        ends = [0.0, max(time[moves[0] - 1], AT_ONCE), time[moves[-1]], time[-1]]
+    elif target.events:
+        after = [
+            k for k in range(deepest) if float(target.event(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
+        ]
+        if not after:
+            return None
+        ends.insert(1, time[after[0]])
+    return np.array(ends) if min(np.diff(ends)) > 0 else None

@@ -1,0 +1,193 @@
+"""What a program minimizes: minus the weighted sum of the problem's objectives, plus small prices.
+
+Every objective is affine or quadratic in the variables. What is neither is an output of a block first, with a
+variable that equals it (:meth:`impactopt.transcription.builder.Builder.lift`); only what a problem asks for
+is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from impactopt.errors import InputError
+from impactopt.kinematics.statics import static_wrenches
+from impactopt.problem.objectives import (
+    AngularMomentum,
+    Effort,
+    Impulse,
+    Objective,
+    PeakForce,
+    Penetration,
+    TargetEnergy,
+)
+from impactopt.problem.terms import kind_of
+from impactopt.transcription.blocks import DEPTH_SCALE, FORCE_SCALE
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.layout import Affine, Array, Group, Layout, stack
+from impactopt.transcription.plan import complete_reference
+
+if TYPE_CHECKING:
+    from impactopt.transcription.at_contact import ContactProgram
+    from impactopt.transcription.transcription import Transcription
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What an objective weighs: an affine expression plus the squares of a group of variables."""
+
+    affine: Affine
+    squares: Group | None = None
+
+    def evaluate(self, x: Array) -> float:
+        """Its value for solver variables (n,)."""
+        squared = float(np.sum(self.squares.read(x) ** 2)) if self.squares is not None else 0.0
+        return float(self.affine.evaluate(x)[0]) + squared
+
+
+def quantities(t: ContactProgram, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
+    """Objectives with their quantities; adds what they need to the program."""
+    return [(o, _quantity(t, o)) for o in objectives]
+
+
+def _quantity(t: ContactProgram, objective: Objective) -> Quantity:
+    if type(objective).quantity is Objective.quantity:
+        return _QUANTITIES[kind_of(objective, Objective)](t)
+    found = objective.quantity(t)  # a user's own
+    whole = found if isinstance(found, Quantity) else Quantity(found)
+    if not isinstance(whole.affine, Affine) or whole.affine.size != 1:
+        raise InputError(
+            f"{type(objective).__name__}.quantity gave {found!r}; give one affine expression, such as "
+            "program.swing_T[0], or an impactopt.transcription.objective.Quantity"
+        )
+    return whole
+
+
+def _impulse(t: ContactProgram) -> Quantity:
+    return Quantity(t.expected.impulse)
+
+
+def _peak_force(t: ContactProgram) -> Quantity:
+    hit = t.expected
+    assert isinstance(hit, Collision)  # the problem is refused otherwise
+    forces = hit.f
+    at = t.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
+    return Quantity(t.lift("peak force", np.array([at]))[0] * FORCE_SCALE)
+
+
+def _target_energy(t: ContactProgram) -> Quantity:
+    numbers = np.array(list(t.problem.target.parameters.values()))
+    at = t.add_block("energy", [[t.expected.target_state]], numbers)
+    return Quantity(t.lift("target energy", np.array([at]))[0])
+
+
+def _penetration(t: ContactProgram) -> Quantity:
+    return Quantity(t.lift("deepest penetration", t.deepest)[0] * DEPTH_SCALE)
+
+
+def _angular_momentum(t: ContactProgram) -> Quantity:
+    assert t.angular_momentum is not None
+    return Quantity(Affine.zeros(1), t.angular_momentum)
+
+
+def _effort(t: Transcription) -> Quantity:
+    """T sum(tau^2) at each node is a variable; their sum is the trapezoidal rule's."""
+    swing, follow = len(t.swing_nodes), len(t.follow_nodes)
+    durations = [t.swing_T] * swing + [t.follow.T] * follow
+    slots = [[tau, T[0]] for tau, T in zip(t.torques, durations, strict=False)]
+    at = t.add_block("effort", slots, np.zeros(0))
+    places = [*map(t.swing_place, t.swing_nodes), *map(t.follow.place_at, t.follow_nodes)]
+    labels = [place.name for place in places]  # by which a program with more nodes finds them again
+    of_node = t.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
+    first, *of_swing = trapezoid(np.concatenate([[0.0], t.swing_nodes]))
+    weights = np.array([*of_swing, *trapezoid(t.follow_nodes)])
+    start = first * float(np.sum(start_torque(t) ** 2))
+    return Quantity(of_node.apply(weights[None]) + t.swing_T[0] * start)
+
+
+_QUANTITIES: dict[type[Objective], Callable[[Any], Quantity]] = {
+    Impulse: _impulse,
+    PeakForce: _peak_force,
+    TargetEnergy: _target_energy,
+    Penetration: _penetration,
+    AngularMomentum: _angular_momentum,
+    Effort: _effort,
+}
+
+
+def trapezoid(nodes: Array) -> Array:
+    """Weights (k,) of the trapezoidal rule on ascending nodes (k,)."""
+    half = np.diff(nodes) / 2
+    return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
+
+
+def start_torque(t: Transcription) -> Array:
+    """Torque over limit (n,) at rest in the start posture."""
+    c, rest = t.coordinates, np.zeros((1, t.ny))
+    wrench = static_wrenches(c, t.y0, t.legs0)[None]
+    torque = complete_reference(t.problem, t.y0[None], rest, rest, wrench, t.legs0)[3][0]
+    return np.asarray(torque / t.robot.torque_limit)
+
+
+@dataclass(frozen=True)
+class Prices:
+    """1/2 x'Qx + q'x + constant [N s], small beside the objectives: what makes the optimum unique."""
+
+    quadratic: Any
+    linear: Array
+    constant: float = 0.0
+
+
+def assemble(
+    layout: Layout, wanted: list[tuple[Objective, Quantity]], prices: Prices
+) -> tuple[Affine, Any, Array]:
+    """Objective, Q and q of :class:`impactopt.transcription.structured.StructuredProgram` [N s]."""
+    objective, diagonal = Affine.constant(prices.constant), np.zeros(layout.n)
+    for o, quantity in wanted:
+        worth = -o.weight if o.cost else o.weight
+        objective = objective - quantity.affine * worth
+        if (group := quantity.squares) is not None:
+            span = slice(group.offset, group.offset + group.count * group.size)
+            diagonal[span] -= 2 * worth * np.tile(group.scale**2, group.count)
+    return objective, prices.quadratic + sp.diags_array(diagonal), prices.linear
+
+
+def wrench_prices(t: ContactProgram, groups: list[tuple[Group, int]]) -> Array:
+    """Diagonal (n,) of the price of sole wrenches: the mean of so many nodes as each group comes with."""
+    diagonal = np.zeros(t.layout.n)
+    for group, nodes in groups:
+        span = slice(group.offset, group.offset + group.count * group.size)
+        diagonal[span] = t.problem.wrench_price / max(1, nodes)
+    return diagonal
+
+
+def motion_prices(t: Transcription) -> Prices:
+    """Of accelerations, of sole wrenches and of ending away from the start posture."""
+    p, n = t.problem, t.layout.n
+    linear, diagonal, constant = np.zeros(n), np.zeros(n), 0.0
+    accelerations: list[Affine] = []
+    for control, breaks, nodes, bounds in (
+        (t.swing_control, t.swing_breaks, t.swing_nodes, p.swing.duration),
+        *((f.control, t.follow_breaks, t.follow_nodes, p.follow.duration) for f in t.follows),
+    ):
+        typical = float(np.mean(bounds))
+        lengths = np.gradient(nodes)
+        for at, length in zip(nodes, lengths, strict=True):
+            weight = p.smoothness * typical * length
+            accelerations.append(t.at(control, breaks, at)[2] * (np.sqrt(2 * weight) / typical**2))
+    weighted = stack(accelerations)
+    m = weighted.matrix(n)
+    linear += m.T @ weighted.const
+    constant += float(weighted.const @ weighted.const) / 2
+    groups = (t.swing_w, t.coast_w, *[part.w for part in (*t.follows, *t.collisions)])
+    diagonal += wrench_prices(t, [(group, group.count) for group in groups])
+    for follow in t.follows:  # price (y_end - y_start)^2: rest near the start posture
+        end = follow.c.index(-1)
+        diagonal[end] += 2 * p.return_price
+        linear[end] -= 2 * p.return_price * t.y0
+        constant += p.return_price * float(t.y0 @ t.y0)
+    return Prices(m.T @ m + sp.diags_array(diagonal), linear, constant)

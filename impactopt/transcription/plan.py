@@ -1,0 +1,377 @@
+"""The planned motion as numbers: references for the robot's servo, and what the plan predicts.
+
+This is the border to everything that checks, draws or executes a plan: arrays only, no CasADi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.splines import CubicSpline
+from impactopt.kinematics.support import margin, support_polygon, zmp
+from impactopt.problem.problem import ImpactProblem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """What the servo is given: nothing else of the plan reaches a simulation.
+
+    time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2
+    follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n)
+    feed-forward [N m]; ground (k, 6) total ground wrench about the world's origin that the feed-forward
+    assumes [N, N m]. contact_start, contact_end, end [s]: when the plan expects contact to begin and to end,
+    and the motion to be over.
+    """
+
+    time: Array
+    phase: NDArray[np.intp]
+    q: Array
+    v: Array
+    a: Array
+    torque: Array
+    ground: Array
+    contact_start: float
+    contact_end: float
+    end: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Where bodies are at k instants.
+
+    time (k,) [s].  phase (k,) : 0 before, 1 in, 2 after contact.  q (k, nq) : Pinocchio's configurations.
+    travel (k,) [m] : of the target along its normal.
+    """
+
+    time: Array
+    phase: NDArray[np.intp]
+    q: Array
+    travel: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedCollision:
+    """The collision that the plan predicts, at its m collocation points.
+
+    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s] of
+    its surface; outcome: what the blow has brought the target, by name and unit (``speed_m_s`` of a free
+    mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n) [N m], servo and feed-forward;
+    ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each
+    sole's frame.
+    """
+
+    time: Array
+    force: Array
+    target_speed: Array
+    outcome: dict[str, float]
+    torque: Array
+    ground: Array
+    sole_wrench: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedScenario:
+    """What the plan predicts if the target of the :class:`impactopt.Scenario` of this name is hit.
+
+    impulse [N s] to that target.
+    """
+
+    name: str
+    impulse: float
+    collision: PlannedCollision
+
+    def summary(self, *, torque_limit: Array, polygon: Array) -> dict[str, Any]:
+        """The numbers of ``summary.json``; torque_limit (n,) [N m]; polygon (k, 2) [m], of the soles."""
+        hit = self.collision
+        out = {
+            "name": self.name,
+            "impulse_Ns": self.impulse,
+            "target": hit.outcome,
+            "peak_force_N": float(hit.force.max()),
+            "contact_ms": 1e3 * float(hit.time[-1]),
+            "torque_ratio": float(np.abs(hit.torque / torque_limit).max()),
+        }
+        return out | ({"zmp_margin_m": float(margin(polygon, zmp(hit.ground)).min())} if len(polygon) else {})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """A planned impact motion.
+
+    swing, follow : splines in the independent coordinates; compression, restitution [s].
+    swing_nodes (k,), swing_wrench (k, 6 a sole): where on [0, 1] the program had nodes, and the wrenches
+    there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
+    through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
+    [N s] to the target. scenarios: what is predicted of other targets, in the problem's order; a missing one
+    is not hit, so it is not among them. brake, brake_wrench: as follow, after a blow that met nothing; None
+    if the problem does not ask for it.
+    """
+
+    problem: ImpactProblem
+    swing: CubicSpline
+    follow: CubicSpline
+    compression: float
+    restitution: float
+    swing_nodes: Array
+    swing_wrench: Array
+    follow_nodes: Array
+    follow_wrench: Array
+    collision: PlannedCollision
+    hand_speed: float
+    impulse: float
+    scenarios: tuple[PlannedScenario, ...] = ()
+    brake: CubicSpline | None = None
+    brake_wrench: Array | None = None
+
+    @property
+    def coordinates(self) -> StanceCoordinates:
+        return self.problem.coordinates
+
+    @property
+    def contact_start(self) -> float:
+        return self.swing.duration
+
+    @property
+    def contact_end(self) -> float:
+        return self.swing.duration + self.compression + self.restitution
+
+    @property
+    def duration(self) -> float:
+        """Start to rest [s]."""
+        return self.contact_end + self.follow.duration
+
+    @cached_property
+    def polygon(self) -> Array:
+        """Support polygon (k, 2) [m]."""
+        return support_polygon(self.problem.robot, self.coordinates)
+
+    def independent(
+        self, phase: int, time: Array, *, missed: bool = False
+    ) -> tuple[Array, Array, Array, Array]:
+        """Reference y, ydot, yddot (k, ny) and sole wrenches (k, 6 a sole) of a phase.
+
+        time (k,) [s] : since the motion's start.
+        phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
+        then rest; ``missed``: the brake instead.
+        """
+        ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
+        if phase == 1:
+            end, rate, _ = self.swing.sample(self.contact_start)
+            y = end + rate * (ts[:, None] - self.contact_start)
+            wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
+            return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
+        curve, start, nodes, wrench = self.way(phase, missed=missed)
+        local = np.clip(ts - start, 0.0, curve.duration)
+        y, yd, ydd = curve.sample(local)
+        at = nodes * curve.duration
+        w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
+        return y, yd, ydd, w
+
+    def way(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
+        """Spline, start [s], nodes and sole wrenches there of the swing (phase 0) or the follow-through (2);
+        ``missed``: of the brake.
+        """
+        if phase == 0:
+            return self.swing, 0.0, self.swing_nodes, self.swing_wrench
+        if not missed:
+            return self.follow, self.contact_end, self.follow_nodes, self.follow_wrench
+        after = self.problem.brake_after
+        if self.brake is None or self.brake_wrench is None or after is None:
+            raise InputError(
+                "this plan has no motion for a blow that meets nothing: solve the problem with a scenario "
+                "Scenario(name=..., missing=True, brake_after=0.025)"
+            )
+        return self.brake, self.contact_start + after, self.follow_nodes, self.brake_wrench
+
+    def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
+        """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
+
+        missed : the one that a robot goes on with which has felt nothing: the same until its contact_end, and
+        then the brake.
+
+        Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
+        dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.
+        The instants of contact and of its end are there twice: the reference jumps from the coasting one to
+        the predicted state.
+        """
+        last, t1, _, _ = self.way(2, missed=missed)
+        t0, rest = self.contact_start, t1 + last.duration
+        end = rest + hold
+        legs = self.coordinates.split(self.problem.start_posture)[1]
+        parts: list[tuple[Any, ...]] = []
+        for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
+            times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
+            rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
+            parts.append((phase, times, *rows))
+            legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
+        phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
+        time, q, v, a_, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(1, 7))
+        # held while in contact: the collision model counts on what makes the robot coast at contact
+        torque[phases == 1] = self.collision.torque[0]
+        return Trajectory(
+            time=time,
+            phase=phases,
+            q=q,
+            v=v,
+            a=a_,
+            torque=torque,
+            ground=ground,
+            contact_start=t0,
+            contact_end=t1,
+            end=rest,
+        )
+
+    def motion(
+        self, step: float = 1e-3, *, missed: bool = False, reference: Trajectory | None = None
+    ) -> Motion:
+        """What the robot's bodies are expected to do, about every ``step`` [s] from start to rest.
+
+        In contact the robot is slower than the servo's reference: between the states before and after it goes
+        the cubic that has both states' rates.
+
+        missed : after a blow that meets nothing, from the planned contact on; before it all is as planned.
+        reference : :meth:`trajectory`, if it is known: then the postures are its, at its instants.
+
+        Raises
+        ------
+        InputError : the legs do not reach.
+        """
+        last, t1, _, _ = self.way(2, missed=missed)
+        t0, end = self.contact_start, t1 + last.duration
+        within = np.linspace(t0, t1, max(2, round((t1 - t0) / step) + 1))
+        during = self._closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
+        if reference is not None:
+            parts = [
+                (reference.time[k], reference.q[k]) for k in (reference.phase == 0, reference.phase == 2)
+            ]
+        else:
+            spans = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t1, end))]
+            parts = [
+                (times, self._closed(self.independent(phase, times, missed=missed)[0]))
+                for phase, times in zip((0, 2), spans, strict=True)
+                if phase or not missed
+            ]
+        if missed:
+            parts = [(np.zeros(0), np.zeros((0, self.problem.robot.nq))), parts[-1]]
+        (before, q_before), (after, q_after) = parts
+        time = np.concatenate([before, within, after])
+        return Motion(
+            time=time,
+            phase=np.repeat([0, 1, 2], [len(before), len(within), len(after)]),
+            q=np.concatenate([q_before, during, q_after]),
+            travel=np.zeros(len(time)) if missed else self.travel(time),
+        )
+
+    def through_contact(self, s: Array, *, missed: bool = False) -> Array:
+        """Independent coordinates (k, ny) at fractions s (k,) of the contact."""
+        t0, (_, t1, _, _) = self.contact_start, self.way(2, missed=missed)
+        (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
+        (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
+        span, way, at = t1 - t0, y1 - y0, s[:, None]
+        bend = at * (1 - at) * ((1 - at) * (span * u0 - way) - at * (span * u1 - way))
+        return np.asarray(y0 + at * way + bend)
+
+    def travel(self, time: Array) -> Array:
+        """How far (k,) [m] the target has gone along the normal at times [s] since the motion's start.
+
+        After contact a free one goes on as fast as it is then.
+        """
+        hit, since = self.collision, np.asarray(time) - self.contact_start
+        if len(hit.time) < 2:
+            return np.zeros(len(since))
+        gone = np.concatenate(
+            [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
+        )
+        last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
+        return np.interp(since, hit.time, gone, left=0.0) + last * np.maximum(since - hit.time[-1], 0.0)
+
+    def _closed(self, y: Array) -> Array:
+        """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""
+        c = self.coordinates
+        legs = c.split(self.problem.start_posture)[1]
+        q = np.zeros((len(y), self.problem.robot.nq))
+        for k, row in enumerate(y):
+            legs = c.solve_legs(row, legs)
+            q[k] = c.join(row, legs)
+        return q
+
+    def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:
+        """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through.
+
+        Of an impact without duration the plan knows neither, so there is no number for the collision.
+        """
+        ref = self.trajectory() if trajectory is None else trajectory
+        limit = self.problem.robot.torque_limit
+        phase = ref.phase
+        grounds = [ref.ground[phase == 0], self.collision.ground, ref.ground[phase == 2]]
+        during = self.collision.torque if len(self.collision.ground) else self.collision.torque[:0]
+        torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
+        names = ("swing", "collision", "follow")
+        ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
+        out = {"torque_ratio": ratio}
+        if len(self.polygon):
+            out["zmp_margin_m"] = {
+                n: float(margin(self.polygon, zmp(g)).min())
+                for n, g in zip(names, grounds, strict=True)
+                if len(g)
+            }
+        return out
+
+
+def complete_reference(
+    problem: ImpactProblem, y: Array, yd: Array, ydd: Array, wrench: Array, legs: Array
+) -> tuple[Array, ...]:
+    """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6).
+
+    y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
+    as little as it takes to balance the base; legs (nl,) starts their inverse kinematics.
+    """
+    c, robot = problem.coordinates, problem.robot
+    model, data = robot.model, robot.model.createData()
+    n = len(y)
+    q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
+    torque, ground = np.zeros((n, robot.n)), np.zeros((n, 6))
+    # least correction of the interpolated wrenches, moments dear: the soles share the load as planned
+    scale = np.array([1, 1, 1, 10, 10, 10] * len(c.legs))
+    for k in range(n):
+        legs = c.solve_legs(y[k], legs)
+        q[k], v[k], a[k] = c.complete_motion(y[k], yd[k], ydd[k], legs)
+        tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
+        if c.legs:
+            jac, place = c.sole_jacobians(q[k])
+            base = jac[:, :6].T / scale
+            miss = tau[:6] - jac[:, :6].T @ wrench[k]
+            w = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / scale
+            tau = tau - jac.T @ w
+            ground[k] = _about_origin(place, w)
+        torque[k] = tau[c.base :]
+    return q, v, a, torque, ground
+
+
+def _about_origin(placements: list[pin.SE3], wrenches: Array) -> Array:
+    """Sum of sole wrenches (each in its sole's frame) as one wrench about the world's origin, world axes."""
+    total = np.zeros(6)
+    for k, m in enumerate(placements):
+        f = m.rotation @ wrenches[6 * k : 6 * k + 3]
+        total[:3] += f
+        total[3:] += m.rotation @ wrenches[6 * k + 3 : 6 * k + 6] + np.cross(m.translation, f)
+    return total
+
+
+def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
+    """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
+
+    The soles are where they are held.
+    """
+    placements = [leg.placement for leg in coordinates.legs]
+    return np.array([_about_origin(placements, w) for w in wrenches])

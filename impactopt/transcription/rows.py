@@ -1,0 +1,183 @@
+"""The rows of a program: what they bound, and how a person reads one that is not met.
+
+A row knows its term, its component, its place, whose time is a function of the solution's durations, and the
+measure of its violation: "torque limit, swing at 0.61 s, arm_right_4_joint: 12 % over its limit".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impactopt.transcription.layout import Affine, Array
+
+Index = NDArray[np.intp]
+Rank = tuple[int, int]  # of variables that rows determine: those of lower rank are eliminated first
+
+
+def by_leg(joints: Index) -> list[Index]:
+    """Numbers of leg joints (6 a leg), leg by leg."""
+    return list(joints.reshape(-1, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where in the motion a row holds.
+
+    name : in the program, where no other place has it: "swing, 93 %".
+    text : to a reader; ``{s}`` and ``{ms}`` stand for the time [s] and [ms].
+    time : [s], an expression in the program's variables; None if the text has none.
+    """
+
+    name: str
+    text: str
+    time: Affine | None = None
+
+    @classmethod
+    def plain(cls, name: str) -> Place:
+        """A place without a time."""
+        return cls(name, name.replace("{", "{{").replace("}", "}}"))
+
+    def told(self, x: Array) -> str:
+        """The text, with the time that solver variables (n,) say."""
+        t = float(self.time.evaluate(x)[0]) if self.time is not None else np.nan
+        return self.text.format(s=f"{t:.2f} s", ms=f"{1e3 * t:.0f} ms")
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """How far a violation goes, in words: the amount x ``factor`` in ``unit``, and a ``phrase``.
+
+    over : what the amount is divided by first, such as a sole's normal force; at least ``least``.
+    """
+
+    unit: str
+    factor: float
+    phrase: str
+    over: Affine | None = None
+    least: float = 1e-3
+
+    def told(self, x: Array, amount: float) -> str:
+        by = max(float(self.over.evaluate(x)[0]), self.least) if self.over is not None else 1.0
+        value = abs(amount * self.factor / by)
+        number = f"{value:.0f}" if 9.5 <= value < np.inf else f"{value:.2g}"
+        return f"{number} {self.unit} {self.phrase}"
+
+
+def millimetres(phrase: str, *, scale: float = 1.0) -> Measure:
+    """Of rows in ``scale`` [m]."""
+    return Measure("mm", 1e3 * scale, phrase)
+
+
+def degrees(phrase: str) -> Measure:
+    """Of rows in [rad]."""
+    return Measure("deg", float(np.degrees(1)), phrase)
+
+
+def percent(phrase: str, *, of: float = 1.0) -> Measure:
+    """Of rows whose ``of`` is the whole."""
+    return Measure("%", 100 / of if of > 0 else 100.0, phrase)
+
+
+def along(labels: Sequence[str], phrase: str) -> list[Measure]:
+    """Of rows in [m] for directions x, y, z, and in [rad] for all else: the labels' last words say which."""
+    return [millimetres(phrase) if _straight(name) else degrees(phrase) for name in labels]
+
+
+def rates(labels: Sequence[str]) -> list[Measure]:
+    """As :func:`along`, of rows in [m/s] and [rad/s]."""
+    return [Measure("m/s" if _straight(name) else "rad/s", 1.0, "off") for name in labels]
+
+
+def _straight(label: str) -> bool:
+    return label.split()[-1] in ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A constraint's origin: term, place and component, and how its violation is told.
+
+    whole : what the component is a part of, and what messages name in its place; None: the component.
+    """
+
+    term: str
+    place: Place
+    component: str
+    measure: Measure | None = None
+    whole: str | None = None
+
+    def __str__(self) -> str:
+        return _joined(self.term, self.place.name, self.component)
+
+    def told(self, x: Array, amount: float) -> tuple[str, str]:
+        """Which row this is at solver variables (n,), and by how much it is violated."""
+        by = f"by {amount:.3g}" if self.measure is None else self.measure.told(x, amount)
+        component = self.component if self.whole is None else self.whole
+        return _joined(self.term, self.place.told(x), component), by
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+@dataclass
+class Rows:
+    """Constraints under construction: each is at most one block output plus an affine expression of x."""
+
+    outputs: list[Index] = field(default_factory=list)
+    affine: list[Affine] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+    origins: list[Row] = field(default_factory=list)
+
+    def copy(self) -> Rows:
+        """The same rows, to which others can be added."""
+        return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
+
+    def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
+        """Append rows of these origins:  lower <= out[outputs]."""
+        n = len(origins)
+        self.outputs.append(np.asarray(outputs, dtype=np.intp))
+        self.affine.append(Affine.zeros(n))
+        self.lower.append(np.full(n, lower))
+        self.upper.append(np.full(n, np.inf))
+        self.origins.extend(origins)
+
+    def add(
+        self,
+        *,
+        term: str,
+        place: Place | str = "",
+        components: Sequence[str],
+        outputs: Index | None = None,
+        affine: Affine | None = None,
+        lower: ArrayLike = -np.inf,
+        upper: ArrayLike = np.inf,
+        measure: Measure | Sequence[Measure] | None = None,
+        whole: str | None = None,
+    ) -> None:
+        """Append ``len(components)`` rows  lower <= out[outputs] + affine <= upper.
+
+        measure : of all, or one a row; place as text: one without a time; whole : of :class:`Row`.
+        Rows that are unbounded on both sides are dropped.
+        """
+        n = len(components)
+        lo = np.broadcast_to(np.asarray(lower, dtype=float), (n,))
+        hi = np.broadcast_to(np.asarray(upper, dtype=float), (n,))
+        keep = np.flatnonzero(np.isfinite(lo) | np.isfinite(hi))
+        if not keep.size:
+            return
+        out = np.full(n, -1, dtype=np.intp) if outputs is None else np.asarray(outputs, dtype=np.intp)
+        lin = Affine.zeros(n) if affine is None else affine
+        if keep.size < n:
+            out, lin, lo, hi = out[keep], lin[keep], lo[keep], hi[keep]
+        self.outputs.append(out)
+        self.affine.append(lin)
+        self.lower.append(lo)
+        self.upper.append(hi)
+        where = Place.plain(place) if isinstance(place, str) else place
+        measures = [measure] * n if measure is None or isinstance(measure, Measure) else measure
+        self.origins.extend(Row(term, where, components[int(k)], measures[int(k)], whole) for k in keep)

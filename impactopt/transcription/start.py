@@ -1,0 +1,264 @@
+"""First iterates: a reach to the target by inverse kinematics, or a strike's state at contact; and back."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from scipy.optimize import lsq_linear
+
+from impactopt.errors import InputError
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
+from impactopt.kinematics.statics import static_wrenches
+from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.finer_contact import carry_contact, same_places
+from impactopt.transcription.layout import Array, Group
+from impactopt.transcription.mesh import with_middles
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription
+
+
+def strike_rates(
+    c: StanceCoordinates, striker: str, y: Array, legs: Array, velocity: Array, *, base: float = 0.3
+) -> Array:
+    """Least rates ydot (ny,) that give the striking point ``velocity`` (3,) [m/s].
+
+    ``base`` : ease of the base's rates.
+    """
+    model, data = c.model, c.model.createData()
+    fid = model.getFrameId(f"striker:{striker}")
+
+    def point(at: Array) -> Array:
+        pin.framesForwardKinematics(model, data, c.join(at, legs))
+        return np.array(data.oMf[fid].translation)
+
+    h = 1e-6
+    jac = np.stack([(point(y + h * e) - point(y - h * e)) / (2 * h) for e in np.eye(c.ny)], axis=1)
+    weight = np.ones(c.ny)
+    weight[: c.base] = base
+    return np.asarray(weight * np.linalg.lstsq(jac * weight, velocity, rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A state at contact: coordinates y and rates (ny,), legs (nl,)."""
+
+    y: Array
+    rates: Array
+    legs: Array
+
+
+def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Contact:
+    """The target reached by inverse kinematics, and met at ``speed`` [m/s] where joints are that fast.
+
+    ``noise`` [rad] perturbs the posture, for several starts.
+    """
+    p, c = t.problem, t.coordinates
+    rng = np.random.default_rng(seed)
+    y, legs = c.split(p.contact_posture)
+    y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
+    y = np.clip(y, t.y_lower, t.y_upper)
+    rates = strike_rates(c, p.striker, y, legs, speed * p.normal)
+    return Contact(y, rates * _within(rates[c.base :], 0.8 * t.rate_limit[c.independent]), legs)
+
+
+def _within(rates: Array, limit: Array) -> float:
+    """The factor, 1 at most, that brings rates inside their limits."""
+    return min(1.0, float((limit / np.maximum(np.abs(rates), 1e-9)).min()))
+
+
+def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
+    """Solver variables (n,) of a plain reach; speed, noise, seed: as of :func:`reached`."""
+    hit = reached(t, speed=speed, noise=noise, seed=seed)
+    zero, (swing_T, follow_T) = np.zeros(t.ny), _durations(t)
+    swing = quintic(t.y0, zero, hit.y, hit.rates, swing_T, t.swing_breaks)
+    back = quintic(hit.y, 0.5 * hit.rates, t.y0, zero, follow_T, t.follow_breaks)
+    x = _motion(
+        t,
+        CubicSpline.fit(swing, t.swing_breaks, zero, hit.rates, swing_T),
+        CubicSpline.fit(back, t.follow_breaks, 0.5 * hit.rates, zero, follow_T),
+    )
+    _write_hit(t, x, hit)
+    return _finished(t, x)
+
+
+def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
+    """Solver variables (n,) of a strike, as of :func:`first_iterate`."""
+    hit = reached(t, speed=speed, noise=noise, seed=seed)
+    x = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
+    with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+        hit = replace(hit, legs=t.coordinates.solve_legs(hit.y, hit.legs))
+    t.y.write(x, hit.y)
+    t.legs.write(x, hit.legs)
+    t.w.write(x, static_wrenches(t.coordinates, hit.y, hit.legs))
+    _write_hit(t, x, hit)
+    return _finished(t, x)
+
+
+def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array) -> Array:
+    """Solver variables (n,) of a motion from those of a strike: to its state at contact, and back.
+
+    Where the swing there would break limits of rates it goes as fast as they allow.
+    """
+    y, u = strike.y.read(x)[0], strike.u0.read(x)[0]
+    after, rates = (e.evaluate(x) for e in strike.expected.state_after[:2])
+    swing_T, follow_T = _durations(t)
+    out = _motion(
+        t,
+        _least_accelerations(t, t.swing_breaks, swing_T, t.y0, y, end_rates=u),
+        _least_accelerations(t, t.follow_breaks, follow_T, after, t.y0, rates=rates),
+    )
+    for name, group in strike.layout.groups.items():
+        mine = t.layout.groups.get(name)
+        if mine is not None and mine.count == group.count:
+            mine.write(out, group.read(x))
+    return _finished(t, out)
+
+
+def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
+    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements.
+
+    What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
+    multipliers are those of the same rows and variables.
+    """
+    stages = same_places(t.stages, old.stages)
+    places = {"swing": (old.swing_nodes, t.swing_nodes)}
+    places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
+    new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
+    for name, group in t.layout.groups.items():
+        known = old.layout.groups.get(name)
+        if known is None or not group.size:
+            continue
+        if known.labels != group.labels:  # of one vector with a part for each node, which its label names
+            _carry_by_label(group, known, (new, x), (bounds, z))
+            continue
+        pairs = [(k, k) for k in range(group.count)]
+        if name.split()[0] in places and known.count != group.count:
+            before, now = places[name.split()[0]]
+            pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
+            group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
+        elif known.count == len(old.stages) and known.count != group.count:
+            pairs = stages
+        else:
+            group.write(new, known.read(x))
+        for i, k in pairs:
+            bounds[group.index(i)] = z[known.index(k)]
+    for mine, its in zip(t.collisions, old.collisions, strict=True):
+        if t.elements != old.elements and isinstance(mine, Collision) and isinstance(its, Collision):
+            carry_contact(mine, its, new, x)
+    of_rows = dict(zip(_keys(old), y, strict=True))
+    rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
+    return _finished(t, new), rows, bounds
+
+
+def _carry_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> None:
+    """Copy what has the same label; ``vectors``: new and old ones. What is new is lifted, so it is found
+    afterwards.
+    """
+    before = {label: j for j, label in enumerate(known.labels)}
+    there = [k for k, label in enumerate(group.labels) if label in before]
+    here = [before[group.labels[k]] for k in there]
+    for k in range(min(group.count, known.count)):
+        for new, old in vectors:
+            new[group.index(k)[there]] = old[known.index(k)[here]]
+
+
+def _keys(t: Transcription) -> Iterator[tuple[str, str, str, int]]:
+    """What a row is, and how many of that name come before it."""
+    seen: dict[tuple[str, str, str], int] = {}
+    for row in t.program.origins:
+        name = row.term, row.place.name, row.component
+        seen[name] = seen.get(name, -1) + 1
+        yield *name, seen[name]
+
+
+def _write_hit(t: ContactProgram, x: Array, hit: Contact) -> None:
+    t.u0.write(x, hit.rates)
+    for collision in t.collisions:
+        collision.guess(x, hit.y, hit.rates, hit.legs)
+
+
+def _finished(t: ContactProgram, x: Array) -> Array:
+    return np.clip(t.with_lifted(x), t.layout.lower, t.layout.upper)
+
+
+def _durations(t: Transcription) -> tuple[float, float]:
+    """Of swing and follow-through [s]."""
+    return float(np.mean(t.problem.swing.duration)), float(np.mean(t.problem.follow.duration))
+
+
+def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
+    """A swing and a follow-through, with legs and sole wrenches as at rest."""
+    c, x = t.coordinates, np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
+    t.swing_c.write(x, curve.control[3:-1])
+    for follow in t.follows:
+        follow.guess(x, back, t.y0)
+    for group, wrench, spline, nodes in (
+        (t.swing_legs, t.swing_w, curve, t.swing_nodes),
+        *((follow.legs, follow.w, back, t.follow_nodes) for follow in t.follows),
+    ):
+        legs, all_legs, all_w = t.legs0, [], []
+        for y in spline.sample(nodes * spline.duration)[0]:
+            with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+                legs = c.solve_legs(y, legs)
+            all_legs.append(np.clip(legs, t.legs_lower, t.legs_upper))
+            all_w.append(static_wrenches(c, y, legs))
+        if c.legs:
+            group.write(x, np.array(all_legs))
+            wrench.write(x, np.array(all_w))
+    if t.brake is not None and c.legs:
+        t.coast_w.write(x, t.swing_w.read(x)[-1:])
+    t.swing_T.write(x, curve.duration)
+    return x
+
+
+def _least_accelerations(
+    t: Transcription,
+    breaks: Array,
+    duration: float,
+    start: Array,
+    end: Array,
+    *,
+    rates: Array | None = None,
+    end_rates: Array | None = None,
+) -> CubicSpline:
+    """The spline of least accelerations inside the limits of positions, to ``end`` without acceleration.
+
+    It starts and ends at rest, or with these rates. A coordinate that would break its limit of rates starts
+    and ends slower.
+    """
+    factors, count = rate_weights(breaks), len(breaks) + 2
+    nodes = with_middles(breaks)
+    accelerations = basis(breaks, nodes)[2] * np.sqrt(np.gradient(nodes))[:, None]
+    limit = np.concatenate([np.full(t.coordinates.base, np.inf), t.rate_limit[t.coordinates.independent]])
+    control = np.zeros((count, t.ny))
+    for k in range(t.ny):
+        fastest = np.inf
+        for slower in (1.0, 0.8, 0.6, 0.4, 0.2):
+            way = slower * duration
+            u0, u1 = (0.0 if u is None else way * float(u[k]) for u in (rates, end_rates))
+            points = np.zeros(count)
+            points[0] = start[k]
+            points[1] = points[0] + u0 / factors[0]
+            held = [0, 1, count - 3, count - 2, count - 1]
+            if rates is None:  # at rest without acceleration
+                points[2] = points[1]
+                held.append(2)
+            points[-1] = end[k]
+            points[-2] = points[-1] - u1 / factors[-1]
+            points[-3] = points[-2] - u1 / factors[-2]
+            free = np.setdiff1d(np.arange(count), held)
+            bounds = t.y_lower[k] - 1e-9, t.y_upper[k] + 1e-9
+            found = lsq_linear(accelerations[:, free], -accelerations @ points, bounds)
+            points[free] = found.x
+            fast = float(np.abs(factors * np.diff(points)).max()) / duration
+            if fast < fastest:
+                fastest, control[:, k] = fast, points
+            if fast <= limit[k]:
+                break
+    return CubicSpline(control=control, breaks=breaks, duration=duration)

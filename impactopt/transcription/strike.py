@@ -1,0 +1,136 @@
+"""The program of a blow alone: the state at contact, and the collision that it leads to.
+
+No swing need reach that state and no follow-through has to stop what it leaves behind, so its optimum is a
+bound on what a whole motion brings, found with a fraction of the variables; and it is a start for the motion.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.problem.problem import ImpactProblem
+from impactopt.transcription.at_contact import BodyState, ContactProgram
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.objective import Prices, wrench_prices
+from impactopt.transcription.plan import total_ground_wrench
+from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.rows import Index, Measure, Place, along, by_leg
+
+
+class StrikeTranscription(ContactProgram):
+    """The program of one problem's strike, with the groups that its solution is read from.
+
+    Terms and objectives are the problem's, but for those that only a whole motion has.
+    """
+
+    def __init__(
+        self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
+    ) -> None:
+        super().__init__(problem, coordinates, functions)
+        add, c = self.layout.add, coordinates
+        self.y = add("posture at contact", 1, self.ny, **self.of_y)
+        self.legs = add("legs at contact", 1, self.nl, **self.of_legs)
+        self.w = add("sole wrench at contact", 1, self.nw, **self.of_wrenches)
+        fastest = np.full(self.ny, np.inf)
+        fastest[c.base :] = self.rate_limit[c.independent]
+        self._hit(after=True, rates={"lower": -fastest, "upper": fastest})
+        self.contact_state = self.y[0], self.u0[0], Affine.zeros(self.ny)
+        self.contact_T = Affine.constant(1.0)
+        self.contact_legs, self.contact_w = self.legs[0], self.w[0]
+        node = [*self.contact_state, self.contact_legs, self.contact_w, self.contact_T]
+        (torque,) = self.add_nodes([node], ["contact"])
+        self._feedforward_rows(torque)
+        self._contact_rows()
+        self._collision_rows()
+        self._after(fastest)
+        self._finish(
+            tuple(term for term in problem.terms if not term.whole_motion),
+            tuple(o for o in problem.objectives if not o.whole_motion),
+        )
+
+    def _nodes(self) -> list[list[Index]]:
+        return [[*by_leg(self.legs.index(0)), self.w.index(0)[:6]]]
+
+    def _after(self, fastest: Array) -> None:
+        """The state that each target leaves behind is one to go on from."""
+        labels, far = self.coordinates.labels, along(self.coordinates.labels, "off")
+        hits = [hit for hit in self.collisions if isinstance(hit, Collision)]
+        if hits:
+            at = self.add_block("link", [slots for hit in hits for slots in hit.link_after()], np.zeros(0))
+            for k, hit in enumerate(hits):
+                outputs = at + 3 * (k * self.ny + np.arange(self.ny)) + 1
+                self.equal("state after contact", f"position{hit.suffix}", labels, outputs, far)
+        self.rows.add(
+            term=self.velocity.name,
+            place="after contact",
+            components=labels,
+            affine=self.expected.state_after[1],
+            lower=-fastest,
+            upper=fastest,
+            measure=Measure("rad/s", 1.0, "too fast"),
+        )
+        if self.coordinates.legs:
+            self._balance_rows(self.expected.state_after)
+
+    def _prices(self) -> Prices:
+        """Of sole wrenches, and of the least accelerations that lead to the state at contact from rest.
+
+        A coordinate that has to go the way d to the rate u in the time T accelerates with at least
+        integral a^2 dt = 12 d^2/T^3 - 12 d u/T^2 + 4 u^2/T (the cubic).
+        """
+        p, n = self.problem, self.layout.n
+        T, linear, diagonal = float(np.mean(p.swing.duration)), np.zeros(n), np.zeros(n)
+        y, u = self.y.index(0), self.u0.index(0)
+        way, both, rate = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))
+        diagonal[y], diagonal[u] = way, rate
+        linear[y], linear[u] = -way * self.y0, -both * self.y0
+        mixed = sp.csr_array((np.full(self.ny, both), (y, u)), shape=(n, n))
+        of_swing = (self.w, 2 * p.swing.intervals)  # one of its nodes
+        diagonal += wrench_prices(self, [of_swing, *[(hit.w, hit.w.count) for hit in self.collisions]])
+        quadratic = sp.diags_array(diagonal) + mixed + mixed.T
+        return Prices(quadratic, linear, way / 2 * float(self.y0 @ self.y0))
+
+    def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
+        return [(Place.plain("contact"), [self.contact_state[0], self.contact_legs])]
+
+    def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
+        y, _, legs, _ = self.expected.state_after
+        return [(Place.plain("after contact"), [y, legs])]
+
+    def body_states(self, x: Array) -> list[BodyState]:
+        places = [*self.swing_spots(), *self.follow_spots()]
+        end = sum(self.expected.durations(x))
+        return [
+            BodyState(phase, place.name, time, self.posture(x, slots))
+            for (place, slots), phase, time in zip(places, (0, 2), (0.0, end), strict=True)
+        ]
+
+    def travel(self, x: Array, time: Array) -> Array:
+        hit = self.decode(x).collision
+        gone = float(np.diff(hit.time) @ (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)
+        return np.where(np.asarray(time) > 0, gone, 0.0)
+
+    # ------------------------------------------------------------------ solution
+    def decode(self, x: Array) -> PlannedStrike:
+        """The strike that solver variables (n,) stand for."""
+        c, still = self.coordinates, np.zeros(self.ny)
+        before = self.y[0], self.u0[0], self.contact_legs
+        states = [[e.evaluate(x) for e in state] for state in (before, self.expected.state_after[:3])]
+        (q, v), (q_after, v_after) = (
+            c.complete_motion(y, rates, still, legs)[:2] for y, rates, legs in states
+        )
+        return PlannedStrike(
+            problem=self.problem,
+            posture=q,
+            velocity=v,
+            posture_after=q_after,
+            velocity_after=v_after,
+            torque=self.feedforward.read(x)[0] * self.robot.torque_limit,
+            ground=total_ground_wrench(c, self.w.read(x))[0],
+            **self._decode_hit(x),
+        )

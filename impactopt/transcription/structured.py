@@ -1,0 +1,178 @@
+"""A nonlinear program made of small compiled blocks on affine lifts of the variables.
+
+Every nonlinear function is ``block(S x + c)`` with a constant sparse S, so the Jacobian's and the Hessian's
+nonzeros are a *constant* linear map of the blocks' own nonzeros.  That map is built once; an evaluation is:
+lift, call the compiled blocks without Python in the loop, and add their numbers up, run by run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+
+from impactopt.transcription.batched import Block
+from impactopt.transcription.layout import Affine, Array, Layout, stack
+from impactopt.transcription.maps import HessianMap, JacobianMap
+from impactopt.transcription.rows import Index, Rank, Rows
+
+
+class StructuredProgram:
+    """The assembled program; implements :class:`impactopt.solvers.program.NonlinearProgram`."""
+
+    def __init__(
+        self,
+        layout: Layout,
+        blocks: Sequence[Block],
+        rows: Rows,
+        *,
+        objective: Affine,
+        quadratic: sp.spmatrix | sp.sparray,
+        linear: Array,
+        determined: Sequence[tuple[Rank, Index]] = (),
+    ) -> None:
+        """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds.
+
+        determined : variables that equality rows of their own determine, with their rank in eliminating them.
+        """
+        self.determined = tuple(determined)
+        self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)
+        n = self.n = layout.n
+        self.x_lower, self.x_upper = layout.lower, layout.upper
+        lift = stack([b.lift for b in blocks])
+        self._lift, self._lift_const = lift.matrix(n), lift.const
+        self._z_offset = np.cumsum([0] + [b.count * b.n_in for b in blocks])
+        self._out_offset = np.cumsum([0] + [b.count * b.n_out for b in blocks])
+        linear_rows = stack(rows.affine)
+        self._row_out = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
+        self._nonlinear = np.flatnonzero(self._row_out >= 0)
+        self.m = len(self._row_out)
+        self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
+        self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
+        self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
+        self._c = np.zeros(n)
+        np.add.at(self._c, objective.cols, objective.vals)
+        self._c += linear
+        self._c0 = float(objective.const.sum())
+        self._Q = sp.csc_array(quadratic)
+        row_of_out = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
+        row_of_out[self._row_out[self._nonlinear]] = self._nonlinear
+        self._jacobian = JacobianMap(self.blocks, self._lift, row_of_out, self._rows_matrix)
+        self._hessian = HessianMap(self.blocks, self._lift, self._Q)
+        self.seconds = 0.0
+        self._x: Array | None = None
+
+    # ------------------------------------------------------------------ evaluation
+    def _lifted(self, x: Array) -> list[Array]:
+        z = self._lift @ x + self._lift_const
+        return [
+            z[a : a + b.count * b.n_in].reshape(b.count, b.n_in)
+            for a, b in zip(self._z_offset, self.blocks, strict=False)
+        ]
+
+    def outputs(self, x: Array) -> dict[str, Array]:
+        """Every block's outputs, name -> (count, n_out)."""
+        return {b.name: b.value(z).copy() for b, z in zip(self.blocks, self._lifted(x), strict=True)}
+
+    def objective(self, x: Array) -> float:
+        return float(self._c0 + self._c @ x + 0.5 * (x @ (self._Q @ x)))
+
+    def gradient(self, x: Array) -> Array:
+        return self._c + self._Q @ x
+
+    def constraints(self, x: Array) -> Array:
+        t = time.perf_counter()
+        g = self._rows_matrix @ x + self._rows_const
+        if self.blocks:
+            out = np.concatenate(
+                [b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)]
+            )
+            g[self._nonlinear] += out[self._row_out[self._nonlinear]]
+        self.seconds += time.perf_counter() - t
+        return g
+
+    def jacobian(self, x: Array) -> sp.csc_array:
+        t = time.perf_counter()
+        for b, z in zip(self.blocks, self._lifted(x), strict=True):
+            b.jacobian(z)
+        out = self._jacobian.matrix()
+        self.seconds += time.perf_counter() - t
+        return out
+
+    def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
+        t = time.perf_counter()
+        lam = np.zeros(int(self._out_offset[-1]))
+        lam[self._row_out[self._nonlinear]] = multipliers[self._nonlinear]
+        for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
+            b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out))
+        out = self._hessian.matrix(sigma)
+        self.seconds += time.perf_counter() - t
+        return out
+
+    # ------------------------------------------------------------------ names
+    def row_name(self, i: int) -> str:
+        return str(self.origins[i])
+
+    def row_group(self, i: int) -> tuple[str, str]:
+        """Its term and place: the rows that one message stands for."""
+        return self.origins[i].term, self.origins[i].place.name
+
+    def describe_violation(self, i: int, x: Array, amount: float) -> tuple[str, str]:
+        """Row i at x, and how far it is from being met: as a person reads it."""
+        return self.origins[i].told(x, amount)
+
+    def variable_name(self, j: int) -> str:
+        return self.layout.name(j)
+
+
+def derivative_functions(
+    name: str, z: Any, p: Any, out: Any, through: tuple[Any, Any] | None = None
+) -> list[Any]:
+    """A block's three functions of (z, p).
+
+    ``name`` (z, p) -> out, ``name_jac`` (z, p) -> d out/dz,
+    ``name_hess`` (z, p, lam) -> lower triangle of d2(lam.out)/dz2.
+
+    through : numbers s, and what they are of (z, p), where ``out`` is written with them: it is then
+        differentiated by them and by z apart, and both put together by the chain rule. That saves operations
+        where many of z have an effect through few numbers only.
+    """
+    lam = ca.SX.sym("lam", out.numel())
+    out = ca.densify(out)
+    if through is None:
+        jac = ca.jacobian(out, z)
+        hess = ca.jacobian(ca.gradient(ca.dot(lam, out), z), z)
+    else:
+        out, jac, hess = _through(z, out, lam, *through)
+    hess = ca.tril(hess)
+    opts = {"cse": True}
+    return [
+        ca.Function(name, [z, p], [out], opts),
+        ca.Function(f"{name}_jac", [z, p], [jac], opts),
+        ca.Function(f"{name}_hess", [z, p, lam], [hess], opts),
+    ]
+
+
+def _through(z: Any, out: Any, lam: Any, s: Any, of_z: Any) -> list[Any]:
+    """Value, Jacobian and Hessian of lam.out by z, where s in ``out`` stands for ``of_z``."""
+    n, both = z.numel(), ca.vertcat(z, s)
+    whole = ca.jacobian(out, both)
+    slopes = ca.gradient(ca.dot(lam, out), both)
+    curvature = ca.jacobian(slopes, both)
+    inner, along = ca.jacobian(of_z, z), ca.SX.sym("along", s.numel())
+    bends = ca.jacobian(ca.gradient(ca.dot(along, of_z), z), z)
+    crossed = ca.mtimes(inner.T, curvature[n:, :n])
+    jac = whole[:, :n] + ca.mtimes(whole[:, n:], inner)
+    hess = (
+        curvature[:n, :n]
+        + crossed
+        + crossed.T
+        + ca.mtimes(ca.mtimes(inner.T, curvature[n:, n:]), inner)
+        + ca.substitute(bends, along, slopes[n:])
+    )
+    found: list[Any] = ca.substitute([out, jac, hess], [s], [of_z])
+    return found

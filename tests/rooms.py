@@ -1,0 +1,107 @@
+"""The rooms of the package, in their order, and what its files import."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import impactopt
+
+PACKAGE = Path(impactopt.__file__).parent
+
+# Each room may import from those above it.
+ROOMS_IN_ORDER = (
+    "__init__",
+    "errors",
+    "storage",
+    "codegen",
+    "robots",
+    "rigid_body",
+    "contact",
+    "kinematics",
+    "collision",
+    "bodies",
+    "problem",
+    "solvers",
+    "transcription",
+    "simulation",
+    "planning",
+    "files",
+    "sweeps",
+    "pictures",
+    "report",
+    "studies",
+    "cli",
+    "__main__",
+)
+RANK = {room: rank for rank, room in enumerate(ROOMS_IN_ORDER)}
+# Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.
+NUMERIC = (
+    "bodies",
+    "kinematics/inverse_kinematics.py",
+    "kinematics/splines.py",
+    "kinematics/statics.py",
+    "kinematics/support.py",
+    "kinematics/wrench_cone.py",
+    "planning/keeping_apart.py",
+    "planning/solution.py",
+    "simulation",
+    "solvers/program.py",
+    "solvers/sqp",
+    "transcription/plan.py",
+    "transcription/planned_strike.py",
+)
+# What an engine may know of this package, so that it can contradict the rest of it.
+ENGINE = {"contact", "errors", "robots", "simulation"}
+
+
+def imports(file: Path) -> Iterator[str]:
+    """Absolute names of the modules that a file imports, lazily too."""
+    inside = ("impactopt", *file.relative_to(PACKAGE).parts[:-1])
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = inside[: len(inside) - node.level + 1] if node.level else ()
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            # `from impactopt import cone` names a module, or something of the package's own
+            yield from (
+                [f"{module}.{alias.name}" for alias in node.names] if module == "impactopt" else [module]
+            )
+
+
+def room(file: Path) -> str:
+    """The module or folder of the package that a file belongs to."""
+    return file.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def rooms_imported(file: Path) -> set[str]:
+    parts = [name.split(".") for name in imports(file) if name.split(".")[0] == "impactopt"]
+    return {p[1] if len(p) > 1 and p[1] in ROOMS else "__init__" for p in parts}
+
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+ROOMS = {room(file) for file in FILES}
+
+
+def modules_imported(file: Path) -> set[str]:
+    """Files of the package that a file imports when it runs, lazily too; not those for types alone."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            node.body = [ast.Pass()]
+    found = set[str]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found & set(MODULES)
+
+
+MODULES = {
+    ".".join(("impactopt", *file.relative_to(PACKAGE).with_suffix("").parts)): file
+    for file in FILES
+    if file.name != "__init__.py"
+}

@@ -30,6 +30,7 @@ ROOMS_IN_ORDER = (
     "files",
     "sweeps",
     "pictures",
+    "terminal",
     "report",
     "studies",
     "cli",

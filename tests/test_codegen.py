@@ -612,3 +612,20 @@ def test_model_hash_leaves_limits_out() -> None:
     changed = model()
     changed.upperPositionLimit[:] = 1
     assert model_hash(changed) == model_hash(model())
+
+
+@pytest.mark.parametrize("room", ["cli", "files", "pictures", "planning", "report", "studies", "sweeps"])
+def test_an_edit_that_shapes_no_function_leaves_all_of_them(
+    room: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "impactopt"
+    kept = shutil.ignore_patterns("__pycache__", "*.js", "*.html")
+    shutil.copytree(ROOT / "impactopt", package, ignore=kept)
+    monkeypatch.setattr(codegen, "__file__", str(package / "codegen" / "cache.py"))
+    key = codegen._sources_key.__wrapped__
+    before = key()
+    for file in (package / room).rglob("*.py"):
+        file.write_text("# edited\n", encoding="utf-8")
+    assert key() == before
+    (package / "collision" / "sdc.py").write_text("# edited\n", encoding="utf-8")
+    assert key() != before

@@ -16,7 +16,6 @@ from small_plans import planned, transcribed
 
 from impactopt import (
     Tool,
-    _folders,
     arm7,
     load_problem,
     load_robot,
@@ -34,6 +33,7 @@ from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.arms import ARM7, arm_model
 from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
+from impactopt.storage import folders
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = {path.stem: path for path in (ROOT / "problems").glob("*.toml")}
@@ -79,13 +79,13 @@ def test_a_wheel_has_them_inside_the_package(monkeypatch: pytest.MonkeyPatch, tm
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     kept = wheel["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert {str(ROOT / inside): ROOT / folder for folder, inside in kept.items()} == {
-        str(_folders.FOLDERS[0]): FILES["punch"].parent
+        str(folders.FOLDERS[0]): FILES["punch"].parent
     }
     (tmp_path / "_problems").mkdir()
     (tmp_path / "_problems" / "inside.toml").write_text("# What it is.\n", encoding="utf-8")
     (tmp_path / "_problems" / "sweeps").mkdir()
     (tmp_path / "_problems" / "sweeps" / "many.toml").touch()
-    monkeypatch.setattr(_folders, "FOLDERS", (tmp_path / "_problems", *_folders.FOLDERS[1:]))
+    monkeypatch.setattr(folders, "FOLDERS", (tmp_path / "_problems", *folders.FOLDERS[1:]))
     assert problem_names() == ("inside",) and names.problem_summary("inside") == "What it is"
     assert names.sweep_names() == ("many",)
     assert names.sweep_file("many") == tmp_path / "_problems" / "sweeps" / "many.toml"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impactopt.report.plain_errors import plain_errors
+from impactopt.terminal.plain_errors import plain_errors
 
 if TYPE_CHECKING:
     from impactopt.report import Report

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import typer
 
-from impactopt.report.plain_errors import plain_errors
 from impactopt.studies.bench.report import Report, Say
+from impactopt.terminal.plain_errors import plain_errors
 
 __all__ = ["show_reports"]
 
@@ -34,8 +34,8 @@ def show_reports(
         from rich.console import Console
 
         from impactopt.files.output import make_directory, plain
-        from impactopt.report.console import Progress
         from impactopt.studies.bench.report import save_report
+        from impactopt.terminal.console import Progress
 
         directory = make_directory(out) if out is not None else None
         found = {}

@@ -114,8 +114,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         told = solution.summary(solution.validate())
         held = told["simulated"]
         out |= {
-            "clearance_mm": min(told["clearance_mm"], held["clearance_mm"]),
-            "touches": len(told["contacts_besides"]) + len(held["contacts_besides"]),
+            "clearance_mm": _least(told["clearance_mm"], held["clearance_mm"]),
+            "touches": len([*told["contacts_besides"], *(held["contacts_besides"] or ())]),
             "impulse_error_pct": held["impulse_error_pct"],
             "zmp_margin_m": min(held.get("zmp_margin_m", {}).values(), default=None),
             "torque_ratio": max(held["torque_ratio"].values()),
@@ -141,3 +141,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         "reason": free["reason"],
     }
     return out
+
+
+def _least(*lengths: float | None) -> float | None:
+    """Of those that are known."""
+    return min((length for length in lengths if length is not None), default=None)

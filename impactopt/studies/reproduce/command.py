@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from impactopt.report.plain_errors import plain_errors
 from impactopt.studies.bench.running import show_reports
+from impactopt.terminal.plain_errors import plain_errors
 
 
 def reproduce(

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.report.plain_errors import plain_errors
 from impactopt.studies.bench.report import Say
+from impactopt.terminal.plain_errors import plain_errors
 
 if TYPE_CHECKING:
     from impactopt.pictures.style import Picture
@@ -63,7 +63,7 @@ def figures(
     """
     with plain_errors("interrupted before all figures were made") as console:
         from impactopt.files.output import make_directory, write_file
-        from impactopt.report.console import Progress
+        from impactopt.terminal.console import Progress
 
         wanted = chosen(names or [name for name, (how, _) in FIGURES.items() if how not in DEAR])
         directory = make_directory(out)

@@ -1,0 +1,215 @@
+"""What a person sees in the terminal: progress while a problem is solved, and the results as a table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.status import Status
+from rich.table import Table
+
+from impactopt.errors import printable
+from impactopt.solvers.program import IterationRecord
+from impactopt.terminal.result_rows import (
+    PHASES,
+    Row,
+    collision_rows,
+    number_row,
+    replay_columns,
+    result_columns,
+    result_rows,
+)
+
+__all__ = [
+    "Progress",
+    "blows_table",
+    "collision_table",
+    "replay_table",
+    "result_table",
+    "starts_table",
+    "strike_table",
+    "told_touches",
+    "torques_table",
+    "violation_table",
+]
+
+PHASES_OF_STRIKE = ("contact", "collision")
+QUIET_BETWEEN = 1.0  # seconds between lines about iterations where lines cannot be rewritten
+
+
+def _plain(text: str) -> str:
+    """Text that comes from files, for a console: neither markup nor control characters are obeyed."""
+    return escape(printable(text))
+
+
+class Progress:
+    """Lines about what is being done, and a live line about the iterations.
+
+    Where there is no terminal, iterations are plain lines, one a second at most; `verbose`: all of them.
+    """
+
+    def __init__(self, console: Console, *, quiet: bool = False, verbose: bool = False) -> None:
+        self._console, self._quiet, self._verbose = console, quiet, verbose
+        self._live: Status | None = None
+        self._last = -QUIET_BETWEEN
+        self._start = time.perf_counter()
+
+    def __enter__(self) -> Progress:
+        if self._console.is_terminal and not self._quiet:
+            self._live = self._console.status("starting")
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def say(self, text: str) -> None:
+        """One more thing is done or begun."""
+        if self._quiet:
+            return
+        elapsed = time.perf_counter() - self._start
+        self._console.print(f"{elapsed:6.1f} s  {_plain(text)}", highlight=False, soft_wrap=True)
+        if self._live is not None:
+            self._live.update(_plain(text))
+
+    def iteration(self, record: IterationRecord) -> None:
+        """A solver's callback."""
+        text = (
+            f"iteration {record.iteration:4d}   objective {record.objective:10.4f}   "
+            f"violation {record.max_violation:8.1e}   {record.seconds:6.1f} s"
+        )
+        if self._quiet:
+            return
+        if self._live is not None:
+            self._live.update(text)
+        if self._verbose or (self._live is None and record.seconds - self._last >= QUIET_BETWEEN):
+            self._last = record.seconds
+            self._console.print(f"          {text}", highlight=False, soft_wrap=True)
+
+
+def result_table(summary: Mapping[str, Any]) -> Table:
+    """Planned beside simulated, and beside the replay on free soles; what is outside its limit is marked."""
+    return _table(summary, result_columns(summary))
+
+
+def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table:
+    """A replay beside the plan; `report` as in `impactopt validate --json`."""
+    return _table(summary, replay_columns(report, summary))
+
+
+def strike_table(summary: Mapping[str, Any]) -> Table:
+    """The planned blow; `summary` as of a :class:`impactopt.StrikeSolution`."""
+    table = _table(summary, {"planned": summary}, PHASES_OF_STRIKE)
+    margin = [summary.get("capture_margin_m")]
+    row = number_row("capture point's margin after contact [mm]", margin, 1, scale=1e3, least=-1e-6)
+    if row is not None:
+        _add(table, row)
+    return table
+
+
+def collision_table(found: Mapping[str, Any]) -> Table:
+    """One collision, beside what a saved result says of it; `found` as in `impactopt collide --json`."""
+    model = f"{found['model']}, freezes = {found['freezes']}" if found.get("freezes") else found["model"]
+    table = Table(title=_plain(f"{found['problem']}: {model}"), title_justify="left")
+    words = [f"caution: {found['caution']}"] if found.get("caution") else []
+    words += [f"{found['model']}: {found['believe']}"] if "believe" in found else []
+    if words:
+        table.caption, table.caption_justify = _plain("\n".join(words)), "left"
+    table.add_column("")
+    for name in ("collision", *(found.get("saved") or {})):
+        table.add_column(name, justify="right")
+    for row in collision_rows(found):
+        _add(table, row)
+    return table
+
+
+def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
+    """The joints whose servos are asked for most; `joints` as in `impactopt collide --json`."""
+    table = Table(title="largest torque demands", title_justify="left")
+    for name in ("joint", "torque [N m]", "limit [N m]", "ratio"):
+        table.add_column(name, justify="left" if name == "joint" else "right")
+    for joint in joints[:most]:
+        numbers = (f"{joint['torque_Nm']:.1f}", f"{joint['limit_Nm']:.1f}", f"{joint['ratio']:.2f}")
+        table.add_row(_plain(str(joint["joint"])), *numbers)
+    return table
+
+
+def starts_table(starts: Sequence[Mapping[str, Any]]) -> Table:
+    """What came of each start; `starts` as in a summary."""
+    table = Table(title="starts", title_justify="left")
+    for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
+        table.add_column(name, justify="left" if name in ("start", "status") else "right")
+    for start in starts:
+        name, numbers = str(start["start"]), (start["impulse_Ns"], start["iterations"], start["seconds"])
+        cells = (f"{number:.{digits}f}" for number, digits in zip(numbers, (2, 0, 1), strict=True))
+        table.add_row(
+            _plain(f"{name}, kept" if start["kept"] else name), _plain(str(start["status"])), *cells
+        )
+    return table
+
+
+def _table(
+    summary: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]], phases: Sequence[str] = PHASES
+) -> Table:
+    table = Table(title=_plain(str(summary.get("problem", {}).get("name", "result"))), title_justify="left")
+    table.add_column("")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for row in result_rows(columns, phases):
+        _add(table, row)
+    return table
+
+
+def _add(table: Table, row: Row) -> None:
+    texts = ((_plain(cell.text), cell.good) for cell in row.cells)
+    cells = (text if good else f"[bold red]! {text}[/]" for text, good in texts)
+    table.add_row(_plain(row.label), *cells)
+
+
+def told_touches(summary: Mapping[str, Any]) -> str:
+    """What a plan's bodies do to each other, in a sentence; "" where nothing touches anything."""
+    touches = summary.get("contacts_besides") or ()
+    if not touches:
+        return ""
+    pairs = {(touch["one"], touch["other"]) for touch in touches}
+    worst = max(touches, key=lambda touch: float(touch["depth_mm"]))
+    count = f"{len(pairs)} pairs of bodies are" if len(pairs) > 1 else "two bodies are"
+    return (
+        f"{count} in each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
+        "[terms.self_collision] and [terms.keep_out] keep them apart"
+    )
+
+
+def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
+    """What is not met, worst first."""
+    table = Table(title="what is not met, worst first", title_justify="left")
+    table.add_column("row", overflow="fold")
+    table.add_column("by how much", overflow="fold")
+    for violation in violations:
+        table.add_row(_plain(str(violation["row"])), _plain(str(violation["by"])))
+    return table
+
+
+def blows_table(series: Mapping[str, Any]) -> Table:
+    """A row for each blow on a nail; `series` as in `impactopt drive --json`."""
+    table = Table(title="blows on the nail", title_justify="left")
+    columns = (
+        ("driven [mm]", "driven_m", 1e3, 1),
+        ("depth [mm]", "depth_m", 1e3, 1),
+        ("impulse [N s]", "impulse_Ns", 1.0, 2),
+        ("peak force [N]", "peak_force_N", 1.0, 0),
+        ("speed [m/s]", "hand_speed_m_s", 1.0, 2),
+        ("solved in [s]", "solve_seconds", 1.0, 1),
+    )
+    for name in ("blow", *(label for label, *_ in columns)):
+        table.add_column(name, justify="right")
+    for k, blow in enumerate(series["blows"], start=1):
+        table.add_row(str(k), *(f"{scale * blow[key]:.{n}f}" for _, key, scale, n in columns))
+    return table

@@ -1,0 +1,157 @@
+"""Planned beside simulated, as rows of text: what tables on screen and in reports are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = [
+    "Cell",
+    "Row",
+    "collision_rows",
+    "number_row",
+    "replay_columns",
+    "result_columns",
+    "result_rows",
+]
+
+PHASES = ("swing", "collision", "follow")
+Columns = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number as text, and whether it is within its limit."""
+
+    text: str
+    good: bool = True
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is told, with its unit, and a cell for each column."""
+
+    label: str
+    cells: tuple[Cell, ...]
+
+
+def result_columns(summary: Mapping[str, Any]) -> Columns:
+    """The plan, its simulation on held soles, and its replay on free ones, as far as there are any.
+
+    summary : the content of ``summary.json``.
+    """
+    replayed = _by_phase(summary.get("replayed", {}))
+    return _said({"planned": summary, "simulated": summary.get("simulated", {}), "free soles": replayed})
+
+
+def replay_columns(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Columns:
+    """The plan and one replay; `report` as in `impactopt validate --json`."""
+    name = "free soles" if report["engine"] == "mujoco" else "held soles"
+    return _said({"planned": summary, name: _by_phase(report)})
+
+
+def result_rows(columns: Columns, phases: Sequence[str] = PHASES) -> list[Row]:
+    """Rows that some column has something to say in; the first column is the plan's."""
+    return [row for row in _rows(list(columns.values()), phases) if row is not None]
+
+
+def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterator[Row | None]:
+    for label, key, digits in (
+        ("impulse [N s]", "impulse_Ns", 2),
+        ("peak force [N]", "peak_force_N", 0),
+        ("contact time [ms]", "contact_ms", 1),
+        ("speed at contact [m/s]", "hand_speed_m_s", 3),
+    ):
+        yield number_row(label, [source.get(key) for source in sources], digits)
+    yield from _target_rows([source.get("target") or {} for source in sources])
+    for label, key, digits, scale, least, most in (
+        ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
+        ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
+    ):
+        for phase in phases:
+            values = [source.get(key, {}).get(phase) for source in sources]
+            yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
+    for label, key, digits in (
+        ("least normal force [N]", "min_normal_force_N", 0),
+        ("largest slip of a sole [mm]", "sole_slip_mm", 2),
+        ("largest lift of a sole [mm]", "sole_lift_mm", 2),
+        ("impulse error [%]", "impulse_error_pct", 2),
+        ("left uncertain by steps [%]", "step_error_pct", 3),
+    ):
+        yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
+    stands = [None, *(source.get("standing") for source in sources[1:])]
+    yield _of_replays(_word_row("stands at the end", stands, no_is_bad=True))
+
+
+def collision_rows(found: Mapping[str, Any]) -> list[Row]:
+    """One collision, and what a saved result says of it; `found` as in `impactopt collide --json`."""
+    sources = [found, *(found.get("saved") or {}).values()]
+    most_uncertain = -np.inf if found.get("caution") else np.inf
+    rows = [
+        number_row(label, [x.get(key) for x in sources], digits, scale=scale, least=least, most=most)
+        for label, key, digits, scale, least, most in (
+            ("speed at contact [m/s]", "hand_speed_m_s", 3, 1.0, -np.inf, np.inf),
+            ("effective mass [kg]", "effective_mass_kg", 2, 1.0, -np.inf, np.inf),
+            ("impulse [N s]", "impulse_Ns", 3, 1.0, -np.inf, np.inf),
+            ("left uncertain by freezing [%]", "freeze_error_pct", 1, 1.0, -np.inf, most_uncertain),
+            ("peak force [N]", "peak_force_N", 1, 1.0, -np.inf, np.inf),
+            ("contact time [ms]", "contact_ms", 2, 1.0, -np.inf, np.inf),
+            ("energy to the target [J]", "energy_J", 3, 1.0, -np.inf, np.inf),
+            ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
+            ("least force on a sole [N]", "sole_force_N", 0, 1.0, 0.0, np.inf),
+            ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
+            ("joint speed / limit", "velocity_ratio", 2, 1.0, 0.0, 1.0),
+        )
+    ]
+    rows += _target_rows([source.get("target") or {} for source in sources])
+    return [row for row in rows if row is not None]
+
+
+def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
+    yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
+    yield _word_row("the board breaks", [target.get("broken") for target in targets])
+
+
+def number_row(
+    label: str,
+    values: Sequence[float | None],
+    digits: int,
+    *,
+    scale: float = 1.0,
+    least: float = -np.inf,
+    most: float = np.inf,
+) -> Row | None:
+    """None where no column has a number; what is not between `least` and `most` is not good."""
+    if all(value is None for value in values):
+        return None
+    cells = [Cell("-") if v is None else Cell(f"{scale * v:.{digits}f}", least <= v <= most) for v in values]
+    return Row(label, tuple(cells))
+
+
+def _word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> Row | None:
+    if all(value is None for value in values):
+        return None
+    cells = [
+        Cell("-" if v is None else "yes" if v else "no", v is None or bool(v) or not no_is_bad)
+        for v in values
+    ]
+    return Row(label, tuple(cells))
+
+
+def _of_replays(row: Row | None) -> Row | None:
+    """Of a plan there is no such number."""
+    return None if row is None else Row(row.label, (Cell(""), *row.cells[1:]))
+
+
+def _by_phase(report: Mapping[str, Any]) -> dict[str, Any]:
+    """A report with its numbers by phase, named as in a summary."""
+    names = {"zmp_margin_m": "zmp_margin_by_phase_m", "torque_ratio": "torque_ratio_by_phase"}
+    return {**report, **{name: report.get(other) or {} for name, other in names.items()}} if report else {}
+
+
+def _said(sources: Columns) -> Columns:
+    return {name: source for name, source in sources.items() if source and "error" not in source}

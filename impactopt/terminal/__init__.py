@@ -1,1 +1,1 @@
-"""What a user reads on the terminal: progress, tables, bad input as a plain message. Nothing heavy is loaded."""
+"""What a user reads on the terminal: progress, tables, bad input as a plain message. It is light to load."""

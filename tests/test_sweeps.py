@@ -93,7 +93,7 @@ def test_ctrl_c_and_a_worker_that_is_killed_cost_nothing_and_the_table_tells_all
     assert schema.field("impulse_Ns").metadata[b"unit"] == b"N s"
     said = {name.decode(): text.decode() for name, text in schema.metadata.items()}
     chosen = sweep_from_data(SWEEP)
-    assert said["impactopt.problem.hashing"] == chosen.problem.build().hash
+    assert said["impactopt.problem_hash"] == chosen.problem.build().hash
     assert said["impactopt.sweep_hash"] == chosen.hash
     assert json.loads(said["impactopt.versions"])["casadi"]
     assert json.loads(said["impactopt.units"])["target.resistance_N"] == "N"

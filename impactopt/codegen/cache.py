@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
-import numpy as np
 import numpy.typing as npt
 
 from impactopt.codegen.compiler import CompileError, Compiler, find_compiler, why_no_compiler
@@ -392,16 +391,7 @@ def _by_name(functions: Sequence[Buildable]) -> dict[str, Buildable]:
 
 def _graphs(functions: dict[str, Buildable]) -> dict[str, ca.Function]:
     """The functions as CasADi can run them itself."""
-    return {name: _no_nan(f.graph()) if isinstance(f, NativeCode) else f for name, f in functions.items()}
-
-
-def _no_nan(graph: ca.Function) -> ca.Function:
-    """A function that gives no numbers where an input is none, as C code does."""
-    inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
-    # a comparison with none is false; x == x would be simplified
-    finite = ca.mmin(ca.vertcat(1, *[ca.vec(ca.densify(x)) >= -np.inf for x in inputs]))
-    out = [ca.if_else(finite, x, np.nan) for x in graph.call(inputs)]
-    return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
+    return {name: f.graph() if isinstance(f, NativeCode) else f for name, f in functions.items()}
 
 
 @functools.cache

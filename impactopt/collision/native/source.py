@@ -5,6 +5,9 @@ from __future__ import annotations
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
+import numpy as np
+
 from impactopt.codegen.cache import NativeCode
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from impactopt.collision.native.generated import (
@@ -56,7 +59,7 @@ def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, ever
     return NativeCode(
         name="collision",
         code=code,
-        graph=lambda: collision_graph(collision, outputs, every=every, as_compiled=True),
+        graph=lambda: _no_nan(collision_graph(collision, outputs, every=every, as_compiled=True)),
     )
 
 
@@ -72,7 +75,7 @@ def native_gradient(collision: SymbolicModel, output: str) -> Any:
     def graph() -> Any:
         if collision.stepping == "implicit":
             raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'events'"))
-        return gradient_graph(collision, output)
+        return _no_nan(gradient_graph(collision, output))
 
     return NativeCode(
         name="collision_gradient",
@@ -90,6 +93,15 @@ def native_jacobian(collision: SymbolicModel, outputs: tuple[str, ...], *, every
     return NativeCode(
         name="collision_jacobian", code=_code(collision, "collision_jacobian", outputs, every), graph=none
     )
+
+
+def _no_nan(graph: ca.Function) -> ca.Function:
+    """A function that gives no numbers where an input is none, as C code does."""
+    inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
+    # a comparison with none is false; x == x would be simplified
+    finite = ca.mmin(ca.vertcat(1, *[ca.vec(ca.densify(x)) >= -np.inf for x in inputs]))
+    out = [ca.if_else(finite, x, np.nan) for x in graph.call(inputs)]
+    return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 
 def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: int) -> str:

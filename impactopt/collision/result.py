@@ -76,11 +76,16 @@ class Collision:
 
     @classmethod
     def from_outputs(cls, found: dict[str, Array], target: Target) -> Collision:
-        """From the arrays of a collision function, without instants that repeat the one before."""
+        """From the arrays of a collision function, without instants that repeat the one before.
+
+        What judges a result, `step_error`, is no part of it.
+        """
         time = found["time"].ravel()
         kept = np.concatenate([[True], np.diff(time) > 0])
         out: dict[str, Any] = {}
         for name, value in found.items():
+            if name == "step_error":
+                continue
             if name in HISTORIES:
                 columns = value.T if value.shape == (time.size, 1) else value
                 rows = np.ascontiguousarray(columns[:, kept].T)

@@ -202,7 +202,7 @@ class SymbolicModel(CollisionModel):
 
         Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with terms.feedforward; then the settings
         that `parameters` name (any of `settings`), the others being fixed. It does not contain what no
-        output needs, and has no derivatives.
+        output needs, and has no derivatives. Where an input is NaN, so are all outputs, `separated` too.
 
         Parameters
         ----------
@@ -437,7 +437,7 @@ class SymbolicModel(CollisionModel):
         found = self._collision(names).call([ca.DM(x) for x in (*arguments, *values.values())])
         outputs = {name: np.array(x) for name, x in zip(names, found, strict=True)}
         check_finite(outputs, self.step_length)
-        error = float(outputs.pop("step_error", np.zeros(1)).item())
+        error = float(outputs.get("step_error", np.zeros(1)).item())
         result = Collision.from_outputs(outputs, self.target)
         # of a plastic blow, where the contact is broken off before
         numbers = {name: values[f"target_{name}"] for name in self.target.parameters}

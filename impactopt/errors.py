@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -24,6 +25,8 @@ __all__ = [
 FARTHEST = 1e3  # [m] from the origin of a frame or the world; micrometres still count there
 # of any other number that is given, in SI units: products of a few such ones are still finite
 MOST = 1e15
+# a terminal obeys them, and half of a pair (a surrogate) cannot be written in UTF-8
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class InputError(ValueError):
@@ -82,6 +85,22 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
 def printable(text: str) -> str:
     """Text for a terminal: control characters but new lines are shown by their codes, not obeyed."""
     return "".join(c if c == "\n" or c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def has_control(text: str) -> bool:
+    """Whether a text has control characters besides tabs and new lines: no file, name or result may."""
+    return _CONTROL.search(text) is not None
+
+
+def check_name(what: str, name: object, *, empty: bool = False) -> None:
+    """InputError if reports cannot call a thing so: it is no text, it is empty, or a terminal would obey it.
+
+    what : that is called so, as "a scenario".  empty : may the name be.
+    """
+    if not isinstance(name, str) or not (empty or name.strip()):
+        raise InputError(f"{what}'s name is {shortened(repr(name))}; give a word that reports can call it by")
+    if has_control(name):
+        raise InputError(f"{what}'s name {shortened(repr(name))} has control characters; take them out")
 
 
 def check_array(

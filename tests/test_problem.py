@@ -165,6 +165,8 @@ def test_a_fixed_base_holds_no_soles() -> None:
         ({"collision_elements": ((), (1.0,))}, "collision_elements"),
         ({"collision_elements": ((1.0,),)}, "collision_elements"),
         ({"terms": (Incidence(), Incidence(speed=0.1))}, "two terms of kind Incidence"),
+        ({"name": "a\x1b[2Jb"}, "the problem's name 'a.*control characters"),
+        ({"name": 3}, "the problem's name is 3"),
         ({"smoothness": -1.0}, "smoothness"),
         ({"wrench_price": np.nan}, "wrench_price"),
         ({"stance": BothSoles(base_mass=1e6, base_inertia=1e6)}, "virtual base"),

@@ -149,6 +149,7 @@ OBJECTIVES = st.lists(
     min_size=1,
     unique_by=type,
 ).map(tuple)
+LETTERS = st.characters(exclude_categories=["Cc", "Cs"], include_characters="\n\t")
 WORDS = st.text("ab \"'\\\n=#[", min_size=1).filter(lambda text: bool(text.strip()))
 SCENARIOS = st.lists(
     st.builds(Scenario, name=WORDS, torque=SMALL, cone_margin=SMALL)
@@ -188,7 +189,7 @@ CHANGES = st.fixed_dictionaries(
         "smoothness": SMALL,
         "wrench_price": SMALL,
         "return_price": SMALL,
-        "name": st.text(st.characters(exclude_categories=["Cs"]), max_size=8),
+        "name": st.text(LETTERS, max_size=8),
     },
 )
 

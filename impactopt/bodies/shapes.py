@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean, shortened
+from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
 
 Vector = tuple[float, float, float]
 
@@ -79,8 +79,7 @@ class Obstacle:
 
     def __post_init__(self) -> None:
         where = f"obstacle {self.name!r}"
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise InputError(f"an obstacle's name is {self.name!r}; give a word that reports can call it by")
+        check_name("an obstacle", self.name)
         if (self.size is None) == (self.start is None):
             raise InputError(f"{where}: give either size, of a box, or start and radius, of a capsule")
         for key in ("size", "position", "rpy", "start", "end"):

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.errors import has_control
+
 __all__ = ["check_arrays", "check_summary"]
 
 # Letters are sizes: n, nq and nv of the robot in all arrays; others are the same among arrays of one prefix.
@@ -31,6 +33,7 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "": {"joints": "n", "torque_limit": "n", "velocity_limit": "n", "polygon": "c 2"},
     "reference": {**_REFERENCE, "angle": "k n"},
     "missed": _REFERENCE,
+    "strike": {"posture": "nq", "velocity": "nv", "torque": "n"},
     "simulated": {**_MOTION, **_HISTORIES, "v": "k nv", "demand": "k n", "torque": "k n", "angle": "k n"},
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"},
@@ -39,7 +42,8 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
 }
 _TEXTS = ("joints", "replayed_soles")
 _ROBOT = ("n", "nq", "nv")
-_FINITE = ("time", "q", "angle", "torque", "links", "path")  # of the motion; what there is none of may be NaN
+# of the motion; what there is none of may be NaN
+_FINITE = ("time", "q", "posture", "velocity", "angle", "torque", "links", "path")
 _NUMBER, _NONE = (int, float), (int, float, type(None))
 _KEYS: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(("status", "message", "solver"), (str,)),
@@ -120,7 +124,7 @@ def check_summary(summary: Any, *, whole: bool) -> None:
         for entry in summary.get(name, ()):
             _check_kind(name, entry, (dict,))
     for text in _texts(summary):
-        if any(not c.isprintable() and c not in "\n\t" for c in text):
+        if has_control(text):
             raise ValueError(f"its summary has text with control characters: {text[:40]!r}")
 
 

@@ -21,6 +21,7 @@ from impactopt.errors import (
     InputError,
     Mistakes,
     check_array,
+    check_name,
     check_number,
     check_whole,
     raw_array,
@@ -160,6 +161,7 @@ class ImpactProblem:
 
     def __post_init__(self) -> None:
         found = Mistakes()
+        found.attempt(lambda: check_name("the problem", self.name, empty=True))
         hits = found.attempt(lambda: self.robot.striker(self.striker))
         aimed = found.attempt(self._check_aim)
         stands = found.attempt(self._check_stance) and found.attempt(self._check_start)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from impactopt.contact.factors import scaled_numbers
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
-from impactopt.errors import MOST, InputError, check_array
+from impactopt.errors import MOST, InputError, check_array, check_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +47,7 @@ class Scenario:
     capture_margin: float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise InputError(f"a scenario's name is {self.name!r}; give a word that reports can call it by")
+        check_name("a scenario", self.name)
         where = f"scenario {self.name!r}"
         for f in fields(self)[1:]:
             value = getattr(self, f.name)

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.errors import has_control
+
 __all__ = [
     "LONGEST_TEXT",
     "TOMLError",
@@ -24,7 +26,6 @@ __all__ = [
 
 _tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 TOMLError: type[ValueError] = _tomllib.TOMLDecodeError
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 LONGEST_TEXT = 1 << 22  # bytes: 400 times the longest of our files, and read in a few seconds
 DEEPEST = 32  # tables and lists in each other; ours are five deep
@@ -105,7 +106,7 @@ def plain_value(value: Any) -> Any:
 def text_with_control(data: Any) -> str:
     """A key or a text with control characters, which a terminal would obey; "" if there is none."""
     if isinstance(data, str):
-        return data if _CONTROL.search(data) else ""
+        return data if has_control(data) else ""
     if isinstance(data, Mapping):
         return next(filter(None, map(text_with_control, (*data, *data.values()))), "")
     if isinstance(data, (list, tuple)):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fake_solution import still_problem, still_solution
 
-from impactopt.contact import CustomLaw, RigidWall
+from impactopt.contact import CustomLaw, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.simulation import Conditions
 from impactopt.simulation import workers as _workers
@@ -71,7 +71,7 @@ def test_every_range_is_a_condition() -> None:
         ({"kp": (0.0, 1.0)}, "kp starts at 0"),
         ({"payload": (-1.0, 1.0)}, "payload is -1"),
         ({"friction": (0.0, 1.0)}, "friction is 0"),
-        ({"distance": (0.0, np.inf)}, "distance is inf"),
+        ({"distance": (0.0, np.inf)}, "distance: inf at index 1; give a finite number"),
         ({"period": -1.0}, "period is -1"),
     ],
 )
@@ -208,8 +208,10 @@ def test_a_law_that_cannot_go_to_processes_is_refused(still: tuple[Any, Any]) ->
 
 def test_a_replay_that_diverges_is_a_row(still: tuple[Any, Any]) -> None:
     """The fist, pressed into a target far stiffer than the step can follow."""
-    hard = Spread(stiffness=(1e12, 1e12), distance=(-0.01, -0.01))
-    result = robustness(*still, 1.0, draws=2, spread=hard, workers=1, step=STEP)
+    _, motion = still
+    problem = still_problem(law=SpringDamper(stiffness=1e9, damping=300.0))
+    hard = Spread(stiffness=(1e6, 1e6), distance=(-0.01, -0.01))
+    result = robustness(problem, motion, 1.0, draws=2, spread=hard, workers=1, step=STEP)
     assert not result.standing.any()
     assert all("diverged" in reason for reason in result.reason)
     assert np.isnan(result.impulse).all() and np.isnan(result.slip).all() and np.isnan(result.lift).all()
@@ -227,8 +229,8 @@ def test_what_an_engine_raises_is_a_row(still: tuple[Any, Any], monkeypatch: pyt
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"draws": 0}, "0 draws"),
-        ({"seed": -1}, "seed is -1"),
+        ({"draws": 0}, "draws: 0; give a whole number from 1"),
+        ({"seed": -1}, "seed: -1; give a whole number from 0"),
         ({"workers": 0}, "0 workers"),
         ({"step": 0.0}, "step of the simulation"),
         ({"step": float("nan")}, "step of the simulation"),

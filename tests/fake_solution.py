@@ -10,12 +10,14 @@ import pinocchio as pin
 from small_robots import biped
 
 from impactopt.contact import FreeMass, SpringDamper
+from impactopt.files.output import Record
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.planning.multistart import Attempt
 from impactopt.planning.solution import Solution
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.robots.robot import Robot
 from impactopt.simulation import Simulation
 from impactopt.solvers.program import IterationRecord, SolverResult, Status, Violation
 from impactopt.transcription.plan import Plan, PlannedCollision
@@ -188,3 +190,20 @@ def still_solution(
         objectives={o.name: IMPULSE for o in problem.objectives if isinstance(o, Impulse)},
         attempts=attempts,
     )
+
+
+def strike_record(robot: Robot, q: Any, v: Any, torque: Any, **given: Any) -> Record:
+    """What is kept of a strike that hits with these, with all that a record has to have."""
+    arrays = {
+        "joints": np.array(robot.joint_names),
+        "torque_limit": robot.torque_limit,
+        "velocity_limit": robot.velocity_limit,
+        "polygon": np.zeros((0, 2)),
+        "strike_posture": q,
+        "strike_velocity": v,
+        "strike_torque": torque,
+    }
+    summary: dict[str, Any] = dict.fromkeys(("status", "message", "solver"), "")
+    summary |= {"violations": [], "starts": [], "iterations": 0, "problem": {}}
+    summary |= dict.fromkeys(("solve_seconds", "build_seconds", "max_violation"))
+    return Record(summary=summary, arrays=arrays, **given)

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from fake_solution import strike_record
 from small_robots import arm, biped
 
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.files.output import Record, save_record
+from impactopt.files.output import save_record
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
 from impactopt.kinematics.stance import BothSoles, FixedBase
 from impactopt.kinematics.support import margin
@@ -221,13 +222,7 @@ def test_the_state_of_a_result(tmp_path: Path) -> None:
     q = robot.posture("ready")
     v = np.array([0.3, 1.0, 0.4])
     torque = holding_torque(robot, q, v) + 1.0
-    arrays = {
-        "joints": np.array(robot.joint_names),
-        "strike_posture": q,
-        "strike_velocity": v,
-        "strike_torque": torque,
-    }
-    save_record(Record(summary={}, arrays=arrays), tmp_path)
+    save_record(strike_record(robot, q, v, torque), tmp_path)
     law = SpringDamper(stiffness=2e4, damping=50.0)
     model = SDC(robot=robot, striker="hammer", normal=NORMAL, law=law, target=FreeMass(mass=0.5))
     as_saved = collide_many(

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_solution import strike_record
 from typer.testing import CliRunner
 
 import impactopt
 from impactopt.cli.app import app
 from impactopt.cli.options import complete_problem
-from impactopt.files.output import Record, save_record
+from impactopt.files.output import save_record
 from impactopt.files.problem_file import load_problem, problem_names, read_problem_file, write_toml
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
@@ -161,10 +162,8 @@ def test_collide_takes_a_saved_result(file: Path, tmp_path: Path) -> None:
     robot, rng = problem.robot, np.random.default_rng(0)
     posture, velocity = problem.start_posture, np.array([0.3, 0.4, 0.2])
     torque = rng.uniform(-5, 5, 3)
-    arrays = {"joints": np.array(robot.joint_names), "strike_posture": posture}
-    arrays |= {"strike_velocity": velocity, "strike_torque": torque}
-    record = Record(summary={}, problem=file.read_text(), arrays=arrays, problem_path=file)
-    save_record(record, tmp_path / "strike")
+    state = (robot, posture, velocity, torque)
+    save_record(strike_record(*state, problem=file.read_text(), problem_path=file), tmp_path / "strike")
     found = json.loads(run("collide", tmp_path / "strike", "--model", "full", "--json", "-q")[0])
     model = FullDynamics(
         robot=robot,
@@ -181,7 +180,7 @@ def test_collide_takes_a_saved_result(file: Path, tmp_path: Path) -> None:
     faster = json.loads(run("collide", tmp_path / "strike", "--speed", twice, "--json", "-q")[0])
     assert faster["hand_speed_m_s"] == pytest.approx(twice)
     assert "leave it out" in run("collide", tmp_path / "strike", "--posture", "ready", code=2)[1]
-    save_record(Record(summary={}, arrays=arrays), tmp_path / "python")
+    save_record(strike_record(*state), tmp_path / "python")
     assert "no problem file" in run("collide", tmp_path / "python", code=2)[1]
     (tmp_path / "empty").mkdir()
     run("collide", tmp_path / "empty", code=2)

@@ -151,11 +151,15 @@ def test_columns_are_those_of_exact_collisions(case):
 
 
 # ------------------------------------------------------------ against gradients
-@pytest.mark.parametrize("output", SCALARS)
+# implicit steps keep their error below the tolerance, and have none to differentiate
+NUMBERS = tuple(name for name in SCALARS if name != "step_error")
+
+
+@pytest.mark.parametrize("output", NUMBERS)
 def test_rows_of_numbers_are_their_gradients(output):
     model = implicit("arm", **SHORT, target=Nail(mass=0.2, resistance=80.0))
     values = situation("arm", model)
-    found = jacobians(model, SCALARS, values)
+    found = jacobians(model, NUMBERS, values)
     value, by_q, by_v = gradient(model, output, values)
     assert found[output] == pytest.approx(value, rel=1e-12)
     assert found[f"{output}_by_q"][0] == pytest.approx(by_q, rel=1e-9, abs=1e-12)

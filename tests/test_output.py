@@ -182,6 +182,7 @@ def test_a_damaged_record_is_never_read_as_another(tmp_path: Path) -> None:
         ("reference_time", np.array(["a"])),
         ("reference_time", np.full(4, np.nan)),
         ("reference_torque", None),
+        ("strike_posture", np.zeros(3)),
         ("joints", np.zeros(3)),
         ("torque_limit", np.zeros(1)),
         ("plan_x", np.zeros(2, dtype="S3")),

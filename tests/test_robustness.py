@@ -299,7 +299,7 @@ def test_ctrl_c_ends_the_processes_and_is_raised(tmp_path: Path) -> None:
         from impactopt.simulation.workers import map_on_workers
 
         def wait(_, x):
-            print(os.getpid(), flush=True)
+            os.write(1, f"{os.getpid()}\\n".encode())  # at once: two of them write
             time.sleep(60)
 
         if __name__ == "__main__":

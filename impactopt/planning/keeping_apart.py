@@ -27,6 +27,8 @@ OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no 
 BETWEEN = 4  # joints at least between two links that get a row because they are near
 EXACT = 0.05  # [m] nearer bodies get a row that knows their hulls there
 BEAD = 0.02  # [m] radius of its sphere
+ROUNDED = 5e-3  # [m] that bodies may be in each other where rounded rows are met
+MANY = 8  # rows of two bodies at one place
 DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
 FAR = 0.6  # this [m]
 DEEPEST = 3  # spheres of a pair
@@ -219,12 +221,11 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     rows: Rows = {}
     for (spot, pair), apart in found.items():
         known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair) and row.number >= 0]
-        # rows that are met, and yet it is too near there or beside: they are to ask for more
-        more = 0.0
-        here = bodies.exact(spots.at, spot, pair)
-        if known and here > (1 - SHARE) * margins.of(
-            pair
-        ):  # the place is right, and the motion beside it is not
+        # rows that are met, and yet it is too near there, as they are rounded, or beside, as the motion is not
+        # what it is at nodes: they are to ask for more; the former only where others have not helped
+        more, here = 0.0, bodies.exact(spots.at, spot, pair)
+        enough = (1 - SHARE) * margins.of(pair) if len(known) <= MANY else -ROUNDED
+        if known and here > enough:
             before = [t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known]
             more = max(0.0, *before) + margins.of(pair) - max(apart, -DEEP)
         found_here = margins.held_around(spots.at, spot, pair, min(more, DEEP))

@@ -221,8 +221,8 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     rows: Rows = {}
     for (spot, pair), apart in found.items():
         known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair) and row.number >= 0]
-        # rows that are met, and yet it is too near there, as they are rounded, or beside, as the motion is not
-        # what it is at nodes: they are to ask for more; the former only where others have not helped
+        # rows that are met, and yet it is too near: there, as they are rounded, or beside, as motion is not
+        # what it is at nodes. They are to ask for more; the former only where others have not helped
         more, here = 0.0, bodies.exact(spots.at, spot, pair)
         enough = (1 - SHARE) * margins.of(pair) if len(known) <= MANY else -ROUNDED
         if known and here > enough:

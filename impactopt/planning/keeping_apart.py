@@ -80,15 +80,20 @@ class Margins:
         of_all = zip(near.sphere, near.joint, near.other, near.gap, strict=True)
         return {(int(s), bodies.known(int(j), int(o))): float(gap) for s, j, o, gap in of_all}
 
-    def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
+    def held(self, at: Places, k: int, pair: Pair) -> Held:
         """A row that knows what it keeps apart exactly as it is at instant k, where the two are nearest.
 
         Of the one link it takes a small sphere that touches its surface there, of the other body the plane
-        that does.  more [m] : than the margin.
+        that does.
         """
-        return self._held(at, k, pair, self.bodies.closest(at, k, pair), more)
+        return self._held(at, k, pair, self.bodies.closest(at, k, pair))
 
-    def _held(self, at: Places, k: int, pair: Pair, found: Closest, more: float) -> Held:
+    def held_sphere(self, at: Places, k: int, sphere: int, pair: Pair) -> Held:
+        """A row for a sphere of a link and the planes about the other body, at instant k."""
+        centre = tuple(self.bodies.links.centre[sphere].tolist())
+        return Held(centre, self.reach(sphere, pair), None, float(at.travel[k]))
+
+    def _held(self, at: Places, k: int, pair: Pair, found: Closest, more: float = 0.0) -> Held:
         travel, away = float(at.travel[k]), -found.normal  # from the other to the one
         (turn, shift), (facing, place) = (self.bodies.placement(at, k, body) for body in pair)
         centre = turn.T @ (found.one + BEAD * away - shift)
@@ -98,7 +103,7 @@ class Margins:
 
     def held_around(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> list[Held]:
         """As :meth:`held`, and corners of the one link around, which come next where two flat sides slide or
-        turn.
+        turn.  more [m] : than the margin.
         """
         found = self.bodies.closest(at, k, pair)
         first = self._held(at, k, pair, found, more)
@@ -158,9 +163,8 @@ def _rows_of(margins: Margins, spots: Spots, near: Near) -> Rows:
         if -DEEP < gap < EXACT:
             out[ApartRow(spots.names[k], *pair)] = margins.held(spots.at, int(k), pair)
         else:
-            centre = tuple(bodies.links.centre[sphere].tolist())
-            held = Held(centre, margins.reach(int(sphere), pair), None, float(spots.at.travel[k]))
-            out[ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))] = held
+            row = ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))
+            out[row] = margins.held_sphere(spots.at, int(k), int(sphere), pair)
     return out
 
 
@@ -176,10 +180,9 @@ def _rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
     near = bodies.near(spots.at, FAR, BETWEEN, only) if only else deep
     for k, sphere, joint, other in zip(near.at, near.sphere, near.joint, near.other, strict=True):
         if int(sphere) in worst.get((int(joint), int(other)), ()):
-            reach = margins.reach(int(sphere), bodies.known(int(joint), int(other)))
-            centre = tuple(bodies.links.centre[sphere].tolist())
             row = ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))
-            out[row] = Held(centre, reach, None, float(spots.at.travel[k]))
+            pair = bodies.known(int(joint), int(other))
+            out[row] = margins.held_sphere(spots.at, int(k), int(sphere), pair)
     return out
 
 

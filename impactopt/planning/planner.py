@@ -184,6 +184,7 @@ class _Refining:
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
         self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
         self._refined = 0  # rounds with more nodes or elements
+        self._clean: SolverResult | None = None  # the last that was looked at, if its bodies are apart
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
         """Of a program's contact at its solution; the last one that was asked for is known."""
@@ -256,7 +257,7 @@ class _Refining:
 
     def _judged(self, t: Transcription, result: SolverResult) -> SolverResult:
         """A result that could not be mended is a solution only if nothing touches anything."""
-        if self.margins is None or not result.status.usable:
+        if self.margins is None or not result.status.usable or result is self._clean:
             return result
         with contextlib.suppress(InputError):
             left = rows_to_add(t, result.x, self.margins, share=1.0)
@@ -278,6 +279,7 @@ class _Refining:
         error: ContactError | None = None
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
             violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
+        self._clean = old if violated is None else None
         if violated is not None and violated.depth > DEEP and again < _DEEP_ROUNDS:
             return self._apart_again(t, old, x0, violated)
         if self._refined < _NODE_ROUNDS:

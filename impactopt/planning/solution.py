@@ -186,6 +186,11 @@ class Solution(Solved):
         ``clearance_mm``, ``nearest`` and ``contacts_besides`` of ``summary.json``; those of a missed blow
         are among them, and say so.
         """
+        least, nearest, touches = self._clearance
+        return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": [{**t} for t in touches]}
+
+    @cached_property
+    def _clearance(self) -> tuple[float, str, list[dict[str, Any]]]:
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.brake is not None else (False,):
@@ -199,7 +204,7 @@ class Solution(Solved):
                     {"one": one, "other": other, "start_s": start, "end_s": end, "depth_mm": 1e3 * depth}
                     | ({"missed": True} if missed else {})
                 )
-        return {"clearance_mm": 1e3 * least, "nearest": nearest, "contacts_besides": touches}
+        return least, nearest, touches
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""

@@ -325,7 +325,7 @@ def test_lower_bounds_are_no_more_than_exact_distances(name: str) -> None:
     bodies = problem.bodies
     places, within = random_places(problem, 16), 0.15
     found: dict[tuple[int, Any], float] = {}
-    slack = bodies._slack() + 1e-3
+    slack = bodies.slack + 1e-3
     assert slack <= 3e-3
     for bound, k, pair in bodies.lower_bounds(places, within):
         assert (k, pair) not in found

@@ -5,43 +5,40 @@ our hulls.
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pinocchio as pin
+import pytest
 from small_plans import BODILESS
 
-from impactopt import Solution, solve
-
-
-def meshes(solution: Solution) -> tuple[Any, Any]:
-    """Pinocchio's model and geometry of the robot, with the pairs that may not touch: not what a joint
-    connects, nor what touches at the start."""
-    robot = solution.problem.robot
-    full = pin.buildModelFromUrdf(robot.urdf, pin.JointModelFreeFlyer())
-    folders = [str(folder) for folder in Path(str(robot.urdf)).resolve().parents]
-    geometry = pin.buildGeomFromUrdf(full, robot.urdf, pin.COLLISION, package_dirs=folders)
-    locked = [full.getJointId(name) for name in full.names if name not in set(robot.model.names)]
-    model, geometry = pin.buildReducedModel(full, geometry, locked, pin.neutral(full))
-    geometry.addAllCollisionPairs()
-    data, found = model.createData(), geometry.createData()
-    pin.computeCollisions(model, data, geometry, found, solution.problem.start_posture, False)
-    for k, pair in enumerate(geometry.collisionPairs):
-        a, b = (geometry.geometryObjects[i].parentJoint for i in (pair.first, pair.second))
-        together = a == b or model.parents[a] == b or model.parents[b] == a
-        if together or found.collisionResults[k].isCollision():
-            found.deactivateCollisionPair(k)
-    return model, (geometry, found)
+from impactopt import Solution, load_problem, solve
+from impactopt.simulation.reference.meshes import Meshes
 
 
 def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solution) -> None:
     assert punch.status.usable, punch.result.message
-    model, (geometry, found) = meshes(punch)
-    data = model.createData()
+    meshes = Meshes(punch.problem.robot, punch.problem.start_posture)
+    assert meshes.known
     for missed in (False, True):
-        for q in punch.plan.motion(4e-3, missed=missed).q:
-            assert not pin.computeCollisions(model, data, geometry, found, q, True)
+        assert meshes.touching(punch.plan.motion(1e-3, missed=missed).q) == []
+
+
+def test_the_meshes_know_what_is_in_each_other(punch: Solution) -> None:
+    """A forearm turned through the pelvis is found: what never fails would say nothing."""
+    robot, q = punch.problem.robot, punch.problem.start_posture.copy()
+    for joint in ("arm_left_4_joint", "arm_left_2_joint"):
+        q[robot.model.joints[robot.model.getJointId(joint)].idx_q] = 0.0
+    meshes = Meshes(robot, punch.problem.start_posture)
+    assert any("arm_left" in one or "arm_left" in two for one, two in meshes.touching(q[None]))
+
+
+@pytest.mark.parametrize("name", ["door", "chop", "nailing", "kick_g1"])
+def test_nor_in_other_problems(name: str) -> None:
+    solution = solve(load_problem(name))
+    assert solution.status.usable, solution.result.message
+    meshes = Meshes(solution.problem.robot, solution.problem.start_posture)
+    assert meshes.known
+    for missed in (False, True) if solution.plan.brake is not None else (False,):
+        assert meshes.touching(solution.plan.motion(1e-3, missed=missed).q) == []
 
 
 def test_the_summary_says_so(punch: Solution) -> None:

@@ -282,7 +282,8 @@ class Bodies:
         solid = self.world[-1 - body]
         return solid.rotation, solid.place + at.travel[k] * self.normal * solid.moves
 
-    def _slack(self) -> float:
+    @cached_property
+    def slack(self) -> float:
         """[m] by how much bodies may be nearer than their spheres and planes say."""
         return max(self.links.short.values(), default=0.0)
 
@@ -307,7 +308,7 @@ class Bodies:
         found: dict[Pair, list[tuple[int, float]]] = {}
         seen: set[tuple[Pair, int]] = set()
         for bound, k, pair in self.lower_bounds(at, within):
-            if bound - self._slack() >= max(least, 0.0):
+            if bound - self.slack >= max(least, 0.0):
                 break
             moment = pair, int(time[k] / EVERY)
             if moment in seen:

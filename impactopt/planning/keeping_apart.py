@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -15,6 +16,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -188,12 +191,14 @@ def _rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
 
 class Violated(NamedTuple):
     """Rows that a solution needs beside its own, how deep [m] bodies are in each other without them, and
-    which pairs of them are deeper than `DEEP`.
+    which pairs of them are deeper than `DEEP`. And the places on their splines that need a node, as bodies
+    meet there although rows keep them apart by more than is asked before and after.
     """
 
     rows: Rows
     depth: float
     deep: frozenset[Pair] = frozenset()
+    nodes: MoreNodes = NO_MORE
 
 
 def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = SHARE) -> Violated | None:
@@ -201,27 +206,36 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
 
     Too near is what gives up more than a ``share`` of its margin by exact geometry. Rows that are there and
     do not keep it, as spheres do not know all of a link, or as the motion leaves them between two nodes, are
-    tightened by what is missing.
+    tightened by what is missing. Where tightened rows on both sides are met and do not help, bodies turn
+    about each other in less time than there is between two nodes, and a node is asked for.
     """
     plan, bodies = t.decode(x), margins.bodies
     spots, found, deepest = spots_of(t, x), dict[tuple[int, Pair], float](), -np.inf
+    worst = dict[tuple[tuple[int, ...], Pair], tuple[float, float, bool]]()
     for missed in (False, True) if plan.brake is not None else (False,):
         motion = plan.motion(STEP, missed=missed)
         at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
-        near = bodies.near(at, max(margins.own.margin, margins.world.margin)).least()
+        within = max(margins.own.margin, margins.world.margin) + bodies.slack
+        near = bodies.near(at, within).least()
         for k, joint, other, gap in zip(near.at, near.joint, near.other, near.gap, strict=True):
             pair = bodies.known(int(joint), int(other))
             asked = margins.of(pair)
-            if not margins.term(pair).enabled or gap > asked:
+            if not margins.term(pair).enabled or gap - bodies.slack > (1 - share) * asked:
                 continue
             apart = bodies.exact(at, int(k), pair)
             if apart < (1 - share) * asked:
                 deepest = max(deepest, -apart)
-                for spot in _beside(spots, float(motion.time[k]), missed):
+                beside = _beside(spots, float(motion.time[k]), missed)
+                for spot in beside:
                     found[spot, pair] = min(found.get((spot, pair), np.inf), apart)
+                key = (tuple(beside), pair)
+                worst[key] = min(
+                    worst.get(key, (np.inf, 0.0, missed)), (apart, float(motion.time[k]), missed)
+                )
     if not found:
         return None
     rows: Rows = {}
+    tightened: set[tuple[int, Pair]] = set()  # met and with more than the margin asked for already
     for (spot, pair), apart in found.items():
         known = [row for row in t.apart_rows if row[:3] == (spots.names[spot], *pair) and row.number >= 0]
         # rows that are met, and yet it is too near: there, as they are rounded, or beside, as motion is not
@@ -231,6 +245,8 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         if known and here > enough:
             before = [t.apart_rows[row].reach - BEAD - margins.of(pair) for row in known]
             more = max(0.0, *before) + margins.of(pair) - max(apart, -DEEP)
+            if max(before) > 0.0:
+                tightened.add((spot, pair))
         found_here = margins.held_around(spots.at, spot, pair, min(more, DEEP))
         for k, held in enumerate(found_here if known else found_here[:1], len(known)):
             rows[ApartRow(spots.names[spot], *pair, k)] = held
@@ -238,13 +254,34 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     if deep:
         own = bodies.near(spots.at, -DEEP, BETWEEN, set(deep)).least()
         rows = {**_rows_all_along(margins, spots, own), **rows}
-    return Violated({key: held for key, held in rows.items() if key not in t.apart_rows}, deepest, deep)
+    between = [
+        (time, missed)
+        for (beside, pair), (_, time, missed) in worst.items()
+        if all((spot, pair) in tightened for spot in beside)
+    ]
+    new = {key: held for key, held in rows.items() if key not in t.apart_rows}
+    return Violated(new, deepest, deep, _nodes_at(t, plan, between))
+
+
+def _nodes_at(t: Transcription, plan: Plan, between: Iterable[tuple[float, bool]]) -> MoreNodes:
+    """The program's nodes and more half-way between those around instants [s] of the motion, or of the one
+    that has met nothing.
+    """
+    places: tuple[set[float], set[float]] = set(t.nodes.swing), set(t.nodes.follow)
+    for time, missed in between:
+        for phase, more in ((0, places[0]), (AFTER, places[1])):
+            curve, begin, nodes, _ = plan.way(phase, missed=missed)
+            place = (time - begin) / curve.duration
+            if 0.0 < place < 1.0:
+                k = int(np.clip(np.searchsorted(nodes, place), 1, len(nodes) - 1))
+                more.add(float(nodes[k - 1] + nodes[k]) / 2)
+    return MoreNodes(tuple(sorted(places[0])), tuple(sorted(places[1])))
 
 
 def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:
     """Rows for the bodies that are too near at the places of a program themselves."""
     spots, bodies = spots_of(t, x), margins.bodies
-    near = bodies.near(spots.at, max(margins.own.margin, margins.world.margin)).least()
+    near = bodies.near(spots.at, max(margins.own.margin, margins.world.margin) + bodies.slack).least()
     rows: Rows = {}
     for k, joint, other in zip(near.at, near.joint, near.other, strict=True):
         pair = bodies.known(int(joint), int(other))

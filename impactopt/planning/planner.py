@@ -251,6 +251,8 @@ class _Refining:
                     break
             if not new.status.usable:
                 break
+            if following.program.layout.n != len(x0):  # more nodes or elements: the start has them too
+                x0 = _start_of(following.program, t, x0)
             t, result = following.program, _one_after_the_other(result, new)
             found.append((t, following.name, new))
         return t, result, found
@@ -284,7 +286,8 @@ class _Refining:
             return self._apart_again(t, old, x0, violated)
         if self._refined < _NODE_ROUNDS:
             with contextlib.suppress(InputError):
-                nodes = nodes_to_add(t.decode(old.x), t.nodes)
+                known = t.nodes if violated is None else violated.nodes
+                nodes = nodes_to_add(t.decode(old.x), known)
             error = self.error(t, old.x)
             elements = refined_elements(error, t.elements)
         if violated is None and nodes == t.nodes and elements is None:
@@ -329,6 +332,11 @@ class _Refining:
         warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
         why = f"{words}: on with rows between them"
         return round_of(starts=(warm, x0, old.x), why=why, barrier=_BARRIER_DEEP)
+
+
+def _start_of(finer: Transcription, t: Transcription, x0: Array) -> Array:
+    """What a program started from, for one with more nodes or elements."""
+    return carried_over(finer, t, x0, np.zeros(t.program.m), np.zeros(t.layout.n))[0]
 
 
 def _more(nodes: MoreNodes, elements: Elements | None, rows: int) -> str:

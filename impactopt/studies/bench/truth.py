@@ -12,6 +12,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
@@ -19,9 +22,12 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos
+from impactopt.simulation.reference.meshes import Meshes
 from impactopt.studies.bench.planning import DEMO, solved
 from impactopt.studies.bench.report import Report, Say, columns_table
 
+Array = NDArray[np.float64]
+EVERY = 1e-3  # [s] at which the meshes of a motion are looked at
 TIME_LIMIT = 60.0  # [s] of the solver, for the variants
 
 # what differs from the demo's punch
@@ -51,6 +57,7 @@ HELD = (
     ("force N", "min_normal_force_N", 0),
     ("apart mm", "clearance_mm", 1),
     ("touches", "touches", 0),
+    ("in meshes", "mesh_touches", 0),
 )
 FREE = (
     ("problem", "problem", 0),
@@ -59,6 +66,7 @@ FREE = (
     ("lift mm", "replay_lift_collision_mm", 2),
     ("apart mm", "replay_clearance_mm", 1),
     ("touches", "replay_touches", 0),
+    ("in meshes", "replay_mesh_touches", 0),
     ("stands", "standing", 0),
 )
 
@@ -104,6 +112,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
     """What one problem gives; an error is its status, and ends what can be said of it.
 
     clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
+    mesh_touches : pairs that are in each other by the exact meshes of the robot's URDF, looked at every
+    millisecond of the plan, the missed blow and the replay (None: it has no meshes).
     """
     out: dict[str, Any] = {"problem": name}
     try:
@@ -111,11 +121,13 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         summary = solution.outcome()
         out |= {key: summary[key] for key in ("status", "iterations", "solve_seconds")}
         out["impulse_planned_Ns"] = solution.impulse
-        told = solution.summary(solution.validate())
+        replay = solution.validate()
+        told = solution.summary(replay)
         held = told["simulated"]
         out |= {
             "clearance_mm": _least(told["clearance_mm"], held["clearance_mm"]),
             "touches": len([*told["contacts_besides"], *(held["contacts_besides"] or ())]),
+            "mesh_touches": _mesh_touches(solution, *_planned(solution), replay.q[_each(replay.time)]),
             "impulse_error_pct": held["impulse_error_pct"],
             "zmp_margin_m": min(held.get("zmp_margin_m", {}).values(), default=None),
             "torque_ratio": max(held["torque_ratio"].values()),
@@ -127,7 +139,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         say(f"{name}: {error}")
         return out
     try:
-        free = solution.summary(solution.validate(engine="mujoco"))["simulated"]
+        replay = solution.validate(engine="mujoco")
+        free = solution.summary(replay)["simulated"]
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}
         return out
@@ -137,10 +150,27 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         "replay_lift_collision_mm": free.get("sole_lift_collision_mm"),
         "replay_clearance_mm": free["clearance_mm"],
         "replay_touches": len(free["contacts_besides"] or ()),
+        "replay_mesh_touches": _mesh_touches(solution, replay.q[_each(replay.time)]),
         "standing": free["standing"],
         "reason": free["reason"],
     }
     return out
+
+
+def _planned(solution: Solution) -> list[Array]:
+    """Configurations (k, nq) of the plan and of its missed blow."""
+    ways = (False, True) if solution.plan.brake is not None else (False,)
+    return [solution.plan.motion(EVERY, missed=missed).q for missed in ways]
+
+
+def _each(time: Array) -> NDArray[np.intp]:
+    """Which instants (k,) [s] of a replay are about `EVERY` apart."""
+    return np.unique(time // EVERY, return_index=True)[1]
+
+
+def _mesh_touches(solution: Solution, *motions: Array) -> int | None:
+    meshes = Meshes(solution.problem.robot, solution.problem.start_posture)
+    return len({pair for q in motions for pair in meshes.touching(q)}) if meshes.known else None
 
 
 def _least(*lengths: float | None) -> float | None:

@@ -28,7 +28,7 @@ from impactopt.transcription.planned_strike import PlannedStrike
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Solved:
     """What a solved (or stopped) program of a problem is told by.
 
@@ -48,6 +48,14 @@ class Solved:
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
+
+    def __repr__(self) -> str:
+        """One line: its arrays would fill pages."""
+        impulse = getattr(self, "impulse", np.nan)
+        return (
+            f"<{type(self).__name__} of {self.problem.name or self.problem.robot.name!r}: "
+            f"{self.status.value}, {impulse:.2f} N s, {self.result.iterations} iterations>"
+        )
 
     @property
     def status(self) -> Status:
@@ -69,7 +77,7 @@ class Solved:
         }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Solution(Solved):
     """A solved (or stopped) impact problem.
 

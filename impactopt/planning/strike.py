@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 ROUNDS = 5  # of more rows between bodies
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class StrikeSolution(Solved):
     """A solved (or stopped) strike.
 

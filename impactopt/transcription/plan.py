@@ -104,7 +104,7 @@ class PlannedScenario:
         return out | ({"zmp_margin_m": float(margin(polygon, zmp(hit.ground)).min())} if len(polygon) else {})
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Plan:
     """A planned impact motion.
 
@@ -132,6 +132,10 @@ class Plan:
     scenarios: tuple[PlannedScenario, ...] = ()
     brake: CubicSpline | None = None
     brake_wrench: Array | None = None
+
+    def __repr__(self) -> str:
+        """One line: its arrays would fill pages."""
+        return f"<Plan of {self.problem.name!r}: {self.impulse:.2f} N s, contact at {self.contact_start:.3g} s>"
 
     @property
     def coordinates(self) -> StanceCoordinates:

@@ -14,7 +14,6 @@ PACKAGE = Path(impactopt.__file__).parent
 ROOMS_IN_ORDER = (
     "__init__",
     "errors",
-    "storage",
     "codegen",
     "robots",
     "rigid_body",
@@ -30,7 +29,6 @@ ROOMS_IN_ORDER = (
     "files",
     "sweeps",
     "pictures",
-    "terminal",
     "report",
     "studies",
     "cli",

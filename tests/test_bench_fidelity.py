@@ -23,8 +23,8 @@ from impactopt.simulation.cases import PAPER_SPEEDS
 from impactopt.studies.bench import fidelity, virtual_base
 from impactopt.studies.bench.fidelity import Task
 from impactopt.studies.bench.ladder import GAINS, HORIZON, MASS_RATIOS, TARGETS, Rung, situations
-from impactopt.studies.bench.report import Report
 from impactopt.studies.bench.virtual_base import Hand
+from impactopt.studies.report import Report
 
 runner = CliRunner()
 

@@ -20,11 +20,12 @@ import pinocchio as pin
 import pytest
 
 from impactopt.codegen import cache as codegen
-from impactopt.codegen.cache import cache_directory, cached, model_hash
+from impactopt.codegen import private_files
+from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import Compiler, find_compiler
+from impactopt.codegen.directory import cache_directory
+from impactopt.codegen.hashing import canonical, model_hash
 from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
-from impactopt.storage import private_files
-from impactopt.storage.hashing import canonical
 
 ROOT = Path(__file__).parent.parent
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -39,7 +39,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import striking_velocity
 from impactopt.simulation.reference import FullDynamics, holding_torque
 from impactopt.simulation.workers import map_on_workers
-from impactopt.studies.bench.report import Report, Say, make_table
+from impactopt.studies.report import Report, Say, make_table
 
 __all__ = ["FREEZES", "KINDS", "ROBOTS", "Drawn", "draw", "judge", "run", "summary"]
 

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.codegen.files import open_own, write_atomically
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import make_directory, plain
 from impactopt.files.problem_file import read_problem_file
 from impactopt.files.problem_file.names import problem_file, problem_names
 from impactopt.solvers.program import NonlinearProgram, Status, Vector
-from impactopt.storage.files import open_own, write_atomically
 from impactopt.studies.bench.attempts import Attempt, Make, attempt
-from impactopt.studies.bench.report import Report, Say, columns_table
 from impactopt.studies.bench.solvers import SOLVERS
+from impactopt.studies.report import Report, Say, columns_table
 
 __all__ = ["ATTEMPTS", "planning_program", "run", "summary"]
 

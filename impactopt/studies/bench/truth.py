@@ -20,7 +20,7 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos
 from impactopt.studies.bench.planning import DEMO, solved
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 TIME_LIMIT = 60.0  # [s] of the solver, for the variants
 

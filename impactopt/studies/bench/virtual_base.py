@@ -28,7 +28,7 @@ from impactopt.kinematics.stance import BothSoles
 from impactopt.pictures.virtual_base import virtual_base_picture
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 Array = NDArray[np.float64]
 

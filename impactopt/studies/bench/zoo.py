@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.codegen.files import open_own, write_atomically
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
@@ -25,9 +26,8 @@ from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.storage.files import open_own, write_atomically
 from impactopt.studies.bench.planning import DEMO, solved
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 __all__ = ["BASES", "ROWS", "Base", "cleanliness", "draw", "drawn_problem", "row", "run"]
 

@@ -1,7 +1,7 @@
 """How a held robot's striking point can be moved, and what torque lets it move on, compiled for many states.
 
-`impactopt.simulation.cases.striking_velocity` and `impactopt.simulation.reference.holding_torque` are the
-same for one state, by Pinocchio and least squares; the two are tested against each other.
+`impactopt.kinematics.held` has the same for one state, by Pinocchio and least squares; the two are tested
+against each other. That takes some milliseconds a state, which for millions of them would be hours.
 """
 
 from __future__ import annotations

@@ -34,10 +34,10 @@ from impactopt.contact import (
     SpringDamper,
 )
 from impactopt.errors import InputError
+from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
-from impactopt.simulation.cases import striking_velocity
-from impactopt.simulation.reference import FullDynamics, holding_torque
+from impactopt.simulation.reference import FullDynamics
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.report import Report, Say, make_table
 

@@ -7,7 +7,6 @@ import resource
 import sqlite3
 import subprocess
 import sys
-import zlib
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -133,6 +132,7 @@ def test_a_file_that_was_cut_off_is_refused_and_left_as_it_is(tmp_path: Path, si
     "content",
     [
         b"",
+        "text",
         b"[]\n",
         b"{}\n",
         b"[" * 100_000,
@@ -147,10 +147,11 @@ def test_a_file_that_was_cut_off_is_refused_and_left_as_it_is(tmp_path: Path, si
         b'{"unit": 1, "peak_mb": 1, "lists": {"a": [[]]}, "arrays": {}, "order": ["a"]}\n',
     ],
 )
-def test_a_row_that_is_none_is_damaged_whatever_its_checksum(tmp_path: Path, content: bytes) -> None:
+def test_a_row_that_is_none_is_damaged_whatever_its_checksum(tmp_path: Path, content: bytes | str) -> None:
     filled(tmp_path / "j", (0,))
     with closing(sqlite3.connect(tmp_path / "j")) as file, file:
-        file.execute("INSERT INTO units VALUES (1, ?, ?)", (zlib.crc32(content), content))
+        crc = zlib.crc32(content) if isinstance(content, bytes) else 0
+        file.execute("INSERT INTO units VALUES (1, ?, ?)", (crc, content))
     journal = Journal(tmp_path / "j")
     assert journal.units == {0} and journal.damaged == 1
     journal.add(entry(1))
@@ -169,6 +170,14 @@ def test_another_programs_file_is_refused_and_left_as_it_is(tmp_path: Path) -> N
         with pytest.raises(InputError, match=rf"{path}.*give another --out"):
             Journal(path)
         assert path.read_bytes() == before
+
+
+def test_nothing_is_written_through_a_link_beside_it(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious", encoding="utf-8")
+    (tmp_path / "j-journal").symlink_to(victim)
+    filled(tmp_path / "j")
+    assert victim.read_text(encoding="utf-8") == "precious"
 
 
 def test_a_full_disk_is_said_and_what_was_there_is_kept(tmp_path: Path) -> None:

@@ -63,9 +63,10 @@ class Journal:
         try:
             self._claim()
             for unit, crc, content in self._rows():
-                sound = zlib.crc32(content) == crc and _unit(content) == unit
-                self.units |= {unit} if sound else set()
-                self.damaged += not sound
+                if isinstance(content, bytes) and zlib.crc32(content) == crc and _unit(content) == unit:
+                    self.units.add(unit)
+                else:
+                    self.damaged += 1
         except BaseException as error:
             self._file.close()
             if isinstance(error, sqlite3.Error):
@@ -117,8 +118,11 @@ class Journal:
         if found != "ok":
             raise InputError(f"{self.path} is damaged ({' '.join(found.split())}); {MEND}")
 
-    def _rows(self) -> Iterator[tuple[int, int, bytes]]:
-        yield from self._file.execute("SELECT unit, crc, content FROM units ORDER BY unit")
+    def _rows(self) -> Iterator[tuple[Any, Any, Any]]:
+        try:
+            yield from self._file.execute("SELECT unit, crc, content FROM units ORDER BY unit")
+        except sqlite3.Error as error:
+            raise InputError(f"cannot read {self.path}: {error}; {MEND}") from error
 
 
 def _made(path: str, flags: int) -> int:

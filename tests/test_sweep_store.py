@@ -7,6 +7,7 @@ import resource
 import sqlite3
 import subprocess
 import sys
+import zlib
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ def test_what_was_added_is_read_in_order_bit_by_bit(tmp_path: Path) -> None:
 
 ADDING = """
 import sys
+import zlib
 from pathlib import Path
 from test_sweep_store import Journal, entry
 journal = Journal(Path(sys.argv[1]))

@@ -14,7 +14,6 @@ PACKAGE = Path(impactopt.__file__).parent
 ROOMS_IN_ORDER = (
     "__init__",
     "errors",
-    "storage",
     "codegen",
     "robots",
     "rigid_body",
@@ -30,7 +29,6 @@ ROOMS_IN_ORDER = (
     "files",
     "sweeps",
     "pictures",
-    "terminal",
     "report",
     "studies",
     "cli",
@@ -40,6 +38,7 @@ RANK = {room: rank for rank, room in enumerate(ROOMS_IN_ORDER)}
 # Below the transcription all is numbers; IPOPT's adapter is the exception, as CasADi's wheel carries IPOPT.
 NUMERIC = (
     "bodies",
+    "kinematics/held.py",
     "kinematics/inverse_kinematics.py",
     "kinematics/splines.py",
     "kinematics/statics.py",

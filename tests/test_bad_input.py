@@ -36,11 +36,10 @@ from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.files.problem_file.changes import parse_settings
 from impactopt.files.problem_file.mistakes import key_lines
 from impactopt.files.problem_file.names import problem_file
+from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.problem.problem import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate
-from impactopt.simulation.cases import striking_velocity
-from impactopt.simulation.reference import holding_torque
 from impactopt.solvers.sqp.ordering import elimination_blocks
 from impactopt.sweeps import read_sweep_file
 

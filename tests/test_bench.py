@@ -20,8 +20,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Simulation
 from impactopt.solvers.program import Status
 from impactopt.studies.bench import replay, robustness, truth
-from impactopt.studies.bench.registry import BENCHES, run_bench
-from impactopt.studies.bench.report import Report, columns_table, make_table, save_report
+from impactopt.studies.registry import BENCHES, run_bench
+from impactopt.studies.report import Report, columns_table, make_table, save_report
 
 HEADS = {"seconds", "versions", "machine"}
 
@@ -223,7 +223,7 @@ def test_out_keeps_numbers_and_pictures(planner: Planner) -> None:
 def test_all_runs_every_bench(planner: Planner, monkeypatch: pytest.MonkeyPatch) -> None:
     planner.kind = FirstOrder
     benches = {name: name for name in ("truth", "robustness", "replay")}
-    monkeypatch.setattr("impactopt.studies.bench.registry.BENCHES", benches)
+    monkeypatch.setattr("impactopt.studies.registry.BENCHES", benches)
     result = run("all", "--draws", "1", "--workers", "1", "--out", "kept", "--json")
     assert result.exit_code == 0, result.output
     assert list(json.loads(result.stdout)) == list(benches)

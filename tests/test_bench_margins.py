@@ -25,7 +25,7 @@ from impactopt.simulation.robustness import Robustness, Spread, draw_conditions
 from impactopt.solvers.program import Status
 from impactopt.studies.bench import margins
 from impactopt.studies.bench.margins import OPTIONS, Option
-from impactopt.studies.bench.report import Report
+from impactopt.studies.report import Report
 
 VALUES = [(option, value) for option in OPTIONS for value in option.values]
 EXPECTED_SLIP = np.array([1e-3, 0.5, 3e-3, 2e-3])  # [m] of four draws; the second falls
@@ -217,6 +217,6 @@ def test_with_all_others_it_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
         asked[name] = options
         return Report(name=name, numbers={})
 
-    monkeypatch.setattr("impactopt.studies.bench.registry.run_bench", run_bench)
+    monkeypatch.setattr("impactopt.studies.registry.run_bench", run_bench)
     assert CliRunner().invoke(app, ["bench", "all", "--draws", "200", "--json"]).exit_code == 0
     assert asked["margins"]["quick"] and asked["margins"]["draws"] < 40

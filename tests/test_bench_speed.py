@@ -23,8 +23,8 @@ from impactopt.pictures.style import STYLE
 from impactopt.robots.presets import standin
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench import clock, collision, scaling, skip
-from impactopt.studies.bench.registry import run_bench
 from impactopt.studies.bench.scene import Scene
+from impactopt.studies.registry import run_bench
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 unwarned = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
@@ -390,7 +390,7 @@ def test_legends_of_scaling_leave_the_data_free() -> None:
 
 @pytest.mark.parametrize("name", ["collision", "scaling", "skip"])
 def test_the_benches_are_among_all(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from impactopt.studies.bench.report import Report
+    from impactopt.studies.report import Report
 
     module = {"collision": collision, "scaling": scaling, "skip": skip}[name]
     monkeypatch.setattr(module, "run", lambda _say, **_options: Report(name=name, numbers={"rows": []}))

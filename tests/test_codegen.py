@@ -20,11 +20,12 @@ import pinocchio as pin
 import pytest
 
 from impactopt.codegen import cache as codegen
-from impactopt.codegen.cache import cache_directory, cached, model_hash
+from impactopt.codegen import directory, library, private_files
+from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import Compiler, find_compiler
+from impactopt.codegen.directory import cache_directory
+from impactopt.codegen.hashing import canonical, model_hash
 from impactopt.errors import CacheWarning, InputError, NoCompilerWarning
-from impactopt.storage import private_files
-from impactopt.storage.hashing import canonical
 
 ROOT = Path(__file__).parent.parent
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -152,7 +153,7 @@ def test_flags_of_the_compiler_are_in_the_key(
 def test_long_functions_are_compiled_without_optimization(
     cache: Path, monkeypatch: pytest.MonkeyPatch, compilations: list[str]
 ) -> None:
-    monkeypatch.setattr(codegen, "_MAX_OPTIMIZED", 10)
+    monkeypatch.setattr(library, "MAX_OPTIMIZED", 10)
     x = ca.SX.sym("x", 3)
     inner = ca.Function("inner", [x], [ca.sin(x) * x + ca.cos(x)])
     y = ca.MX.sym("y", 3)
@@ -501,7 +502,7 @@ def test_a_library_that_cannot_be_loaded_costs_only_time(
 
 @needs_compiler
 def test_a_place_that_allows_no_code_is_not_used(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(codegen, "allows_code", lambda path: path != cache)
+    monkeypatch.setattr(directory, "allows_code", lambda path: path != cache)
     with pytest.warns(CacheWarning, match="noexec"):
         functions = cached("toy", (1,), Builder())
     assert value(functions) == pytest.approx(TRUE, rel=1e-14)

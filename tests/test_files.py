@@ -9,9 +9,9 @@ from typing import IO
 
 import pytest
 
+from impactopt.codegen.files import open_own, write_atomically
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
-from impactopt.storage.files import open_own, write_atomically
 from impactopt.sweeps.journal import Journal
 
 

@@ -12,12 +12,12 @@ from impactopt.collision import SDC, VirtualMass
 from impactopt.collision.freezing import freeze_error, more_often
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
-from impactopt.simulation.cases import striking_velocity
-from impactopt.simulation.reference import FullDynamics, holding_torque
+from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.report.console import collision_table
+from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench import freezes as bench
 from impactopt.studies.bench.stability_robots import make_robot
 from impactopt.sweeps.collisions import collide_many
-from impactopt.terminal.console import collision_table
 
 X = np.array([1.0, 0.0, 0.0])
 Q, SPEED = np.array([0.4, 0.9, 0.5]), 1.0

@@ -19,9 +19,9 @@ from impactopt.pictures import PICTURES, save_pictures
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import TorqueLimit
+from impactopt.report.console import result_table
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.terminal.console import result_table
 from impactopt.transcription.blocks import two_mass_restitution
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.start import first_iterate

@@ -14,8 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from small_plans import arm_problem, transcribed
 
-from impactopt.codegen.cache import NativeCode, cached
+from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import find_compiler
+from impactopt.codegen.library import NativeCode
 from impactopt.errors import NoCompilerWarning
 from impactopt.transcription import lanes
 from impactopt.transcription.batched import BatchedFunction

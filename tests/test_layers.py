@@ -62,6 +62,7 @@ def test_engines_share_no_code_with_the_planner() -> None:
     engines = sorted((PACKAGE / "simulation").glob("*_engine.py"))
     assert engines
     names = ("result", "servo", "soles", "struck", "touch", "conditions")
-    shared = [PACKAGE / "simulation" / f"{name}.py" for name in names]
-    for file in [*engines, *shared, PACKAGE / "simulation" / "mujoco_world.py"]:
+    robots = ("mujoco_world", "mujoco_robot", "pinocchio_robot")
+    shared = [PACKAGE / "simulation" / f"{name}.py" for name in (*names, *robots)]
+    for file in [*engines, *shared]:
         assert rooms_imported(file) <= ENGINE, file

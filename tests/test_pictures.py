@@ -28,7 +28,7 @@ from impactopt.pictures.ellipsoid import effective_masses
 from impactopt.pictures.style import DPI, PAGE, Picture
 from impactopt.planning.solution import Solution
 from impactopt.simulation.reference.poses import inverse_mass, poses_of
-from impactopt.studies.reproduce.figures import FIGURES, chosen, drawn
+from impactopt.studies.figures import FIGURES, chosen, drawn
 
 ROOT = Path(__file__).resolve().parents[1]
 DRAWS: dict[str, Callable[[Record], Picture | None]] = {"overview": overview, **PICTURES}
@@ -269,7 +269,7 @@ def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return lambda name: Picture(1.0, 1.0)
 
     monkeypatch.setattr(
-        "impactopt.studies.reproduce.figures._MAKERS",
+        "impactopt.studies.figures._MAKERS",
         dict.fromkeys(("plot", "reproduce", "bench", "sweep"), maker),
     )
     result = CliRunner().invoke(app, ["figures", "zmp", "fig7", "force", "--quiet", "--out", str(tmp_path)])
@@ -281,8 +281,7 @@ def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_every_figure_has_a_source_that_exists() -> None:
-    from impactopt.studies.bench.registry import BENCHES
-    from impactopt.studies.reproduce.registry import REPRODUCED
+    from impactopt.studies.registry import BENCHES, REPRODUCED
 
     studies = {path.stem for path in (ROOT / "problems" / "sweeps").glob("*.toml")}
     known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}

@@ -14,8 +14,9 @@ from test_sdc import Kinematics, robot_named, two_masses, with_heavy_feet
 from impactopt.collision import SDC, JointFriction, Terms
 from impactopt.contact import Board, FreeMass, HuntCrossley, KelvinVoigt, Nail, RigidWall, SpringDamper
 from impactopt.errors import InputError
+from impactopt.kinematics.held import holding_torque
 from impactopt.kinematics.stance import BothSoles, OneSole
-from impactopt.simulation.reference import FullDynamics, MujocoDynamics, holding_torque
+from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 

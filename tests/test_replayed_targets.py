@@ -30,6 +30,7 @@ from impactopt.contact import (
     Target,
 )
 from impactopt.errors import InputError
+from impactopt.report.console import replay_table
 from impactopt.robots.robot import Robot
 from impactopt.simulation import (
     Conditions,
@@ -43,7 +44,6 @@ from impactopt.simulation.accuracy import check_steps, with_step_error
 from impactopt.simulation.robustness import Spread
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.terminal.console import replay_table
 from impactopt.transcription.start import first_iterate
 
 Array = NDArray[np.float64]

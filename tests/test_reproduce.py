@@ -18,6 +18,7 @@ from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.errors import InputError
 from impactopt.simulation.cases import Case, paper_motions
+from impactopt.studies import registry
 from impactopt.studies.bench import costs
 from impactopt.studies.bench.trees import random_robot, tip_speed
 from impactopt.studies.reproduce import (
@@ -26,7 +27,6 @@ from impactopt.studies.reproduce import (
     fig7,
     motions,
     paper,
-    registry,
     table1,
     table2,
     table3,
@@ -240,10 +240,10 @@ def test_a_robot_that_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPat
 
 # ---------------------------------------------------------------- command
 def test_all_keeps_everything_under_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "REPRODUCED", {"table3": "table3", "again": "table3"})
+    monkeypatch.setattr(registry, "REPRODUCED", ("table3", "table1"))
     result = runner.invoke(app, ["reproduce", "all", "--json", "--quiet", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert list(json.loads(result.stdout)) == ["table3", "again"]
+    assert list(json.loads(result.stdout)) == ["table3", "table1"]
     assert (tmp_path / "table3.json").exists()
 
 
@@ -256,6 +256,6 @@ def test_an_unknown_name_is_one_message_and_exit_code_2() -> None:
 
 def test_every_name_has_its_module_and_is_in_the_help() -> None:
     text = runner.invoke(app, ["reproduce", "--help"], env={"COLUMNS": "200"}).stdout
-    folder = Path(registry.__file__).parent
-    for name, module in registry.REPRODUCED.items():
-        assert name in text and (folder / f"{module}.py").exists()
+    folder = Path(registry.__file__).parent / "reproduce"
+    for name in registry.REPRODUCED:
+        assert name in text and (folder / f"{name}.py").exists()

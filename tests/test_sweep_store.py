@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import resource
+import sqlite3
 import subprocess
 import sys
 import zlib
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 
 from impactopt.errors import InputError
 from impactopt.sweeps import sweep_from_data
-from impactopt.sweeps.journal import HEAD, MARK, Entry, Journal
+from impactopt.sweeps.journal import Entry, Journal
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import merge_kinds, unit_of, write_table
 from impactopt.sweeps.units import Found
@@ -30,10 +31,10 @@ def entry(unit: int, count: int = 3) -> Entry:
         peak_mb=100.0 + unit,
         columns={
             "status": ["solved"] * count,
-            "reason": ["", 'odd "text"\n', "unit\x00"][:count],
+            "reason": (["", 'odd "text"\n', "unit\x00"] * count)[:count],
             "impulse_Ns": rng.normal(size=count),
             "iterations": np.arange(count),
-            "missing": [None, 0.1, None][:count],
+            "missing": ([None, 0.1, None] * count)[:count],
         },
     )
 
@@ -45,64 +46,100 @@ def same(a: Entry, b: Entry) -> None:
         assert np.array_equal(values, b.columns[name])
 
 
-def filled(path: Path, units: tuple[int, ...] = (2, 0, 1)) -> list[int]:
-    """A journal of these units; where each record ends."""
-    journal, ends = Journal(path), []
+def filled(path: Path, units: tuple[int, ...] = (2, 0, 1)) -> None:
+    """A journal of these units."""
+    journal = Journal(path)
     for unit in units:
         journal.add(entry(unit))
-        ends.append(path.stat().st_size)
     journal.close()
-    return ends
 
 
 def test_what_was_added_is_read_in_order_bit_by_bit(tmp_path: Path) -> None:
     filled(tmp_path / "j")
     journal = Journal(tmp_path / "j")
-    assert journal.units == {0, 1, 2} and not journal.torn and not journal.damaged
+    assert journal.units == {0, 1, 2} and not journal.damaged
     for found, unit in zip(journal.read(), (0, 1, 2), strict=True):
         same(found, entry(unit))
     journal.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["j"]  # one file has it all
 
 
-def test_a_torn_end_is_cut_off_wherever_it_is_torn(tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    ends = filled(path)
-    whole = path.read_bytes()
-    for size in range(ends[1] + 1, ends[2]):
-        path.write_bytes(whole[:size])
-        journal = Journal(path)
-        assert journal.torn and journal.units == {2, 0} and path.stat().st_size == ends[1]
-        journal.close()
-    journal = Journal(path)
-    journal.add(entry(1))
+ADDING = """
+import sys
+import zlib
+from pathlib import Path
+from test_sweep_store import Journal, entry
+journal = Journal(Path(sys.argv[1]))
+for unit in range(10**9):
+    journal.add(entry(unit))
+    print(unit, flush=True)
+"""
+
+
+@pytest.mark.parametrize("said", [1, 30])
+def test_a_kill_loses_no_unit_that_was_added(tmp_path: Path, said: int) -> None:
+    command = [sys.executable, "-c", ADDING, str(tmp_path / "j")]
+    tests = str(Path(__file__).parent)
+    path = os.pathsep.join([tests, *filter(None, [os.environ.get("PYTHONPATH")])])
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path}) as adding:
+        assert adding.stdout is not None
+        for _ in range(said):
+            last = int(adding.stdout.readline())
+        adding.kill()
+    journal = Journal(tmp_path / "j")
+    assert journal.units >= set(range(last + 1)) and not journal.damaged
+    for found in journal.read():
+        same(found, entry(found.unit))
+    journal.add(entry(10**6))
     journal.close()
-    assert path.read_bytes() == whole
 
 
-def test_damage_in_the_middle_costs_its_own_record(tmp_path: Path) -> None:
+def test_no_damage_gives_wrong_numbers_or_is_passed_over(tmp_path: Path) -> None:
+    """Wherever a bit is wrong: the unit is done again, or the file is refused, and left as it is."""
     path = tmp_path / "j"
-    ends = filled(path)
-    whole = bytearray(path.read_bytes())
-    for place in range(ends[0], ends[1], 7):
+    filled(path)
+    whole = path.read_bytes()
+    counted = {"refused": 0, "again": 0, "no matter": 0}
+    for place in range(0, len(whole), 29):
         damaged = bytearray(whole)
         damaged[place] ^= 0x10
         path.write_bytes(damaged)
-        journal = Journal(path)
-        assert journal.units == {2, 1} and journal.damaged == 1 and not journal.torn
-        journal.add(entry(0))
-        for found, unit in zip(journal.read(), (0, 1, 2), strict=True):
-            same(found, entry(unit))
+        try:
+            journal = Journal(path)
+        except InputError as error:
+            assert str(path) in str(error)
+            assert path.read_bytes() == damaged
+            counted["refused"] += 1
+            continue
+        for found in journal.read():
+            same(found, entry(found.unit))
+        assert journal.damaged == 3 - len(journal.units)
+        counted["again" if journal.damaged else "no matter"] += 1
         journal.close()
+    assert counted["refused"] > 3 and counted["again"] > 10
+
+
+@pytest.mark.parametrize("size", [1, 99, 100, 4096])
+def test_a_file_that_was_cut_off_is_refused_and_left_as_it_is(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "j"
+    filled(path)
+    cut = path.read_bytes()[:size]
+    path.write_bytes(cut)
+    with pytest.raises(InputError, match="give another --out"):
+        Journal(path)
+    assert path.read_bytes() == cut
 
 
 @pytest.mark.parametrize(
     "content",
     [
         b"",
+        "text",
         b"[]\n",
         b"{}\n",
         b"[" * 100_000,
         b'{"unit": -1, "peak_mb": 1, "lists": {}, "arrays": {}, "order": []}\n',
+        b'{"unit": 2, "peak_mb": 1, "lists": {}, "arrays": {}, "order": []}\n',
         b'{"unit": 1, "peak_mb": "x", "lists": {}, "arrays": {}, "order": []}\n',
         b'{"unit": 1, "peak_mb": 1, "lists": {}, "arrays": {"a": ["O", 1]}, "order": ["a"]}\n12345678',
         b'{"unit": 1, "peak_mb": 1, "lists": {}, "arrays": {"a": ["<f8", -1]}, "order": ["a"]}\n12345678',
@@ -112,30 +149,40 @@ def test_damage_in_the_middle_costs_its_own_record(tmp_path: Path) -> None:
         b'{"unit": 1, "peak_mb": 1, "lists": {"a": [[]]}, "arrays": {}, "order": ["a"]}\n',
     ],
 )
-def test_a_record_that_is_none_is_damaged_whatever_its_checksum(tmp_path: Path, content: bytes) -> None:
+def test_a_row_that_is_none_is_damaged_whatever_its_checksum(tmp_path: Path, content: bytes | str) -> None:
+    filled(tmp_path / "j", (0,))
+    with closing(sqlite3.connect(tmp_path / "j")) as file, file:
+        crc = zlib.crc32(content) if isinstance(content, bytes) else 0
+        file.execute("INSERT INTO units VALUES (1, ?, ?)", (crc, content))
     journal = Journal(tmp_path / "j")
-    journal.add(entry(0))
-    journal.close()
-    with (tmp_path / "j").open("ab") as file:
-        file.write(MARK + HEAD.pack(len(content), zlib.crc32(content)) + content)
-    journal = Journal(tmp_path / "j")
-    journal.add(entry(2))
-    assert journal.units == {0, 2}
-    for found, unit in zip(journal.read(), (0, 2), strict=True):
+    assert journal.units == {0} and journal.damaged == 1
+    journal.add(entry(1))
+    for found, unit in zip(journal.read(), (0, 1), strict=True):
         same(found, entry(unit))
     journal.close()
 
 
-def test_an_empty_or_foreign_file_has_no_units(tmp_path: Path) -> None:
-    (tmp_path / "j").write_bytes(b"something else entirely")
-    journal = Journal(tmp_path / "j")
-    assert journal.torn and not journal.units
-    journal.close()
+def test_another_programs_file_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    text, other = tmp_path / "text", tmp_path / "other"
+    text.write_bytes(b"something else entirely")
+    with closing(sqlite3.connect(other)) as file, file:
+        file.execute("CREATE TABLE units (unit INTEGER)")
+    for path in (text, other):
+        before = path.read_bytes()
+        with pytest.raises(InputError, match=rf"{path}.*give another --out"):
+            Journal(path)
+        assert path.read_bytes() == before
 
 
-def test_a_full_disk_is_said_and_what_was_there_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_written_through_a_link_beside_it(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_text("precious", encoding="utf-8")
+    (tmp_path / "j-journal").symlink_to(victim)
+    filled(tmp_path / "j")
+    assert victim.read_text(encoding="utf-8") == "precious"
+
+
+def test_a_full_disk_is_said_and_what_was_there_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "j"
     journal = Journal(path)
     journal.add(entry(0))
@@ -143,27 +190,16 @@ def test_a_full_disk_is_said_and_what_was_there_is_kept(
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
     try:
-        with pytest.raises(
-            InputError, match=r"cannot write .*: File too large; what was finished before is kept"
-        ):
-            journal.add(entry(1))
+        with pytest.raises(InputError, match=r"cannot write .*; what was finished before is kept"):
+            journal.add(entry(1, count=3000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert path.stat().st_size == size and journal.units == {0}
-    monkeypatch.setattr(os, "fsync", no_space)
-    with pytest.raises(InputError, match="No space left on device"):
-        journal.add(entry(1))
-    monkeypatch.undo()
-    assert path.stat().st_size == size
+    assert journal.units == {0}
     journal.add(entry(1))
     journal.close()
     again = Journal(path)
-    assert again.units == {0, 1} and not again.torn
+    assert again.units == {0, 1} and not again.damaged
     again.close()
-
-
-def no_space(handle: int) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 # ---------------------------------------------------------------- the directory
@@ -191,6 +227,16 @@ def test_rows_of_other_versions_are_not_mixed_in(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("impactopt.sweeps.store.versions", lambda: {**versions(), "casadi": "9.9"})
     with pytest.raises(InputError, match=r"were made with casadi 3.*this is casadi 9\.9"):
         Store(sweep(), tmp_path)
+
+
+def test_results_of_an_older_journal_are_left_as_they_are(tmp_path: Path) -> None:
+    Store(sweep(), tmp_path).close()
+    (tmp_path / "units.sqlite").rename(tmp_path / "units.journal")
+    plate = tmp_path / "sweep.json"
+    plate.write_bytes(plate.read_bytes().replace(b'"format": 2', b'"format": 1'))
+    with pytest.raises(InputError, match="end this sweep with the version that began it, or give another"):
+        Store(sweep(), tmp_path)
+    assert not (tmp_path / "units.sqlite").exists()
 
 
 def test_a_lost_or_damaged_name_plate_is_said(tmp_path: Path) -> None:

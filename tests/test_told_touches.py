@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from impactopt.terminal.console import told_touches
+from impactopt.report.console import told_touches
 
 
 def touch(one: str, other: str, depth: float, **more: Any) -> dict[str, Any]:

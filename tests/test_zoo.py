@@ -26,6 +26,7 @@ from impactopt import (
 )
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
+from impactopt.files import folders
 from impactopt.files.problem_file import names, read_problem_file
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.problem.objectives import Impulse
@@ -33,7 +34,6 @@ from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.arms import ARM7, arm_model
 from impactopt.robots.robot import Robot
 from impactopt.simulation import simulate
-from impactopt.storage import folders
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = {path.stem: path for path in (ROOT / "problems").glob("*.toml")}

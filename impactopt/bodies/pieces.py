@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies.solids import Solid, cylinder, rounded_box
 from impactopt.bodies.urdf import shapes_of, urdf_root
-from impactopt.codegen.cache import kept
+from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot, Tool
 
 __all__ = ["Piece", "convex", "inertia_box", "pieces_of"]

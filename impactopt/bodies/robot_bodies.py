@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 
 from impactopt.bodies.fit import Planes, Spheres, enclose, fill, surface_points
 from impactopt.bodies.pieces import Piece, pieces_of
-from impactopt.codegen.cache import kept
+from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot
 
 __all__ = ["RobotBodies", "bodies_of", "distance", "transform"]

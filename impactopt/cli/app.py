@@ -37,17 +37,17 @@ from impactopt.cli.show import show
 from impactopt.cli.strike import strike
 from impactopt.cli.sweep import sweep
 from impactopt.cli.validate import validate
-from impactopt.studies.bench.command import app as bench_app
-from impactopt.studies.reproduce.command import reproduce
-from impactopt.studies.reproduce.figures import figures
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
+from impactopt.studies.bench_command import app as bench_app
+from impactopt.studies.figures import figures
+from impactopt.studies.reproduce_command import reproduce
 
 if TYPE_CHECKING:
     from impactopt.files.output import Record
     from impactopt.files.problem_file import ProblemFile
     from impactopt.planning.solution import Solution
     from impactopt.problem.problem import ImpactProblem
-    from impactopt.terminal.console import Progress
+    from impactopt.report.console import Progress
 
 __all__ = ["app", "main"]
 
@@ -122,7 +122,7 @@ def solve(
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.planner import solve as plan
-        from impactopt.terminal.console import Progress
+        from impactopt.report.console import Progress
 
         check_time_limit(time_limit)
         check_loudness(quiet, verbose)
@@ -253,7 +253,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
 
     from impactopt.errors import printable
     from impactopt.files.result_folder import set_aside
-    from impactopt.terminal.console import result_table, starts_table, told_touches, violation_table
+    from impactopt.report.console import result_table, starts_table, told_touches, violation_table
 
     console, summary = Console(), record.summary
     if record.completed:

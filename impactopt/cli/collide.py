@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, check_loudness, complete_problem
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
 
 NO_COLLISION = 1  # exit code
 OFTEN = 16  # freezes of a saved result: a plan's contacts are long
@@ -77,8 +77,8 @@ def collide(
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.report.console import Progress
         from impactopt.sweeps.single import collide_once, problem_of_result
-        from impactopt.terminal.console import Progress
 
         check_loudness(quiet, verbose)
         if not 0 < accuracy < math.inf:
@@ -105,7 +105,7 @@ def collide(
         else:
             from rich.console import Console
 
-            from impactopt.terminal.console import collision_table, torques_table
+            from impactopt.report.console import collision_table, torques_table
 
             if "reason" in found:
                 typer.echo(f"no collision: {found['reason']}")

@@ -16,7 +16,7 @@ from impactopt.cli.options import (
     Verbose,
     check_loudness,
 )
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
 
 NOT_IN = 1  # exit code
 
@@ -43,7 +43,7 @@ def drive(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_series, set_aside
         from impactopt.planning.nail_driving import drive_nail
-        from impactopt.terminal.console import Progress, blows_table
+        from impactopt.report.console import Progress, blows_table
 
         check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))

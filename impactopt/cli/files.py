@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem
-from impactopt.terminal.plain_errors import BAD_INPUT, plain_errors
+from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 

@@ -19,13 +19,13 @@ def complete_problem(incomplete: str) -> list[str]:
 
 def complete_sweep(incomplete: str) -> list[str]:
     """The same of sweeps."""
-    from impactopt.storage.folders import SWEEPS
+    from impactopt.files.folders import SWEEPS
 
     return _complete(incomplete, SWEEPS)
 
 
 def _complete(incomplete: str, folder: str) -> list[str]:
-    from impactopt.storage.folders import named_files
+    from impactopt.files.folders import named_files
 
     typed = Path(incomplete)
     inside = typed if incomplete.endswith("/") else typed.parent

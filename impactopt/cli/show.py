@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
-    from impactopt.report import Report
+    from impactopt.report.report import Report
 
 PAGE = "report.html"
 BODIES = "results"  # where the page of a robot goes
@@ -72,7 +72,7 @@ def _result(result: Path, problem: Path | None) -> tuple[Report, Path]:
     from impactopt.errors import InputError, did_you_mean
     from impactopt.files.output import load_record
     from impactopt.files.replay import load_planned
-    from impactopt.report import report_of
+    from impactopt.report.report import report_of
     from impactopt.robots.presets import robot_names
 
     if not os.path.exists(result):
@@ -90,7 +90,7 @@ def _bodies(what: Path, problem: Path | None) -> tuple[Report, Path]:
     """The page of a robot's bodies, and where it goes."""
     from impactopt.errors import InputError
     from impactopt.files.problem_file import read_problem_file
-    from impactopt.report import bodies_page, bodies_page_of_problem
+    from impactopt.report.robot_page import bodies_page, bodies_page_of_problem
     from impactopt.robots.presets import load_robot
 
     if problem is not None:

@@ -23,7 +23,7 @@ from impactopt.cli.options import (
     check_time_limit,
     command_line,
 )
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
 
 
 def strike(
@@ -53,7 +53,7 @@ def strike(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_record, set_aside
         from impactopt.planning.strike import optimize_strike
-        from impactopt.terminal.console import Progress
+        from impactopt.report.console import Progress
 
         check_time_limit(time_limit)
         check_loudness(quiet, verbose)
@@ -81,7 +81,7 @@ def strike(
         else:
             from rich.console import Console
 
-            from impactopt.terminal.console import starts_table, strike_table, violation_table
+            from impactopt.report.console import starts_table, strike_table, violation_table
 
             shown = Console()
             shown.print(strike_table(record.summary))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, complete_sweep
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, check_loudness
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
 
 FELL = 1  # exit code
 
@@ -70,8 +70,8 @@ def validate(
         from impactopt.files.output import make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
+        from impactopt.report.console import Progress
         from impactopt.simulation import Conditions
-        from impactopt.terminal.console import Progress
 
         check_loudness(quiet, verbose)
 
@@ -117,7 +117,7 @@ def validate(
         else:
             from rich.console import Console
 
-            from impactopt.terminal.console import replay_table
+            from impactopt.report.console import replay_table
 
             console = Console()
             console.print(replay_table(done.report, planned.record.summary))

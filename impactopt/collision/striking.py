@@ -1,7 +1,7 @@
 """How a held robot's striking point can be moved, and what torque lets it move on, compiled for many states.
 
-`impactopt.simulation.cases.striking_velocity` and `impactopt.simulation.reference.holding_torque` are the
-same for one state, by Pinocchio and least squares; the two are tested against each other.
+`impactopt.kinematics.held` has the same for one state, by Pinocchio and least squares; the two are tested
+against each other. That takes some milliseconds a state, which for millions of them would be hours.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.cache import cached, model_hash
+from impactopt.codegen.cache import cached
+from impactopt.codegen.hashing import model_hash
 from impactopt.collision.frozen import _inverse_of_cholesky
 from impactopt.kinematics.stance import Stance
 from impactopt.rigid_body import RigidBody

@@ -12,7 +12,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.codegen.cache import cached, model_hash
+from impactopt.codegen.cache import cached
+from impactopt.codegen.hashing import model_hash
 from impactopt.collision.batch import Batch
 from impactopt.collision.checks import check_course, check_finite, check_frozen
 from impactopt.collision.describe import Description, describe

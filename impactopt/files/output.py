@@ -22,6 +22,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.codegen.files import read_plain, write_atomically
 from impactopt.errors import InputError
 from impactopt.files.record_schema import check_arrays, check_summary
 from impactopt.kinematics.support import support_polygon
@@ -30,7 +31,6 @@ from impactopt.planning.strike import StrikeSolution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.reference.poses import poses_of
 from impactopt.solvers.program import SolverResult
-from impactopt.storage.files import read_plain, write_atomically
 
 __all__ = [
     "Record",

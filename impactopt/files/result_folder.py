@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError
 from impactopt.files.output import (
     DERIVED,
@@ -21,7 +22,6 @@ from impactopt.files.output import (
     write_file,
 )
 from impactopt.solvers.program import Status
-from impactopt.storage.files import read_plain
 
 __all__ = ["keep_record", "keep_series", "set_aside"]
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.codegen.hashing import canonical, model_hash
 from impactopt.contact.custom import CustomLaw
 from impactopt.problem.terms import DEFAULT_TERMS
 from impactopt.robots.robot import Robot
-from impactopt.storage.hashing import canonical, model_hash
 
 __all__ = ["problem_hash"]
 

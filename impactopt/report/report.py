@@ -12,8 +12,8 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
+from impactopt.report.result_rows import result_columns, result_rows
 from impactopt.report.stage import stage_of
-from impactopt.terminal.result_rows import result_columns, result_rows
 
 __all__ = ["Report", "report_of"]
 

@@ -53,20 +53,6 @@ class Factor:
         """H^-1 b, SX (nv, k)."""
         return self._pack([self._back(self._half(x)) for x in self._columns(b, "b")])
 
-    def inverse_form(self, B: Any, C: Any = None) -> Any:
-        """B H^-1 C', SX (k, l), for B (k, nv) and C (l, nv); C is B where it is not given."""
-        Y = [self._half(x) for x in self._rows(B, "B")]
-        scaled = [{k: x / self._D[k] for k, x in y.items()} for y in Y]
-        entries: dict[tuple[int, int], Number] = {}
-        if C is None:
-            for r, y in enumerate(scaled):
-                for c in range(r, len(Y)):
-                    entries[r, c] = entries[c, r] = _dot(y, Y[c])
-            return pack_entries((len(Y), len(Y)), entries)
-        Z = [self._half(x) for x in self._rows(C, "C")]
-        entries = {(r, c): _dot(y, z) for r, y in enumerate(scaled) for c, z in enumerate(Z)}
-        return pack_entries((len(Y), len(Z)), entries)
-
     @property
     def diagonal(self) -> Any:
         """D, SX (nv)."""
@@ -82,12 +68,6 @@ class Factor:
             if not is_zero(number):
                 columns[c][r] = number
         return columns
-
-    def _rows(self, B: Any, name: str) -> list[dict[int, Number]]:
-        B = as_sx(name, B)
-        if B.size2() != self.nv:
-            raise InputError(f"{name}: expected {self.nv} columns, got shape {B.shape}")
-        return self._columns(B.T, name)
 
     def _pack(self, columns: list[dict[int, Number]]) -> Any:
         entries = {(r, c): x for c, column in enumerate(columns) for r, x in column.items()}
@@ -112,14 +92,6 @@ class Factor:
             if not is_zero(value):
                 x[k] = value
         return x
-
-
-def _dot(a: dict[int, Number], b: dict[int, Number]) -> Number:
-    total: Number = 0.0
-    for k, x in a.items():
-        if k in b:
-            total = total + x * b[k]
-    return total
 
 
 def tree_entries(parents: list[int], H: Any) -> dict[tuple[int, int], Number]:

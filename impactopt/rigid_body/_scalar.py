@@ -131,12 +131,6 @@ def unpack_vector(column: Any) -> Vector:
     return [entries.get((i, 0), 0.0) for i in range(column.numel())]
 
 
-def unpack_rows(matrix: Any) -> Matrix:
-    """The entries of an SX matrix, row by row; structural zeros are floats."""
-    entries = unpack_entries(matrix)
-    return [[entries.get((i, j), 0.0) for j in range(matrix.size2())] for i in range(matrix.size1())]
-
-
 def pack_vector(vector: Iterable[Number]) -> Any:
     """A dense SX column."""
     return ca.vertcat(*[_to_sx(number) for number in vector])
@@ -149,12 +143,6 @@ def pack_entries(shape: tuple[int, int], entries: Mapping[tuple[int, int], Numbe
     places = sorted((p for p, x in kept.items() if not x.is_zero()), key=lambda place: (place[1], place[0]))
     sparsity = ca.Sparsity.triplet(*shape, [r for r, _ in places], [c for _, c in places])
     return ca.SX(sparsity, ca.vertcat(*[kept[place] for place in places]))
-
-
-def pack_rows(rows: Sequence[Sequence[Number]], columns: int) -> Any:
-    """A sparse SX matrix from its rows; zeros are left out of its pattern."""
-    entries = {(r, c): number for r, row in enumerate(rows) for c, number in enumerate(row)}
-    return pack_entries((len(rows), columns), entries)
 
 
 def pack_dense(rows: Sequence[Sequence[Number]]) -> Any:

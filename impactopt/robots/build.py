@@ -15,10 +15,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
 from impactopt.robots.checks import HEAVIEST, check_frame
 from impactopt.robots.parts import Striker, Tool
-from impactopt.storage.files import is_plain_file
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools

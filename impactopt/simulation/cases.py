@@ -1,4 +1,4 @@
-"""Situations in which collision models are compared: postures of a given effective mass, and velocities.
+"""Situations in which collision models are compared: postures of a given effective mass, and motions.
 
 The paper's nine motions are three postures, whose virtual masses are 4, 6 and 8 kg, at three speeds (its
 Table I). It does not give the postures; `posture_of_effective_mass` finds some by optimization.
@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from impactopt.collision import Collision, CollisionModel, effective_mass
-from impactopt.errors import MOST, InputError, check_array
+from impactopt.errors import InputError, check_array
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.kinematics.stance import BothSoles, Stance, usual_stance
 from impactopt.kinematics.support import margin as margin_in
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
-from impactopt.simulation.reference import holding_torque
 
 __all__ = [
     "PAPER_MASSES",
@@ -32,7 +32,6 @@ __all__ = [
     "errors_against",
     "paper_motions",
     "posture_of_effective_mass",
-    "striking_velocity",
 ]
 
 Array = NDArray[np.float64]
@@ -125,55 +124,6 @@ def paper_motions(
             )
         )
     return cases
-
-
-# ---------------------------------------------------------------- velocity
-def striking_velocity(
-    robot: Robot,
-    q: ArrayLike,
-    striker: str,
-    normal: ArrayLike,
-    speed: float,
-    *,
-    stance: Stance | None = None,
-) -> Array:
-    """Velocity (nv) of least kinetic energy with the striking point at `speed` [m/s] along the normal.
-
-    What the stance holds (None: all soles, or the fixed base) is at rest, and so is the striking point across
-    the normal (3,); its rotation is free. The least energy makes heavy links move little, whatever the
-    joints' units.
-
-    Raises
-    ------
-    InputError : wrong shapes or NaN; an unknown striker; a stance the robot cannot take; a posture in which
-        the striking point cannot move like that.
-    """
-    q, n = robot.check_configuration(q), check_array("normal", normal, (3,), most=MOST)
-    speed = float(check_array("speed [m/s]", speed, (), most=MOST))
-    held_by = usual_stance(robot) if stance is None else stance
-    model, data = robot.model, robot.model.createData()
-    H = np.array(pin.crba(model, data, q))
-    H = np.triu(H) + np.triu(H, 1).T
-    pin.computeJointJacobians(model, data, q)
-    pin.updateFramePlacements(model, data)
-
-    def jacobian(frame: str) -> Array:
-        J = pin.getFrameJacobian(model, data, model.getFrameId(frame), _AXES)
-        return np.reshape(J, (6, model.nv))
-
-    rows = [jacobian(frame) for frame in held_by.constraint_frames(robot)]
-    J = np.vstack([*rows, jacobian(robot.striker(striker).model_frame)[:3]])
-    wanted = np.concatenate([np.zeros(6 * len(rows)), float(speed) * n])
-    # v = H^-1 J' x; least squares, as a robot of few joints has rows that depend on each other
-    spread = np.linalg.solve(H, J.T)
-    v = spread @ np.linalg.lstsq(J @ spread, wanted, rcond=1e-12)[0]
-    off = float(np.abs(J @ v - wanted).max())
-    if not off <= 1e-6 * max(1.0, abs(speed)):
-        raise InputError(
-            f"q: here {striker!r} cannot move along {np.round(n, 3).tolist()} with what is held at rest (off "
-            f"by {off:.2g} m/s): choose another posture"
-        )
-    return np.array(v)
 
 
 # ---------------------------------------------------------------- posture

@@ -19,7 +19,8 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.besides import Besides
 from impactopt.simulation.conditions import Conditions
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
-from impactopt.simulation.mujoco_world import Solver, build_world, mujoco_module, no_log_file
+from impactopt.simulation.mujoco_robot import MujocoRobot
+from impactopt.simulation.mujoco_world import Solver, build_world, no_log_file
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.soles import BEARS, sole_names, weight_of
@@ -32,29 +33,21 @@ FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; o
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
 
 
-class _Replay:
+class _Replay(MujocoRobot):
     def __init__(
         self, robot: Robot, reference: Any, scene: Scene, conditions: Conditions, solver: Solver
     ) -> None:
-        self.mujoco = mujoco_module()
-        self.robot, self.scene, self.conditions = robot, conditions.scene(scene), conditions
+        self.scene, self.conditions = conditions.scene(scene), conditions
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
-        self.world = build_world(robot, self.scene, conditions, solver, near)
+        super().__init__(robot, build_world(robot, self.scene, conditions, solver, near), "striker")
         self.besides = Besides(self.world, solids)
-        self.data = self.mujoco.MjData(self.world)
         self.follow(reference)
-        joints = [self.world.joint(name) for name in robot.joint_names]
-        self.dof = np.array([joint.dofadr[0] for joint in joints])
-        self.place = np.array([joint.qposadr[0] for joint in joints])
-        self.floating = robot.model.nv > robot.n
-        self.site = self.world.site("striker").id
         self.struck = Struck(self.scene)
         self.target, self.travel = self.struck.at_rest, 0.0  # the target's state, and how far it has gone [m]
         # its depth at the end of a step in contact; of the step before, hand speed and force
         self.kept: float | None = None
         self.before: tuple[float, float] | None = None
-        self.row = np.zeros((3, self.world.nv))
         self.held = {name: k for k, name in enumerate(scene.soles)}
         self.geom_sole = np.full(self.world.ngeom, -1)
         for sole in robot.soles:
@@ -75,19 +68,14 @@ class _Replay:
         self.reference_q = np.asarray(reference.q)
 
     def start(self, q: Array) -> None:
-        d = self.data
-        if self.floating:
-            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
-        d.qpos[self.place] = self.servo.angles(q)
-        self.mujoco.mj_forward(self.world, d)
+        self.put(q)
+        self.mujoco.mj_forward(self.world, self.data)
         self.start_corners = self.corner_places()
 
     # ------------------------------------------------------------------ what a step needs
     def hand_speed(self) -> float:
-        """Speed of the striking point along the normal [m/s]; leaves its Jacobian in ``row``."""
-        self.mujoco.mj_jacSite(self.world, self.data, self.row, None, self.site)
-        self.along = self.scene.normal @ self.row
-        return float(self.along @ self.data.qvel)
+        """Speed of the striking point along the normal [m/s]."""
+        return self.speed_along(self.scene.normal)
 
     def push(self, speed: float, step: float) -> Push:
         """The contact in the step that begins now; moves the target.
@@ -128,25 +116,7 @@ class _Replay:
         """Position (3,), rotation (3, 3) and speed [m/s] of the base."""
         if not self.floating:
             return np.zeros(3), np.eye(3), 0.0
-        rotation = np.zeros(9)
-        self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
-        return self.data.qpos[:3].copy(), rotation.reshape(3, 3), float(np.linalg.norm(self.data.qvel[:3]))
-
-    def state(self) -> tuple[Array, Array]:
-        """q (nq,), v (nv,) in Pinocchio's conventions."""
-        model, d = self.robot.model, self.data
-        q, v = np.zeros(model.nq), np.zeros(model.nv)
-        if self.floating:
-            _, rotation, _ = self.base()
-            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
-            v[:3], v[3:6] = rotation.T @ d.qvel[:3], d.qvel[3:6]
-        angles = d.qpos[self.place]
-        q[self.servo.place] = angles
-        for k in self.servo.continuous:
-            at = self.servo.place[k]
-            q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
-        v[-self.robot.n :] = d.qvel[self.dof]
-        return q, v
+        return self.data.qpos[:3].copy(), self.base_rotation(), float(np.linalg.norm(self.data.qvel[:3]))
 
     def corner_places(self) -> list[Array]:
         """World places (k, 3) of each held sole's corners."""
@@ -275,8 +245,7 @@ def simulate_mujoco(
             push = replay.push(speed, step)
             force = push.force
             peak = max(peak, push.peak)
-            data.qfrc_applied[:] = -force * replay.along
-            data.qfrc_applied[replay.dof] += torque
+            replay.apply(torque, force)
             touches.add(t, force, step, push.since)
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             replay.place_target()

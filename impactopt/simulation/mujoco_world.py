@@ -69,24 +69,30 @@ def build_world(
     The contact law between target and striker is the engine's business.
     """
     mujoco = mujoco_module()
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    spec.compiler.balanceinertia = False
-    spec.option.timestep = solver.step
-    spec.option.iterations = solver.iterations
-    spec.option.tolerance = solver.tolerance
-    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec = spec_of(robot, solver)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0  # friction as hard as the normal direction: no creep
-    # the engine says so itself when it diverges, and does not begin anew
-    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    spec.option.gravity = robot.model.gravity.linear
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
     _surface(floor, conditions, sole=False)
     bodies = _robot_bodies(mujoco, spec, robot, scene, conditions)
     _solids(mujoco, spec, bodies, scene, near)
     return spec.compile()
+
+
+def spec_of(robot: Robot, solver: Solver) -> Any:
+    """An empty world with the robot's gravity, that is integrated and solved so."""
+    mujoco = mujoco_module()
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.compiler.balanceinertia = False
+    spec.option.timestep = solver.step
+    spec.option.iterations, spec.option.tolerance = solver.iterations, solver.tolerance
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # the engine says so itself when it diverges, and does not begin anew
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    spec.option.gravity = robot.model.gravity.linear
+    return spec
 
 
 def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Sequence[tuple[int, int]]) -> None:
@@ -119,7 +125,7 @@ def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Seque
 
 def _primitive(mujoco: Any, solid: Solid) -> dict[str, Any]:
     half, radius = np.asarray(solid.half), solid.radius
-    place = {"pos": solid.place, "quat": _quaternion(solid.rotation)}
+    place = {"pos": solid.place, "quat": quaternion(solid.rotation)}
     if not radius:
         return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, **place}
     if half[2] > 0:
@@ -159,7 +165,7 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
     for j in range(1, model.njoints):
         placement = model.jointPlacements[j]
         body = bodies[model.parents[j]].add_body(
-            name=f"body {model.names[j]}", pos=placement.translation, quat=_quaternion(placement.rotation)
+            name=f"body {model.names[j]}", pos=placement.translation, quat=quaternion(placement.rotation)
         )
         bodies.append(body)
         inertia = model.inertias[j]
@@ -199,7 +205,7 @@ def _inertial(body: Any, mass: float, centre: Any, inertia: Any) -> None:
     body.fullinertia = [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]]
 
 
-def _quaternion(rotation: Any) -> list[float]:
+def quaternion(rotation: Any) -> list[float]:
     """(w, x, y, z), as MuJoCo has it."""
     x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
     return [w, x, y, z]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
@@ -48,66 +49,30 @@ class _Rates:
 class _World:
     def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
         self.robot, self.scene = robot, scene
-        self.model, self.data = robot.model, robot.model.createData()
-        self.base = robot.model.nv - robot.n
-        self.hand = self.model.getFrameId(scene.striker)
+        self.model, self.base = robot.model, robot.model.nv - robot.n
+        self.body = PinocchioBody(robot, scene.soles, np.zeros(6), scene.striker, scene.normal)
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
-        self.contacts = pin.StdVec_RigidConstraintModel()
-        for name in scene.soles:
-            frame = self.model.frames[self.model.getFrameId(name)]
-            self.contacts.append(
-                pin.RigidConstraintModel(
-                    pin.ContactType.CONTACT_6D,
-                    self.model,
-                    frame.parentJoint,
-                    frame.placement,
-                    0,
-                    pin.SE3.Identity(),
-                    pin.LOCAL,
-                )
-            )
-        self.contact_data = pin.StdVec_RigidConstraintData()
-        for contact in self.contacts:
-            self.contact_data.append(contact.createData())
-        pin.initConstraintDynamics(self.model, self.data, self.contacts, self.contact_data)
-        self.proximal = pin.ProximalSettings(1e-12, 1e-12, 1)
-        self.sole_ids = [self.model.getFrameId(name) for name in scene.soles]
 
-    def contact(self, s: _State) -> tuple[float, float, Array]:
-        """Depth [m] and hand speed [m/s] along the normal, and the row (nv,) of the Jacobian."""
-        model, data = self.model, self.data
-        pin.computeJointJacobians(model, data, s.q)
-        jac = pin.getFrameJacobian(model, data, self.hand, pin.LOCAL_WORLD_ALIGNED)
-        jac = np.reshape(jac, (6, model.nv))[:3]  # pin drops an axis where nv is 1
-        point = pin.updateFramePlacement(model, data, self.hand).translation
-        row = self.scene.normal @ jac
-        return self.struck.depth(point, s.x), float(row @ s.v), row
-
-    def accelerate(self, s: _State, torque: Array, row: Array, force: float) -> Array:
-        tau = -row * force
-        tau[self.base :] += torque
-        if not self.sole_ids:
-            return np.array(pin.aba(self.model, self.data, s.q, s.v, tau))
-        return np.array(
-            pin.constraintDynamics(
-                self.model, self.data, s.q, s.v, tau, self.contacts, self.contact_data, self.proximal
-            )
-        )
+    def depth(self, s: _State) -> float:
+        """[m] of the striking point in the target, at the state at which the body has been last."""
+        return self.struck.depth(self.body.hand_place(), s.x)
 
     def rates(self, t: float, s: _State, *, force: float | None = None, step: float = 0.0) -> _Rates:
         """At a state under the force [N] of its step, or that of the step [s] that begins here."""
-        depth, speed, row = self.contact(s)
+        body = self.body
+        speed = body.look(s.q, s.v)
+        depth = self.depth(s)
         demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
         push, struck = None, self.struck
         if force is None:
             force = struck.force(depth, speed, s.target)
             if struck.near(depth, speed, s.target, step):
-                a = self.accelerate(s, torque, row, 0.0)
-                yields = float(row @ (a - self.accelerate(s, torque, row, 1.0)))
-                push = struck.pushed(depth, speed, self.drift(s, a), yields, s.target, s.x, step)
+                a = body.accelerate(torque, 0.0)
+                yields = float(body.row @ (a - body.accelerate(torque, 1.0)))
+                push = struck.pushed(depth, speed, body.drift(a), yields, s.target, s.x, step)
         return _Rates(
             v=s.v.copy(),
-            a=self.accelerate(s, torque, row, force),
+            a=body.accelerate(torque, force),
             vt=struck.speed(s.target),
             force=force,
             hand_speed=speed,
@@ -116,39 +81,30 @@ class _World:
             push=push,
         )
 
-    def drift(self, s: _State, a: Array) -> float:
-        """[m/s2] of the striking point along the normal, at these accelerations (nv,)."""
-        pin.forwardKinematics(self.model, self.data, s.q, s.v, a)
-        drift = pin.getFrameClassicalAcceleration(self.model, self.data, self.hand, pin.LOCAL_WORLD_ALIGNED)
-        return float(self.scene.normal @ drift.linear)
-
     def ground(self) -> Array:
         """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
         ``rates``.
         """
-        out = np.zeros((len(self.sole_ids), 6))
-        for k, i in enumerate(self.sole_ids):
-            m = pin.updateFramePlacement(self.model, self.data, i)
-            wrench = self.data.lambda_c[6 * k : 6 * k + 6]
-            out[k, :3] = m.rotation @ wrench[:3]
-            out[k, 3:] = m.rotation @ wrench[3:] + np.cross(m.translation, out[k, :3])
+        out = self.body.wrenches()
+        out[:, 3:] += np.cross(self.body.places(), out[:, :3])
         return out
 
     def corners(self) -> list[Array]:
         """World places (k, 3) of each held sole's corners."""
-        placements = [pin.updateFramePlacement(self.model, self.data, i) for i in self.sole_ids]
         return [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
-            for m, c in zip(placements, self.scene.corners, strict=True)
+            for m, c in zip(self.body.placements(), self.scene.corners, strict=True)
         ]
 
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
-        """A step of the midpoint rule from a state with its rates, under the contact's mean force in it."""
+        """A step of the midpoint rule from a state with its rates, under the contact's mean force in it.
+
+        The body is where `rates` has left it: at the state.
+        """
         push = first.push
         a = first.a
         if push is not None and push.half != first.force:
-            depth_row = self.contact(s)[2]
-            a = self.accelerate(s, first.torque, depth_row, push.half)
+            a = self.body.accelerate(first.torque, push.half)
         half = _State(
             q=pin.integrate(self.model, s.q, h / 2 * s.v),
             v=s.v + h / 2 * a,
@@ -167,8 +123,8 @@ class _World:
         if push is None:
             return after
         # the depth is the contact's: it is followed more exactly there than the arm is
-        placed = replace(after, x=0.0)
-        along = self.contact(placed)[0]
+        self.body.look(after.q, after.v)
+        along = self.depth(replace(after, x=0.0))
         return replace(after, x=along - push.depth if np.isfinite(along) else push.travel)
 
 

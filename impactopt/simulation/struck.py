@@ -50,7 +50,6 @@ class Struck:
     def __init__(self, scene: Scene) -> None:
         self.scene, self.law, self.target = scene, scene.law, scene.target
         self.at_rest: Array = np.zeros(self.target.n_states)
-        self.switching = bool(self.target.switches(self.at_rest, 0.0))
 
     def speed(self, state: Array) -> float:
         """[m/s] of the hit surface along the normal."""

@@ -2,7 +2,8 @@
 
 Processes are spawned, not forked: a fork copies the locks that CasADi's and BLAS's threads hold, not the
 threads. Each gets what all inputs share once, when it starts, and ends with the process that started it,
-however that ends.
+however that ends. The pools of `concurrent.futures` do not do: a worker that is killed breaks the whole pool,
+which says neither whose input it was nor with which exit code.
 """
 
 from __future__ import annotations

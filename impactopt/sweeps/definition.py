@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from impactopt.codegen.files import is_plain_file, read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.problem_file import ProblemFile, key_place, read_problem_file, read_toml, write_toml
 from impactopt.files.problem_file.mistakes import Mistake, key_lines, mistakes_of, report_mistakes
@@ -25,7 +26,6 @@ from impactopt.files.problem_file.toml import (
     plain_value,
     text_with_control,
 )
-from impactopt.storage.files import is_plain_file, read_plain
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column

@@ -1,16 +1,15 @@
-"""The journal of a sweep: a file to which every finished unit is added, with a checksum, and nothing removed.
+"""The journal of a sweep: an SQLite file with a row for every finished unit.
 
-One writer adds a record and waits until it is on disk. Unlike a file a unit, a night's 100 000 solves are one
-file, small units and large ones are kept alike, and a run that ends in the middle of a record leaves one torn
-end, which the next run sees by length and checksum, and cuts off. What is damaged elsewhere costs its own
-records only: each begins with the same mark.
+SQLite sees to kills and full disks: a row is there whole or not at all, and on disk when `add` returns. Rows
+carry a checksum, so that a unit whose numbers the disk has changed is done again. A file that is no journal,
+or whose pages are damaged, is refused, and nothing in it is changed.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import struct
+import sqlite3
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,15 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.codegen.files import open_own
 from impactopt.errors import InputError
-from impactopt.storage.files import open_own
 from impactopt.sweeps.units import Columns
 
 __all__ = ["Entry", "Journal"]
 
-MARK = b"\nunit\x00\xff\n"
-HEAD = struct.Struct("<QI")  # length and CRC-32 of what follows
-MEMORY = 1 << 22  # bytes read at once where a mark is looked for
+MAGIC = b"SQLite format 3\x00"  # what such a file begins with
+APPLICATION = 0x696D7061  # SQLite's application_id of these files: "impa"
+MEND = "put back a copy of it, or give another --out"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,30 +42,39 @@ class Entry:
 class Journal:
     """An open journal; the file is made if it is not there.
 
-    torn : whether its end was cut off.  damaged : records elsewhere that are not as they were written.
+    units : those that are finished.  damaged : rows that are not as they were written, and do not count.
 
     Raises
     ------
-    InputError : the file cannot be opened, read or written.
+    InputError : the file is no journal, its pages are damaged, or it cannot be opened, read or written.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.torn, self.damaged = path, False, 0
-        self._places: dict[int, int] = {}
+        self.path, self.damaged, self.units = path, 0, set[int]()
         try:
-            self._file = os.fdopen(open_own(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
-            self._end = self._scan()
-            self._file.truncate(self._end)
-        except OSError as error:
-            raise InputError(f"cannot open {path}: {error.strerror}") from error
+            with open(path, "rb", opener=_made) as file:  # no link, pipe or directory
+                head = file.read(len(MAGIC))
+            # SQLite takes a few bytes for an empty file; after a kill it may have its head to mend
+            if head not in (b"", MAGIC) and not path.with_name(f"{path.name}-journal").exists():
+                raise InputError(f"{path} is no journal of a sweep; move it away, or give another --out")
+            self._file = sqlite3.connect(path, isolation_level=None)  # each statement is a transaction
+        except (OSError, sqlite3.Error) as error:
+            raise InputError(f"cannot open {path}: {getattr(error, 'strerror', None) or error}") from error
+        try:
+            self._claim()
+            for unit, crc, content in self._rows():
+                if isinstance(content, bytes) and zlib.crc32(content) == crc and _unit(content) == unit:
+                    self.units.add(unit)
+                else:
+                    self.damaged += 1
+        except BaseException as error:
+            self._file.close()
+            if isinstance(error, sqlite3.Error):
+                raise InputError(f"cannot read {path}: {error}; {MEND}") from error
+            raise
 
     def close(self) -> None:
         self._file.close()
-
-    @property
-    def units(self) -> set[int]:
-        """Those that are finished."""
-        return set(self._places)
 
     def add(self, entry: Entry) -> None:
         """Put a unit on disk; when this returns, it is there.
@@ -76,65 +84,50 @@ class Journal:
         InputError : the disk is full, or fails; what was there before still is.
         """
         content = _pack(entry)
-        record = memoryview(MARK + HEAD.pack(len(content), zlib.crc32(content)) + content)
+        row = (entry.unit, zlib.crc32(content), content)
         try:
-            self._file.seek(self._end)
-            written = 0
-            while written < len(record):
-                written += self._file.write(record[written:]) or 0
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            self._file.truncate(self._end)
+            self._file.execute("INSERT OR REPLACE INTO units VALUES (?, ?, ?)", row)
+        except sqlite3.Error as error:
             raise InputError(
-                f"cannot write {self.path}: {error.strerror}; what was finished before is kept, and the same "
-                "command goes on from there when there is room again"
+                f"cannot write {self.path}: {error}; what was finished before is kept, and the same command "
+                "goes on from there when the disk can be written and has room"
             ) from error
-        self._places[entry.unit] = self._end
-        self._end += len(record)
+        self.units.add(entry.unit)
 
     def read(self) -> Iterator[Entry]:
         """All finished units in their order, one by one."""
-        for unit in sorted(self._places):
-            yield _unpack(self._record(self._places[unit]) or b"")
+        for unit, _, content in self._rows():
+            if unit in self.units:
+                yield _unpack(content)
 
-    def _scan(self) -> int:
-        """Find the sound records; where the last one ends."""
-        size, at, sound = os.fstat(self._file.fileno()).st_size, 0, 0
-        lost = False
-        while at < size:
-            content = self._record(at)
-            unit = None if content is None else _unit(content)
-            if content is None or unit is None:
-                lost, at = True, self._next_mark(at + 1, size)
-                continue
-            if lost:  # in the middle: records follow
-                self.damaged, lost = self.damaged + 1, False
-            self._places[unit] = at
-            at += len(MARK) + HEAD.size + len(content)
-            sound = at
-        self.torn = sound < size
-        return sound
+    def _claim(self) -> None:
+        """Make a new file a journal; refuse a file that is none."""
+        (kind,) = self._file.execute("PRAGMA application_id").fetchone()
+        (tables,) = self._file.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        if kind != APPLICATION and (kind or tables):
+            raise InputError(f"{self.path} is no journal of a sweep; move it away, or give another --out")
+        # EXTRA: a commit is on disk when it returns, in the directory too
+        self._file.execute("PRAGMA synchronous = EXTRA")
+        if not tables:
+            self._file.executescript(
+                f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
+                "CREATE TABLE units (unit INTEGER PRIMARY KEY, crc INTEGER NOT NULL, content BLOB NOT NULL);"
+                "COMMIT"
+            )
+        (found,) = self._file.execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            raise InputError(f"{self.path} is damaged ({' '.join(found.split())}); {MEND}")
 
-    def _record(self, at: int) -> bytes | None:
-        """The content of the record that begins here; None if there is none that is whole."""
-        self._file.seek(at)
-        head = self._file.read(len(MARK) + HEAD.size)
-        if len(head) < len(MARK) + HEAD.size or not head.startswith(MARK):
-            return None
-        length, crc = HEAD.unpack(head[len(MARK) :])
-        if length > os.fstat(self._file.fileno()).st_size - at:
-            return None
-        content = self._file.read(length)
-        return content if len(content) == length and zlib.crc32(content) == crc else None
+    def _rows(self) -> Iterator[tuple[Any, Any, Any]]:
+        try:
+            yield from self._file.execute("SELECT unit, crc, content FROM units ORDER BY unit")
+        except sqlite3.Error as error:
+            raise InputError(f"cannot read {self.path}: {error}; {MEND}") from error
 
-    def _next_mark(self, at: int, size: int) -> int:
-        while at < size:
-            self._file.seek(at)
-            found = self._file.read(MEMORY).find(MARK)
-            if found >= 0:
-                return at + found
-            at += MEMORY - len(MARK) + 1
-        return size
+
+def _made(path: str, flags: int) -> int:
+    """A handle of the file, which is made if it is not there."""
+    return open_own(path, flags | os.O_CREAT)
 
 
 def _pack(entry: Entry) -> bytes:

@@ -123,10 +123,8 @@ def _run(
 ) -> SweepResult:
     journal = store.journal
     together = min(TOGETHER.get(chosen.grain, 1), -(-chosen.design.cases // UNITS))
-    if journal.torn:
-        tell(f"the end of {journal.path} was torn, as when a run is killed; that unit is done again")
     if journal.damaged:
-        tell(f"{journal.path} is damaged in {journal.damaged} places; the units there are done again")
+        tell(f"{journal.damaged} units in {journal.path} are damaged; they are done again")
     tally, finished = Tally(chosen.design.cases), set[int]()
     for entry in journal.read():
         if again and not ACCIDENTS.isdisjoint(entry.columns.get("status", ())):

@@ -2,7 +2,7 @@
 
 * sweep.json      which sweep this is: its file's and its problem's data, and the versions that make its rows
 * sweep.toml      the sweep's file as it was
-* units.journal   every finished unit (`impactopt.sweeps.journal`)
+* units.sqlite    every finished unit (`impactopt.sweeps.journal`)
 * cases/N/        the whole result of case N, as of `impactopt solve`, where trajectories are kept
 * table.parquet   the rows of all finished cases; made from the journal at the end of every run
 """
@@ -15,17 +15,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from impactopt.codegen.files import open_own
 from impactopt.errors import InputError
 from impactopt.files.output import make_directory, save_record, write_file
 from impactopt.planning.solution import versions
-from impactopt.storage.files import open_own
 from impactopt.sweeps.definition import Sweep
 from impactopt.sweeps.journal import Entry, Journal
 from impactopt.sweeps.units import Found
 
 __all__ = ["Store"]
 
-FORMAT = 1  # of sweep.json and the journal
+FORMAT = 2  # of sweep.json and the journal
+UNITS, BEFORE = "units.sqlite", "units.journal"  # the second until format 1
 SAID = 5  # so many changes are named
 
 
@@ -45,7 +46,7 @@ class Store:
         self._lock = _lock(self.path)
         try:
             self._claim(sweep)
-            self.journal = Journal(self.path / "units.journal")
+            self.journal = Journal(self.path / UNITS)
         except BaseException:
             os.close(self._lock)
             raise
@@ -76,7 +77,7 @@ class Store:
         try:
             there = json.loads(place.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            if (self.path / "units.journal").exists():
+            if any((self.path / name).exists() for name in (UNITS, BEFORE)):
                 raise InputError(
                     f"{self.path} holds rows of a sweep, but {place.name}, which says of which, is gone; put "
                     "it back, or give another directory"
@@ -86,7 +87,13 @@ class Store:
             return
         except (OSError, ValueError) as error:
             raise InputError(f"{place} cannot be read ({error}); give another directory") from error
-        if there.get("hash") != now["hash"] or there.get("format") != FORMAT:
+        if not isinstance(there, dict) or there.get("format") != FORMAT:
+            raise InputError(
+                f"{self.path} keeps its finished cases as another version of impactopt does; end this "
+                "sweep with the version that began it, or give another --out (its table.parquet can be read "
+                "as before)"
+            )
+        if there.get("hash") != now["hash"]:
             raise InputError(
                 f"{self.path} holds another sweep{_changes(there, now)}; give another --out, or change the "
                 "sweep back to go on with it"

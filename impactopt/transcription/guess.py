@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.nail import Nail
 from impactopt.contact.targets import FreeMass, Target
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.held import Held
 from impactopt.transcription.layout import Array
 
 LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
@@ -46,17 +46,11 @@ def effective_mass(
     c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array, rates: Array
 ) -> tuple[float, float]:
     """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s]."""
-    model, data = c.model, c.model.createData()
-    q, still = c.join(y, legs), np.zeros(c.ny)
-    ways = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
-    inertia = np.array(pin.crba(model, data, q))
-    inertia = np.triu(inertia) + np.triu(inertia, 1).T
-    pin.computeJointJacobians(model, data, q)
-    frame = model.getFrameId(f"striker:{striker}")
-    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
-    row = normal @ jacobian @ ways
-    mass = 1 / float(row @ np.linalg.solve(ways.T @ inertia @ ways, row))
-    return mass, max(float(row @ rates), 0.1)
+    frames = [sole.frame for sole in c.soles]
+    body = Held.at(c.model, c.join(y, legs), frames, c.robot.striker(striker).model_frame)
+    v = c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
+    mass = 1 / float(normal @ body.inverse_mass() @ normal)
+    return mass, max(float(normal @ body.hand @ v), 0.1)
 
 
 def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:

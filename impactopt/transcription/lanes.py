@@ -12,7 +12,7 @@ from itertools import pairwise, zip_longest
 
 import casadi as ca
 
-from impactopt.codegen.cache import NativeCode
+from impactopt.codegen.library import NativeCode
 
 __all__ = ["LANES", "in_lanes"]
 

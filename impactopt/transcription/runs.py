@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from impactopt.codegen.cache import address, native_library
+from impactopt.codegen.library import address, native_library
 from impactopt.transcription.layout import Array
 from impactopt.transcription.rows import Index
 

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.codegen.cache import cached, model_hash
+from impactopt.codegen.cache import cached
+from impactopt.codegen.hashing import model_hash
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline, basis, graded_breaks, knots, rate_weights
 from impactopt.kinematics.statics import static_wrenches

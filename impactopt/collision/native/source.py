@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from impactopt.codegen.cache import NativeCode
+from impactopt.codegen.library import NativeCode
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from impactopt.collision.native.generated import (
     backwards,

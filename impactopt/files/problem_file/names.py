@@ -6,9 +6,9 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, did_you_mean, shortened
-from impactopt.storage.files import is_plain_file
-from impactopt.storage.folders import SWEEPS, named_files
+from impactopt.files.folders import SWEEPS, named_files
 
 __all__ = ["problem_file", "problem_names", "problem_summary", "sweep_file", "sweep_names"]
 

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from impactopt.codegen.files import read_plain
 from impactopt.errors import InputError, did_you_mean, shortened
 from impactopt.files.problem_file.changes import change_and_place
 from impactopt.files.problem_file.contacts import with_kinds
@@ -30,7 +31,6 @@ from impactopt.files.problem_file.toml import (
 )
 from impactopt.problem.checks import MANY, check_names
 from impactopt.problem.problem import ImpactProblem
-from impactopt.storage.files import read_plain
 
 __all__ = [
     "ProblemFile",

@@ -2,7 +2,6 @@
 
 from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.simulation.reference.full import FullDynamics
-from impactopt.simulation.reference.holding import holding_torque
 from impactopt.simulation.reference.mujoco_dynamics import MujocoDynamics
 
-__all__ = ["FullDynamics", "MujocoDynamics", "coasting_reference", "holding_torque"]
+__all__ = ["FullDynamics", "MujocoDynamics", "coasting_reference"]

@@ -16,7 +16,7 @@ from impactopt.collision.settings import Settings, no_bend, servo_settings
 from impactopt.collision.terms import JointFriction, Terms
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot
-from impactopt.simulation.reference.bodies import DenseBody
+from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.forces import Forces
 
 __all__ = ["ReferenceModel", "converge"]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from impactopt.collision.result import Collision
 from impactopt.errors import InputError, did_you_mean
+from impactopt.simulation.pinocchio_robot import FORMS
 from impactopt.simulation.reference.base import ReferenceModel
-from impactopt.simulation.reference.bodies import FORMS
 from impactopt.simulation.reference.forces import Forces
 from impactopt.simulation.reference.motion import Instant, Motion
 from impactopt.simulation.reference.record import collision_from

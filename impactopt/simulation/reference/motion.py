@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
-from impactopt.simulation.reference.bodies import Body
+from impactopt.simulation.pinocchio_robot import Body
 from impactopt.simulation.reference.forces import Forces, Phase
 
 __all__ = ["Instant", "Motion"]
@@ -160,7 +160,7 @@ class Motion:
         demand, velocity, penetration, rate = self._of(state)
         force = forces.contact(penetration, rate, phase.compressing) if phase.touching else 0.0
         torque = forces.torque(demand, phase)
-        a, wrench = self.body.accelerate(torque - forces.friction(velocity, phase), force)
+        a = self.body.accelerate(torque - forces.friction(velocity, phase), force)
         slope = np.empty_like(y)
         slope[:nv] = y[nv : 2 * nv]
         if self._floating:
@@ -180,7 +180,7 @@ class Motion:
             velocity,
             torque,
             demand,
-            wrench,
+            self.body.wrenches().ravel(),
             self.body.places(),
         )
         return slope, instant

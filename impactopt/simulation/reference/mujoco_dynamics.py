@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.result import Collision
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
-from impactopt.simulation.mujoco_world import mujoco_module, no_log_file, robot_bodies
+from impactopt.simulation.mujoco_robot import MujocoRobot
+from impactopt.simulation.mujoco_world import (
+    Solver,
+    mujoco_module,
+    no_log_file,
+    quaternion,
+    robot_bodies,
+    spec_of,
+)
 from impactopt.simulation.reference.base import ReferenceModel, converge
 from impactopt.simulation.reference.forces import Forces, Phase
 from impactopt.simulation.reference.motion import Instant
 from impactopt.simulation.reference.record import collision_from
 
-__all__ = ["MujocoDynamics"]
+__all__ = ["HeldRobot", "MujocoDynamics", "march"]
 
 Array = NDArray[np.float64]
 # MuJoCo's own limits: impedance of a constraint, and its time constant in steps
@@ -96,31 +103,24 @@ class MujocoDynamics(ReferenceModel):
     def _run(self, step: float, q: Array, v: Array, forces: Forces, normal: Array) -> Collision:
         robot, frames, _, striker = self._held
         with no_log_file():
-            world = _World(robot, frames, striker, step)
+            world = HeldRobot(robot, frames, striker, step)
             world.start(q, v)
-            return _march(world, forces, normal, self.horizon, len(self.held_by.sole_names(robot)))
+            return march(world, forces, normal, self.horizon, len(self.held_by.sole_names(robot)))
 
 
-class _World:
-    """The robot with welded frames, in MuJoCo, in Pinocchio's conventions."""
+class HeldRobot(MujocoRobot):
+    """The robot with frames that are welded to where `start` finds them."""
 
     def __init__(self, robot: Robot, frames: tuple[str, ...], striker: str, step: float) -> None:
-        self.mujoco, self.robot, self.step = mujoco_module(), robot, step
-        mujoco, spec = self.mujoco, self.mujoco.MjSpec()
-        spec.compiler.degree = False
-        spec.compiler.balanceinertia = False
-        spec.option.timestep = step
-        spec.option.iterations, spec.option.tolerance = 50, 0.0
-        spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        mujoco, self.step = mujoco_module(), step
+        spec = spec_of(robot, Solver(step, iterations=50, tolerance=0.0))
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        spec.option.gravity = robot.model.gravity.linear
         bodies = robot_bodies(mujoco, spec, robot)
         for name in dict.fromkeys((*frames, striker)):
             frame = robot.model.frames[robot.model.getFrameId(name)]
             bodies[frame.parentJoint].add_site(
-                name=name, pos=frame.placement.translation, quat=_quaternion(frame.placement.rotation)
+                name=name, pos=frame.placement.translation, quat=quaternion(frame.placement.rotation)
             )
         for name in frames:
             spec.worldbody.add_site(name=f"ground {name}")
@@ -129,76 +129,38 @@ class _World:
             weld.name1, weld.name2 = name, f"ground {name}"
             weld.solref = [_TIME_CONSTANT * step, 1.0]
             weld.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-        joints = [self.model.joint(name) for name in robot.joint_names]
-        self.dof = np.array([joint.dofadr[0] for joint in joints])
-        self.place = np.array([joint.qposadr[0] for joint in joints])
-        self.frames = [self.model.site(name).id for name in frames]
-        self.ground = [self.model.site(f"ground {name}").id for name in frames]
-        self.model.site_sameframe[self.ground] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # they are moved
-        self.hand = self.model.site(striker).id
-        self._row = np.zeros((3, self.model.nv))
-        self._wrench_map = np.zeros((6, self.model.nv))
+        super().__init__(robot, spec.compile(), striker)
+        self.frames = [self.world.site(name).id for name in frames]
+        self.ground = [self.world.site(f"ground {name}").id for name in frames]
+        self.world.site_sameframe[self.ground] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # they are moved
+        self._wrench_map = np.zeros((6, self.world.nv))
 
     def start(self, q: Array, v: Array) -> None:
         """Configuration and velocity at contact; the welds hold what they find."""
-        d, robot = self.data, self.robot
-        if robot.floating:
-            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
-            rotation = pin.Quaternion(q[3:7]).toRotationMatrix()
-            d.qvel[:3], d.qvel[3:6] = rotation @ v[:3], v[3:6]
-        d.qpos[self.place] = robot.joint_positions(q)
-        d.qvel[self.dof] = v[-robot.n :]
-        self._q, self._at_start = q, d.qpos.copy()
-        self.mujoco.mj_kinematics(self.model, d)
+        self.put(q, v)
+        d = self.data
+        self.mujoco.mj_kinematics(self.world, d)
         for frame, ground in zip(self.frames, self.ground, strict=True):
-            self.model.site_pos[ground] = d.site_xpos[frame]
-            quaternion = np.zeros(4)
-            self.mujoco.mju_mat2Quat(quaternion, d.site_xmat[frame])
-            self.model.site_quat[ground] = quaternion
-
-    def look(self, normal: Array) -> float:
-        """Speed of the striking point along the normal [m/s]; leaves its row of the Jacobian."""
-        self.mujoco.mj_step1(self.model, self.data)
-        self.mujoco.mj_jacSite(self.model, self.data, self._row, None, self.hand)
-        self.row = normal @ self._row
-        return float(self.row @ self.data.qvel)
-
-    def push(self, torque: Array, force: float) -> None:
-        """Apply them, and go on by a step."""
-        self.data.qfrc_applied[:] = -force * self.row
-        self.data.qfrc_applied[self.dof] += torque
-        self.mujoco.mj_step2(self.model, self.data)
+            self.world.site_pos[ground] = d.site_xpos[frame]
+            rotation = np.zeros(4)
+            self.mujoco.mju_mat2Quat(rotation, d.site_xmat[frame])
+            self.world.site_quat[ground] = rotation
 
     def wrenches(self) -> tuple[Array, Array]:
         """Of the ground on the welded frames (6 a frame), and their places, at the last step's start."""
         d, J = self.data, self._wrench_map
-        rows = np.reshape(d.efc_J, (-1, self.model.nv))
+        rows = np.reshape(d.efc_J, (-1, self.world.nv))
         out, places = np.empty((len(self.frames), 6)), np.empty((len(self.frames), 3))
         for k, frame in enumerate(self.frames):
             its = slice(6 * k, 6 * k + 6)
-            self.mujoco.mj_jacSite(self.model, d, J[:3], J[3:], frame)
+            self.mujoco.mj_jacSite(self.world, d, J[:3], J[3:], frame)
             # the rows of a weld are in coordinates of its own
             out[k] = np.linalg.lstsq(J.T, rows[its].T @ d.efc_force[its], rcond=None)[0]
             places[k] = d.site_xpos[frame]
         return out.ravel(), places
 
-    def state(self) -> tuple[Array, Array]:
-        """q (nq), v (nv)."""
-        d, robot = self.data, self.robot
-        moved, v = np.zeros(robot.nv), np.zeros(robot.nv)
-        moved[-robot.n :] = (d.qpos - self._at_start)[self.place]
-        v[-robot.n :] = d.qvel[self.dof]
-        q = np.array(pin.integrate(robot.model, self._q, moved))
-        if robot.floating:
-            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
-            rotation = pin.Quaternion(q[3:7]).toRotationMatrix()
-            v[:3], v[3:6] = rotation.T @ d.qvel[:3], d.qvel[3:6]
-        return q, v
 
-
-def _march(world: _World, forces: Forces, normal: Array, horizon: float, soles: int) -> Collision:
+def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles: int) -> Collision:
     data, step = world.data, world.step
     every = max(1, round(_RECORD / step))
     instants: list[Instant] = []
@@ -207,15 +169,16 @@ def _march(world: _World, forces: Forces, normal: Array, horizon: float, soles: 
     angles = data.qpos[world.place].copy()
     k = 0
     while True:
-        speed = world.look(normal)
+        world.mujoco.mj_step1(world.world, data)
+        speed = world.speed_along(normal)
         if k == 0:
-            start = float(normal @ data.site_xpos[world.hand])
+            start = float(normal @ data.site_xpos[world.site])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
         rate = speed - target_speed
-        depth = float(normal @ data.site_xpos[world.hand]) - start - travel
+        depth = float(normal @ data.site_xpos[world.site]) - start - travel
         demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0
@@ -223,7 +186,8 @@ def _march(world: _World, forces: Forces, normal: Array, horizon: float, soles: 
         ends = not phase.touching or time >= horizon * (1 - 1e-9)
         if ends:
             end = world.state()
-        world.push(torque - forces.friction(velocity, phase), force)
+        world.apply(torque - forces.friction(velocity, phase), force)
+        world.mujoco.mj_step2(world.world, data)
         peak = max(peak, force)
         if ends or k % every == 0:
             held = world.wrenches()
@@ -234,9 +198,3 @@ def _march(world: _World, forces: Forces, normal: Array, horizon: float, soles: 
         target = target + step * np.array(forces.target_rates(target, force), dtype=float)
         travel += step * forces.target_speed(target)
         k += 1
-
-
-def _quaternion(rotation: Any) -> list[float]:
-    """(w, x, y, z), as MuJoCo has it."""
-    x, y, z, w = pin.Quaternion(np.asarray(rotation)).normalized().coeffs()
-    return [w, x, y, z]

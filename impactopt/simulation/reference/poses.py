@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.kinematics.held import Held
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
@@ -63,23 +64,10 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
 
 
 def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
-    """J P J' (3, 3) [1/kg] of the striking point, world axes: P is the inverse inertia of the held robot.
-
-    Joints are free, as no servo acts at once; n' J P J' n is one over the effective mass along n (the paper's
-    virtual mass, its section III).
-    """
+    """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.held.Held`."""
     robot = problem.robot
-    model, data = robot.model, robot.model.createData()
-    inverse = np.linalg.inv(pin.crba(model, data, q, pin.Convention.WORLD))
-    held, _ = problem.coordinates.sole_jacobians(q)
-    if len(held):
-        back = inverse @ held.T
-        inverse = inverse - back @ np.linalg.solve(held @ back, back.T)
-    pin.computeJointJacobians(model, data, q)
-    pin.updateFramePlacements(model, data)
-    frame = model.getFrameId(robot.striker(problem.striker).model_frame)
-    jac = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
-    return np.asarray(jac @ inverse @ jac.T)
+    frames = [sole.frame for sole in problem.stance.soles(robot)]
+    return Held.at(robot.model, q, frames, robot.striker(problem.striker).model_frame).inverse_mass()
 
 
 def _bones(robot: Robot) -> list[tuple[int, int]]:

@@ -24,7 +24,7 @@ from impactopt.studies.bench.attack_collisions import LAWS, ROBOTS, TARGETS, Str
 from impactopt.studies.bench.attack_commands import attack_command, make_result
 from impactopt.studies.bench.attack_files import attack_file, texts
 from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
-from impactopt.studies.bench.report import Report, Say, make_table
+from impactopt.studies.report import Report, Say, make_table
 
 __all__ = ["COUNTS", "case", "run"]
 

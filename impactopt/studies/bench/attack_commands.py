@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.report.plain_errors import BUG
 from impactopt.studies.bench.attack_cases import Found, Generator, attempt, odd_number, pick
 from impactopt.studies.bench.attack_files import mutated_file, spoil_bytes, texts
-from impactopt.terminal.plain_errors import BUG
 
 __all__ = ["attack_command", "damage", "make_result"]
 

@@ -22,7 +22,7 @@ from impactopt.problem.terms import Balance
 from impactopt.simulation import Simulation, simulate
 from impactopt.simulation.robustness import robustness
 from impactopt.studies.bench.planning import DEMO, plan_of
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 from impactopt.transcription.plan import Trajectory
 
 TIME_LIMIT = 120.0  # [s] of the solver

@@ -21,7 +21,6 @@ from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.clock import medians, runner, shortest
 from impactopt.studies.bench.methods import Entry, entries
 from impactopt.studies.bench.peers import mujoco_rollouts, pinocchio_calls
-from impactopt.studies.bench.report import Report, Say, cell, columns_table, make_table
 from impactopt.studies.bench.scene import (
     EVALUATION,
     MOTIONS,
@@ -31,6 +30,7 @@ from impactopt.studies.bench.scene import (
     outcome,
     run_of,
 )
+from impactopt.studies.report import Report, Say, cell, columns_table, make_table
 
 # calls of some 30 ms: of 200 collisions, checks of the inputs and a thread's start would be a tenth of the
 # time, where MuJoCo's threads are started before

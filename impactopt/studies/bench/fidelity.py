@@ -21,7 +21,7 @@ from impactopt.pictures.fidelity import fidelity_picture
 from impactopt.simulation.cases import PAPER_SPEEDS, Case, errors_against
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.ladder import GAINS, HORIZON, LADDER, LAW, MASS_RATIOS, TARGETS, Rung, situations
-from impactopt.studies.bench.report import Report, Say, cell, columns_table, make_table
+from impactopt.studies.report import Report, Say, cell, columns_table, make_table
 
 TOLERANCE = 1e-5  # relative, of the reference's impulse
 ORDER_FROM = 2  # freezes

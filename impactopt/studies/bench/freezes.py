@@ -23,23 +23,15 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.collision import SDC, effective_mass
-from impactopt.contact import (
-    Board,
-    FreeMass,
-    HertzDamped,
-    HuntCrossley,
-    KelvinVoigt,
-    Nail,
-    RigidWall,
-    SpringDamper,
-)
+from impactopt.contact import Board, FreeMass, HertzDamped, HuntCrossley
 from impactopt.errors import InputError
+from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
-from impactopt.simulation.cases import striking_velocity
-from impactopt.simulation.reference import FullDynamics, holding_torque
+from impactopt.simulation.reference import FullDynamics
 from impactopt.simulation.workers import map_on_workers
-from impactopt.studies.bench.report import Report, Say, make_table
+from impactopt.studies.bench.stability_cases import LAWS, TARGETS
+from impactopt.studies.report import Report, Say, make_table
 
 __all__ = ["FREEZES", "KINDS", "ROBOTS", "Drawn", "draw", "judge", "run", "summary"]
 
@@ -53,19 +45,12 @@ HORIZON = 0.4  # [s]
 ACCURACY = 1.0  # [%] that flags are of
 TIMES = (0.0, 5e-3, 20e-3, 50e-3, 100e-3, HORIZON)  # [s] of the table
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
-_SPRING = SpringDamper(stiffness=1e4, damping=300.0)
-_MASS = FreeMass(mass=5.0)
 KINDS: dict[str, tuple[Any, Any]] = {
-    "spring, mass": (_SPRING, _MASS),
-    "spring, nail": (_SPRING, Nail(mass=0.1, resistance=300.0, hardening=1e4)),
-    "spring, board": (
-        _SPRING,
-        Board(mass=0.5, stiffness=1e5, breaking_force=400.0, damping=20.0),
-    ),
-    "spring, wall": (_SPRING, RigidWall()),
-    "kelvin, mass": (KelvinVoigt(stiffness=1e4, damping=100.0), _MASS),
-    "hertz, mass": (HertzDamped(stiffness=1e6, damping=10.0), _MASS),
-    "hunt, mass": (HuntCrossley(stiffness=1e5, dissipation=0.3), _MASS),
+    f"{law}, {target}": (LAWS[law], TARGETS[target])
+    for law, target in (
+        *(("spring", target) for target in ("mass", "nail", "board", "wall")),
+        *((law, "mass") for law in ("kelvin", "hertz", "hunt")),
+    )
 }
 # two of five are the common pair
 _ORDER = (*KINDS, "spring, mass", "spring, mass", "spring, mass")

@@ -25,7 +25,7 @@ from impactopt.problem.terms import Balance, ContactWrenchCone, Term, TorqueLimi
 from impactopt.simulation import Conditions, simulate
 from impactopt.simulation.robustness import STEP, robustness
 from impactopt.studies.bench.planning import DEMO
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 TIME_LIMIT = 120.0  # [s] of the solver
 SURVIVED = 0.06  # [m] the missing target's capture margin that problems/punch.toml asks for

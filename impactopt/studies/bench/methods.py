@@ -12,8 +12,8 @@ from impactopt.errors import InputError
 from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.clock import runner
 from impactopt.studies.bench.peers import cvodes, mujoco_loop, mujoco_steps, pinocchio_calls
-from impactopt.studies.bench.report import Say
 from impactopt.studies.bench.scene import EVALUATION, Scene, graph, inputs, outcome, run_of
+from impactopt.studies.report import Say
 
 __all__ = ["Entry", "entries"]
 

@@ -14,9 +14,9 @@ from impactopt.collision import Collision
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
 from impactopt.collision.runge_kutta import rate_of_change
 from impactopt.simulation.mujoco_world import mujoco_module, no_log_file
+from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
-from impactopt.simulation.reference.bodies import PinocchioBody
-from impactopt.simulation.reference.mujoco_dynamics import _march, _World
+from impactopt.simulation.reference.mujoco_dynamics import HeldRobot, march
 from impactopt.studies.bench.scene import Scene
 
 __all__ = ["cvodes", "mujoco_loop", "mujoco_rollouts", "mujoco_steps", "pinocchio_calls"]
@@ -25,11 +25,11 @@ Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- MuJoCo
-def _world(scene: Scene, step: float) -> tuple[MujocoDynamics, _World]:
+def _world(scene: Scene, step: float) -> tuple[MujocoDynamics, HeldRobot]:
     model = scene.model(MujocoDynamics, step=step)
     robot, frames, _, striker = model._held
     with no_log_file():
-        return model, _World(robot, frames, striker, step)
+        return model, HeldRobot(robot, frames, striker, step)
 
 
 def mujoco_loop(scene: Scene, step: float) -> Callable[[], Collision]:
@@ -40,10 +40,10 @@ def mujoco_loop(scene: Scene, step: float) -> Callable[[], Collision]:
 
     def run() -> Collision:
         forces, normal = model._forces(case.v, case.torque, {})
-        world.mujoco.mj_resetData(world.model, world.data)
+        world.mujoco.mj_resetData(world.world, world.data)
         world.start(case.q, case.v)
         with no_log_file():
-            return _march(world, forces, normal, model.horizon, soles)
+            return march(world, forces, normal, model.horizon, soles)
 
     return run
 
@@ -57,10 +57,10 @@ def mujoco_steps(scene: Scene, step: float, duration: float) -> Callable[[], Non
     mujoco = world.mujoco
 
     def run() -> None:
-        mujoco.mj_resetData(world.model, world.data)
+        mujoco.mj_resetData(world.world, world.data)
         world.start(scene.case.q, scene.case.v)
         world.data.qfrc_applied[world.dof] = scene.case.torque
-        mujoco.mj_step(world.model, world.data, count)
+        mujoco.mj_step(world.world, world.data, count)
 
     return run
 
@@ -75,20 +75,20 @@ def mujoco_rollouts(
     mujoco = world.mujoco
     world.start(scene.case.q, scene.case.v)
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    state = np.zeros(mujoco.mj_stateSize(world.model, kind))
-    mujoco.mj_getState(world.model, world.data, state, kind)
+    state = np.zeros(mujoco.mj_stateSize(world.world, kind))
+    mujoco.mj_getState(world.world, world.data, state, kind)
     many = np.tile(state, (batch, 1))
-    data = [mujoco.MjData(world.model) for _ in range(threads)]
+    data = [mujoco.MjData(world.world) for _ in range(threads)]
     # servo and law need the interpreter: the robot moves freely
     pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
-    return lambda: pool.rollout(world.model, data, many, nstep=count)
+    return lambda: pool.rollout(world.world, data, many, nstep=count)
 
 
-def _steps_alone(scene: Scene, step: float) -> _World:
+def _steps_alone(scene: Scene, step: float) -> HeldRobot:
     mujoco = mujoco_module()
     _, world = _world(scene, step)
     usual = mujoco.MjSpec().compile().opt
-    world.model.opt.iterations, world.model.opt.tolerance = usual.iterations, usual.tolerance
+    world.world.opt.iterations, world.world.opt.tolerance = usual.iterations, usual.tolerance
     return world
 
 

@@ -10,7 +10,7 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
-from impactopt.studies.bench.report import Say
+from impactopt.studies.report import Say
 
 DEMO = Path("problems/punch.toml")
 

@@ -15,7 +15,7 @@ from impactopt.pictures.convergence import convergence_picture
 from impactopt.planning.solution import Solution
 from impactopt.simulation import Conditions, Simulation
 from impactopt.studies.bench.planning import DEMO, plan_of
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2.5e-5)  # [s]
 STEP = 2e-4  # of the rows that change something else

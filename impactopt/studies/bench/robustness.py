@@ -12,7 +12,7 @@ from impactopt.pictures.robustness import robustness_picture
 from impactopt.simulation import Conditions, Simulation
 from impactopt.simulation.robustness import STEP, Robustness, Spread, robustness
 from impactopt.studies.bench.planning import DEMO, plan_of
-from impactopt.studies.bench.report import Report, Say, make_table
+from impactopt.studies.report import Report, Say, make_table
 
 ROBUST = Path("problems/punch_robust.toml")
 SAID_EVERY = 20  # draws

@@ -24,9 +24,9 @@ from impactopt.simulation.cases import Case
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.clock import medians, shortest
 from impactopt.studies.bench.costs import Tree, cost_sdc, even_tree, iterations
-from impactopt.studies.bench.report import Report, Say, columns_table
 from impactopt.studies.bench.scaling_robots import depth, humanoid_scenes, tip_scene
 from impactopt.studies.bench.scene import Scene, compiled, inputs, run_of
+from impactopt.studies.report import Report, Say, columns_table
 
 CHAINS = (2, 4, 8, 16, 24, 32, 48, 64, 100)
 TREES = (8, 16, 32, 48, 64, 80, 100)  # of four limbs

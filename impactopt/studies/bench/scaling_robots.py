@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
+from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
-from impactopt.simulation.cases import Case, striking_velocity
-from impactopt.simulation.reference import holding_torque
-from impactopt.studies.bench.report import Say
+from impactopt.simulation.cases import Case
 from impactopt.studies.bench.scene import Scene
 from impactopt.studies.bench.trees import LIMBS, random_robot, tip_speed
+from impactopt.studies.report import Say
 
 __all__ = ["depth", "humanoid_scenes", "tip_scene"]
 

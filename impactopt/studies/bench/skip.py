@@ -24,8 +24,8 @@ from impactopt.robots.presets import standin
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench.clock import medians
-from impactopt.studies.bench.report import Report, Say, columns_table
 from impactopt.studies.bench.scene import Scene, run_of
+from impactopt.studies.report import Report, Say, columns_table
 
 FRICTION = JointFriction(viscous=1.0, coulomb=1.0, transition=0.05)
 WHOLE, FIXED = "everything", "everything, fixed base"

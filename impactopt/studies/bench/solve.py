@@ -7,7 +7,6 @@ its own (`attempts.py`), kept in a file as soon as it is done.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,14 +15,13 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError, did_you_mean
-from impactopt.files.output import make_directory, plain
 from impactopt.files.problem_file import read_problem_file
 from impactopt.files.problem_file.names import problem_file, problem_names
 from impactopt.solvers.program import NonlinearProgram, Status, Vector
-from impactopt.storage.files import open_own, write_atomically
 from impactopt.studies.bench.attempts import Attempt, Make, attempt
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.bench.kept import Kept
 from impactopt.studies.bench.solvers import SOLVERS
+from impactopt.studies.report import Report, Say, columns_table
 
 __all__ = ["ATTEMPTS", "planning_program", "run", "summary"]
 
@@ -32,6 +30,7 @@ VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative
 NOISE = 0.1  # [rad] of the posture at contact in a perturbed start
 SPEEDS = (0.5, 1.5)  # [m/s] of the strike in a perturbed start
 QUICK = ("sqp:interior", "ipopt")
+KEYS = ("problem", "solver", "start", "time_limit")  # of an attempt
 
 COLUMNS = (
     ("problem", "problem", 0),
@@ -72,7 +71,7 @@ def run(
     makes: dict[str, Make] = {path.stem: partial(planning_program, path, seed) for path in _files(problem)}
     chosen = _chosen(solvers or (QUICK if quick else tuple(SOLVERS)))
     number = 1 if quick else starts
-    kept = _Kept(attempts, resume=resume)
+    kept = Kept(attempts, KEYS, resume=resume)
     rows = []
     for name, make in makes.items():
         found = {
@@ -163,42 +162,19 @@ def _number(value: float) -> float | None:
 
 
 def _one(
-    say: Say, kept: _Kept, problem: str, make: Make, label: str, start: int, time_limit: float
+    say: Say, kept: Kept, problem: str, make: Make, label: str, start: int, time_limit: float
 ) -> Attempt:
-    key = (problem, label, start, time_limit)
-    found = kept.found.get(key)
-    if found is None:
-        found = attempt(make, start, label, time_limit)
-        kept.add(key, found)
+    key = dict(zip(KEYS, (problem, label, start, time_limit), strict=True))
+    row = kept.found.get(tuple(key.values()))
+    if row is None:
+        row = kept.add({**key, **dataclasses.asdict(attempt(make, start, label, time_limit))})
+    given: dict[str, Any] = {k: np.nan if v is None else v for k, v in row.items() if k not in KEYS}
+    try:
+        found = Attempt(**given)
+    except TypeError as error:
+        raise InputError(f"the file of attempts has lines of another kind: {error}") from error
     say(f"{problem}, {label}, start {start}: {found.status}, {found.seconds:.2f} s, {found.objective:.4f}")
     return found
-
-
-class _Kept:
-    """The attempts in a file, one a line."""
-
-    def __init__(self, path: Path, *, resume: bool):
-        self._path = path
-        self.found: dict[tuple[str, str, int, float], Attempt] = {}
-        make_directory(path.parent)
-        try:
-            if resume and path.exists():
-                for line in path.read_text(encoding="utf-8").splitlines():
-                    entry: dict[str, Any] = json.loads(line)
-                    key = tuple(entry.pop(name) for name in ("problem", "solver", "start", "time_limit"))
-                    known: dict[str, Any] = {k: np.nan if v is None else v for k, v in entry.items()}
-                    self.found[key] = Attempt(**known)
-            else:
-                write_atomically(path, lambda _file: None)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} cannot be used for the attempts: {error}") from error
-
-    def add(self, key: tuple[str, str, int, float], found: Attempt) -> None:
-        problem, solver, start, time_limit = key
-        entry = {"problem": problem, "solver": solver, "start": start, "time_limit": time_limit}
-        line = json.dumps(plain({**entry, **dataclasses.asdict(found)}), allow_nan=False)
-        with open(self._path, "a", encoding="utf-8", opener=open_own) as file:
-            file.write(line + "\n")
 
 
 def _files(problem: str | None) -> list[Path]:

@@ -26,10 +26,10 @@ from impactopt.collision import Collision
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
 from impactopt.simulation.workers import map_on_workers
-from impactopt.studies.bench.report import Report, Say, make_table
 from impactopt.studies.bench.stability_cases import RIGS, Case, Rig, draw
 from impactopt.studies.bench.stability_others import FREEZES, MASSES, freezes_of, masses_of, refusals
 from impactopt.studies.bench.stability_reference import TakesTooLong, reference
+from impactopt.studies.report import Report, Say, make_table
 
 __all__ = ["Outcome", "judge", "judge_rig", "run"]
 

@@ -23,17 +23,17 @@ from impactopt.contact import (
 )
 from impactopt.studies.bench.stability_robots import make_robot
 
-__all__ = ["RIGS", "Case", "Rig", "draw"]
+__all__ = ["LAWS", "RIGS", "TARGETS", "Case", "Rig", "draw"]
 
 Array = NDArray[np.float64]
 
-_LAWS: dict[str, Any] = {
+LAWS: dict[str, Any] = {
     "spring": SpringDamper(stiffness=1e4, damping=300.0),
     "kelvin": KelvinVoigt(stiffness=1e4, damping=100.0),
     "hertz": HertzDamped(stiffness=1e6, damping=10.0),
     "hunt": HuntCrossley(stiffness=1e5, dissipation=0.3),
 }
-_TARGETS: dict[str, Any] = {
+TARGETS: dict[str, Any] = {
     "mass": FreeMass(mass=5.0),
     "wall": RigidWall(),
     "nail": Nail(mass=0.1, resistance=300.0, hardening=1e4),
@@ -74,8 +74,8 @@ class Rig:
             "robot": robot,
             "striker": striker,
             "normal": np.array([1.0, 0.0, 0.0]),
-            "law": _LAWS[self.law],
-            "target": _TARGETS[self.target],
+            "law": LAWS[self.law],
+            "target": TARGETS[self.target],
             "horizon": self.horizon,
         }
         if self.paper:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from decimal import Context, Decimal, localcontext
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,11 @@ import pinocchio as pin
 from impactopt.collision import SDC, effective_mass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
+from impactopt.kinematics.held import Held
 from impactopt.kinematics.stance import BothSoles
 from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.stability_robots import make_robot
-from impactopt.studies.bench.virtual_base import _decimals, _solved
+from impactopt.studies.bench.virtual_base import exact_inverse_mass
 
 __all__ = ["FREEZES", "MASSES", "freezes_of", "masses_of", "refusals"]
 
@@ -42,26 +43,12 @@ def masses_of(mass: float, cases: int, seed: int) -> list[Found]:
         first = robot.nv - 3 if k % 3 == 0 else robot.nv - robot.n
         dq[first:] = rng.uniform(-0.8, 0.8, robot.nv - first)
         q = pin.integrate(robot.model, pin.neutral(robot.model), dq)
-        expected = 1.0 / float(_inverse_mass(robot, stance, q, Decimal(mass)))
+        body = Held.at(robot.model, q, stance.sole_frames(robot), robot.striker("tip").model_frame)
+        expected = 1.0 / float(exact_inverse_mass(body, X, 1 / Decimal(mass)))
         error = abs(float(function(q)) / expected - 1.0)
         verdict = "nan" if np.isnan(error) else "agree" if error < 1e-6 else "wrong"
         found.append((verdict, "60 digits", error, f"effective mass, M_g = {mass:g} kg, q = {q.tolist()}"))
     return found
-
-
-def _inverse_mass(robot: Any, stance: BothSoles, q: Any, mass: Decimal) -> Decimal:
-    """[1/kg] from Pinocchio's H and Jacobians."""
-    model, data, axes = robot.model, robot.model.createData(), pin.LOCAL_WORLD_ALIGNED
-    upper = np.triu(pin.crba(model, data, q))
-    H = upper + np.triu(upper, 1).T
-    names = [*stance.sole_frames(robot), robot.striker("tip").model_frame]
-    J = [pin.computeFrameJacobian(model, data, q, model.getFrameId(f), axes).copy() for f in names]
-    with localcontext(Context(prec=60)):
-        rows = _decimals(np.vstack([*J[:-1], X @ J[-1][:3]]))
-        inner = rows @ _solved(_decimals(H), rows.T)
-        c = len(rows) - 1
-        held = inner[:c, :c] + np.diag([1 / mass] * c)
-        return Decimal(inner[c, c] - (inner[c, :c] @ _solved(held, inner[:c, c:]))[0])
 
 
 def freezes_of(counts: tuple[int, ...]) -> list[Found]:

@@ -24,7 +24,7 @@ from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos
 from impactopt.simulation.reference.meshes import Meshes
 from impactopt.studies.bench.planning import DEMO, solved
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 Array = NDArray[np.float64]
 EVERY = 1e-3  # [s] at which the meshes of a motion are looked at

@@ -11,7 +11,6 @@ leaves out from what rounding adds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from decimal import Context, Decimal, localcontext
 from typing import Any
 
@@ -24,11 +23,12 @@ from impactopt.collision import SDC
 from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model, number_of_steps
 from impactopt.collision.loop import run as time_loop
 from impactopt.errors import InputError
+from impactopt.kinematics.held import Held
 from impactopt.kinematics.stance import BothSoles
 from impactopt.pictures.virtual_base import virtual_base_picture
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 Array = NDArray[np.float64]
 
@@ -92,13 +92,13 @@ def rows_of(robot: Robot, masses: Sequence[float]) -> list[dict[str, Any]]:
     """One row a mass. `rounding_...`: against 60-digit arithmetic with the same mass."""
     q = robot.postures[POSTURE]
     ours = _ours(robot, None, q)
-    hand = Hand.of(robot, q)
-    exact = hand.inverse_mass(0)
+    body = _body(robot, q)
+    exact = exact_inverse_mass(body, NORMAL, 0)
     strike = _strike(robot)
     impulse = strike(ours)
     rows = []
     for mass in masses:
-        wanted = hand.inverse_mass(Decimal(1) / Decimal(mass))
+        wanted = exact_inverse_mass(body, NORMAL, Decimal(1) / Decimal(mass))
         found = _ours(robot, mass, q)
         row: dict[str, Any] = {
             "robot": robot.name,
@@ -126,7 +126,7 @@ def exact_rows(robot: Robot) -> list[dict[str, Any]]:
     """Rounding of the default, held exactly, in the bench's posture and on straight legs."""
     rows = []
     for name, q in ((POSTURE, robot.postures[POSTURE]), ("straight", pin.neutral(robot.model))):
-        wanted, found = Hand.of(robot, q).inverse_mass(0), _ours(robot, None, q)["m"]
+        wanted, found = exact_inverse_mass(_body(robot, q), NORMAL, 0), _ours(robot, None, q)["m"]
         row = {"robot": robot.name, "posture": name, "mass_kg": 1 / float(wanted)}
         rows.append(row | {"rounding": _off(wanted, found)})
     return rows
@@ -165,13 +165,13 @@ def _literal(robot: Robot, mass: float, q: Array) -> dict[str, Array]:
         frame = model.frames[model.getFrameId(name)]
         inertia = pin.Inertia(mass, np.zeros(3), mass * np.eye(3))
         model.appendBodyToJoint(frame.parentJoint, inertia, frame.placement)
-    hand = Hand.of(robot, q, model)
+    body = _body(robot, q, model)
     try:
-        root = np.linalg.cholesky(hand.H)
+        root = np.linalg.cholesky(body.inertia)
     except np.linalg.LinAlgError as error:
         raise InputError(f"Cholesky factorization of H: {error}") from error
     joints = np.linalg.solve(root, np.eye(robot.nv)[:, -robot.n :])
-    row = np.linalg.solve(root, hand.row)
+    row = np.linalg.solve(root, np.array(NORMAL) @ body.hand)
     A = joints.T @ joints
     # its lower triangle by columns is its upper one by rows
     return {"A": A[np.triu_indices(robot.n)], "s": joints.T @ row, "m": np.atleast_1d(row @ row)}
@@ -192,41 +192,21 @@ def _strike(robot: Robot) -> Any:
 
 
 # ---------------------------------------------------------------- many digits
-@dataclass(frozen=True)
-class Hand:
-    """H (nv, nv), the soles' Jacobians (c, nv) and the hand's row (nv) at one posture, by Pinocchio."""
+def _body(robot: Robot, q: Array, model: Any = None) -> Held:
+    """Of the robot, or of a model with its frames."""
+    frames = BothSoles().sole_frames(robot)
+    return Held.at(robot.model if model is None else model, q, frames, robot.striker(STRIKER).model_frame)
 
-    H: Array
-    soles: Array
-    row: Array
 
-    @classmethod
-    def of(cls, robot: Robot, q: Array, model: Any = None) -> Hand:
-        """Of the robot, or of a model with its frames."""
-        model = robot.model if model is None else model
-        data = model.createData()
-        pin.computeJointJacobians(model, data, q)
-        pin.updateFramePlacements(model, data)
-
-        def jacobian(frame: str) -> Array:
-            J = pin.getFrameJacobian(model, data, model.getFrameId(frame), pin.LOCAL_WORLD_ALIGNED)
-            return np.array(J)
-
-        return cls(
-            np.array(pin.crba(model, data, q)),
-            np.vstack([jacobian(frame) for frame in BothSoles().sole_frames(robot)]),
-            np.array(NORMAL) @ jacobian(robot.striker(STRIKER).model_frame)[:3],
-        )
-
-    def inverse_mass(self, compliance: Decimal | int) -> Decimal:
-        """[1/kg] j P j' with that compliance [1/kg, 1/(kg m2)] of the soles, in 60-digit arithmetic."""
-        with localcontext(Context(prec=DIGITS)):
-            rows = _decimals(np.vstack([self.soles, self.row]))
-            inner = rows @ _solved(_decimals(self.H), rows.T)
-            c = len(self.soles)
-            held = inner[:c, :c] + np.diag([Decimal(compliance)] * c)
-            lost = inner[c, :c] @ _solved(held, inner[:c, c:])
-            return Decimal(inner[c, c] - lost[0])
+def exact_inverse_mass(body: Held, normal: Any, compliance: Decimal | int) -> Decimal:
+    """[1/kg] n' J P J' n with that compliance [1/kg, 1/(kg m2)] of the soles, in 60-digit arithmetic."""
+    with localcontext(Context(prec=DIGITS)):
+        rows = _decimals(np.vstack([body.held, np.asarray(normal) @ body.hand]))
+        inner = rows @ _solved(_decimals(body.inertia), rows.T)
+        c = len(body.held)
+        held = inner[:c, :c] + np.diag([Decimal(compliance)] * c)
+        lost = inner[c, :c] @ _solved(held, inner[:c, c:])
+        return Decimal(inner[c, c] - lost[0])
 
 
 def _decimals(numbers: Array) -> Any:

@@ -6,7 +6,6 @@ on free soles (MuJoCo), with nothing held. No row is left out: an exception is a
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,14 +19,13 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
-from impactopt.files.output import make_directory, plain
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.storage.files import open_own, write_atomically
+from impactopt.studies.bench.kept import Kept
 from impactopt.studies.bench.planning import DEMO, solved
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 
 __all__ = ["BASES", "ROWS", "Base", "cleanliness", "draw", "drawn_problem", "row", "run"]
 
@@ -107,12 +105,12 @@ def run(
     jobs = _files(folder, robot, say) if random is None else _drawn(random, robot, seed, folder, say)
     if not jobs:
         raise InputError(f"no problem to solve in {folder}" + (f" for the robot {robot}" if robot else ""))
-    kept = _Kept(rows, resume=resume)
+    kept = Kept(rows, ("problem", "seed"), resume=resume)
     found = []
     for k, (key, plan) in enumerate(jobs.items(), start=1):
         if key not in kept.found:
-            kept.add(key, row(key[0], plan))
-        found.append(kept.found[key])
+            kept.add({"seed": key[1], **row(key[0], plan)})
+        found.append({name: value for name, value in kept.found[key].items() if name != "seed"})
         say(f"{k} of {len(jobs)}: {_told(found[-1])}")
     numbers = {**_counts(found), "seed": seed, "rows": found}
     title = (
@@ -315,27 +313,3 @@ def _told(r: Mapping[str, Any]) -> str:
         f"{r['problem']}: {r['status']}, {r['impulse_planned_Ns']:.2f} N s, {r['seconds']:.1f} s, {stands}, "
         f"error {r['error_pct']:.2f} %"
     )
-
-
-class _Kept:
-    """The rows in a file, one a line."""
-
-    def __init__(self, path: Path, *, resume: bool):
-        self._path = path
-        self.found: dict[Key, dict[str, Any]] = {}
-        make_directory(path.parent)
-        try:
-            if resume and path.exists():
-                for line in path.read_text(encoding="utf-8").splitlines():
-                    entry: dict[str, Any] = json.loads(line)
-                    self.found[entry["problem"], entry.pop("seed")] = entry
-            else:
-                write_atomically(path, lambda _file: None)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"{path} cannot be used for the rows: {error}") from error
-
-    def add(self, key: Key, found: Mapping[str, Any]) -> None:
-        self.found[key] = plain(found)
-        line = json.dumps(plain({"seed": key[1], **found}), allow_nan=False)
-        with open(self._path, "a", encoding="utf-8", opener=open_own) as file:
-            file.write(line + "\n")

@@ -1,7 +1,5 @@
 """The paper's tables and figures beside ours, each by one command, `impactopt reproduce NAME`.
 
-* registry.py    tables and figures by name
-* command.py     the command line
 * paper.py       what the paper prints
 * costs.py       its formulas of computation cost; timing.py, trees.py: our own implementations, measured
 * motions.py     the nine motions through every rung of the ladder of collision models

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impactopt.kinematics.held import striking_velocity
 from impactopt.robots.presets import standin
-from impactopt.simulation.cases import striking_velocity
 from impactopt.studies.bench.costs import HRP2, TOTAL_TIME, cost_aba, cost_full, cost_sdc, iterations
-from impactopt.studies.bench.report import Report, Say, cell, columns_table
+from impactopt.studies.report import Report, Say, cell, columns_table
 from impactopt.studies.reproduce.timing import Times, measure
 
 if TYPE_CHECKING:

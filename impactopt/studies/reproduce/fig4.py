@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impactopt.studies.bench.costs import cost_aba, cost_full, cost_sdc, even_tree, iterations
-from impactopt.studies.bench.report import Report, Say, columns_table
 from impactopt.studies.bench.trees import random_robot, tip_speed
+from impactopt.studies.report import Report, Say, columns_table
 from impactopt.studies.reproduce.timing import measure
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impactopt.collision import Collision
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 from impactopt.studies.reproduce.motions import LADDER, WHOSE, Rung, motions, reference
 from impactopt.studies.reproduce.paper import OPENHRP3, TABLE_2, TABLE_3
 

@@ -17,7 +17,7 @@ from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import Case, paper_motions
 from impactopt.simulation.reference import FullDynamics
-from impactopt.studies.bench.report import Say
+from impactopt.studies.report import Say
 from impactopt.studies.reproduce.paper import LAW, STEP, TARGET
 
 __all__ = ["HORIZON", "LADDER", "ROBOTS", "WHOSE", "Rung", "motions", "reference", "setting"]

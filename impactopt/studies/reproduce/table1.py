@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.simulation.cases import Case
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 from impactopt.studies.reproduce.motions import ROBOTS, WHOSE, motions
 from impactopt.studies.reproduce.paper import MOTIONS
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from impactopt.collision import Collision, CollisionModel
 from impactopt.simulation.cases import Case, errors_against
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 from impactopt.studies.reproduce.motions import HORIZON, LADDER, ROBOTS, WHOSE, Rung, motions, reference
 from impactopt.studies.reproduce.paper import OPENHRP3, TABLE_2, TABLE_3
 

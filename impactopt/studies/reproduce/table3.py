@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from impactopt.collision import VirtualMass
 from impactopt.robots.robot import Robot, Striker
-from impactopt.studies.bench.report import Report, Say, columns_table
+from impactopt.studies.report import Report, Say, columns_table
 from impactopt.studies.reproduce.paper import LAW, MOTIONS, STEP, TABLE_3, TARGET
 
 __all__ = ["point_mass", "run"]

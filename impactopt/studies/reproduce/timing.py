@@ -24,7 +24,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.codegen.cache import cached, model_hash
+from impactopt.codegen.cache import cached
+from impactopt.codegen.hashing import model_hash
 from impactopt.collision import SDC
 from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model
 from impactopt.rigid_body import RigidBody

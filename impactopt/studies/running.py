@@ -8,8 +8,8 @@ from pathlib import Path
 
 import typer
 
-from impactopt.studies.bench.report import Report, Say
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
+from impactopt.studies.report import Report, Say
 
 __all__ = ["show_reports"]
 
@@ -34,8 +34,8 @@ def show_reports(
         from rich.console import Console
 
         from impactopt.files.output import make_directory, plain
-        from impactopt.studies.bench.report import save_report
-        from impactopt.terminal.console import Progress
+        from impactopt.report.console import Progress
+        from impactopt.studies.report import save_report
 
         directory = make_directory(out) if out is not None else None
         found = {}

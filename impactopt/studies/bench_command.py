@@ -1,17 +1,19 @@
-"""`impactopt bench NAME`: one command a bench.
+"""`impactopt bench NAME`: one command a bench, with the bench's own options and those of all.
 
 Exit codes: 0 done, 2 bad input, or nothing to measure.
 """
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from impactopt.studies.bench.report import Report, Say
-from impactopt.studies.bench.running import show_reports
+from impactopt.studies.report import Report, Say
+from impactopt.studies.running import show_reports
 
 app = typer.Typer(
     name="bench",
@@ -27,18 +29,37 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn conditions.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
+Compilers = Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")]
 FEW_DRAWS = 10  # of the bench margins among all others, which has a dozen plans to replay
 FEW_PROBLEMS = 9  # of the bench zoo among all others
 
 
-@app.command()
-def truth(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+def _shown(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+    """What every command takes."""
+
+
+def _command(name: str) -> Callable[[Callable[..., None]], None]:
+    """A command of that name, of a function whose parameters are the bench's options."""
+
+    def register(of: Callable[..., None]) -> None:
+        def command(*, as_json: bool, out: Path | None, quiet: bool, **options: Any) -> None:
+            _run([name], {name: options}, as_json, out, quiet)
+
+        own, shared = (inspect.signature(f, eval_str=True).parameters.values() for f in (of, _shown))
+        command.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
+        command.__doc__ = of.__doc__
+        app.command(name)(command)
+
+    return register
+
+
+@_command("truth")
+def _truth() -> None:
     """Every problem of problems/ and variants of the demo: planned, replayed on held and on free soles."""
-    _run(["truth"], {}, as_json, out, quiet)
 
 
-@app.command()
-def robustness(
+@_command("robustness")
+def _robustness(
     file: Annotated[
         Path | None,
         typer.Argument(metavar="FILE", help="Problem file (default: problems/punch_robust.toml)."),
@@ -46,178 +67,121 @@ def robustness(
     draws: Draws = 200,
     seed: Seed = 0,
     workers: Workers = 2,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
 ) -> None:
     """How often a plan stands, and how hard it hits, where target, servo and floor are not as planned."""
-    options = {"file": file, "draws": draws, "seed": seed, "workers": workers}
-    _run(["robustness"], {"robustness": options}, as_json, out, quiet)
 
 
-@app.command()
-def replay(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+@_command("replay")
+def _replay() -> None:
     """The replay's own error: the demo's plan with other steps, solver settings and floors."""
-    _run(["replay"], {}, as_json, out, quiet)
 
 
-@app.command()
-def baselines(
+@_command("baselines")
+def _baselines(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Problem file.")] = Path("problems/punch.toml"),
     draws: Draws = 50,
     seed: Seed = 0,
     workers: Workers = 2,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
 ) -> None:
     """What people do today, on the same robot and in the same limits, beside our plans."""
-    options = {"file": file, "draws": draws, "seed": seed, "workers": workers}
-    _run(["baselines"], {"baselines": options}, as_json, out, quiet)
 
 
-@app.command()
-def margins(
+@_command("margins")
+def _margins(
     draws: Draws = 40,
     seed: Seed = 0,
     workers: Workers = 2,
-    few: Annotated[bool, typer.Option("--quick", help="Fewer values of each option.")] = False,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer values of each option.")] = False,
 ) -> None:
     """What planning with margin costs in impulse, and what it buys in robustness, one option at a time."""
-    options = {"draws": draws, "seed": seed, "workers": workers, "quick": few}
-    _run(["margins"], {"margins": options}, as_json, out, quiet)
 
 
-@app.command()
-def fidelity(
-    workers: Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")] = 2,
-    few: Annotated[
+@_command("fidelity")
+def _fidelity(
+    workers: Compilers = 2,
+    quick: Annotated[
         bool, typer.Option("--quick", help="Three collisions of the stand-in, up to four freezes.")
     ] = False,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
 ) -> None:
     """How far each collision model is from full dynamics: 27 collisions on each of three robots."""
-    _run(["fidelity"], {"fidelity": {"workers": workers, "quick": few}}, as_json, out, quiet)
 
 
-@app.command()
-def freezes(
+@_command("freezes")
+def _freezes(
     count: Annotated[int, typer.Option(min=1, help="Collisions that end, on each of three robots.")] = 10,
     seed: Seed = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")] = 2,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
+    workers: Compilers = 2,
 ) -> None:
     """What freezing costs in drawn collisions, over contact time, and whether its estimate holds."""
-    options = {"count": count, "seed": seed, "workers": workers}
-    _run(["freezes"], {"freezes": options}, as_json, out, quiet)
 
 
-@app.command("virtual-base")
-def virtual_base(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+@_command("virtual-base")
+def _virtual_base() -> None:
     """The paper's mass M_g under the soles against soles held exactly: its error, and rounding's."""
-    _run(["virtual-base"], {}, as_json, out, quiet)
 
 
-@app.command()
-def stability(
+@_command("stability")
+def _stability(
     seed: Seed = 0,
     workers: Workers = 2,
-    few: Annotated[bool, typer.Option("--quick", help="A tenth of the cases, small robots only.")] = False,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A tenth of the cases, small robots only.")] = False,
 ) -> None:
     """Collisions at the edges of what numbers can hold: is each right, or refused with a reason?"""
-    options = {"quick": few, "seed": seed, "workers": workers}
-    _run(["stability"], {"stability": options}, as_json, out, quiet)
 
 
-@app.command()
-def attack(
+@_command("attack")
+def _attack(
     seed: Seed = 0,
     workers: Annotated[
         int, typer.Option(min=1, help="Processes; with 1 a case that hangs is not given up.")
     ] = 2,
-    few: Annotated[bool, typer.Option("--quick", help="Some hundred cases, a minute.")] = False,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Some hundred cases, a minute.")] = False,
 ) -> None:
     """Files, URDFs, commands and calls with something wrong; collisions by an equation of their own."""
-    _run(["attack"], {"attack": {"quick": few, "seed": seed, "workers": workers}}, as_json, out, quiet)
 
 
-@app.command()
-def collision(
-    few: Annotated[bool, typer.Option("--quick", help="The stand-in only, with few settings.")] = False,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
+@_command("collision")
+def _collision(
+    quick: Annotated[bool, typer.Option("--quick", help="The stand-in only, with few settings.")] = False,
 ) -> None:
     """Run time of a collision against its error: ours, the paper's, Pinocchio, MuJoCo, CVODES."""
-    _run(["collision"], {"collision": {"quick": few}}, as_json, out, quiet)
 
 
-@app.command()
-def scaling(
+@_command("scaling")
+def _scaling(
     workers: Annotated[int, typer.Option(min=1, help="Processes that compile.")] = 2,
-    few: Annotated[bool, typer.Option("--quick", help="Up to 32 joints, and one humanoid.")] = False,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Up to 32 joints, and one humanoid.")] = False,
 ) -> None:
     """What a collision costs over degrees of freedom, over the step, and over the size of a batch."""
-    _run(["scaling"], {"scaling": {"workers": workers, "quick": few}}, as_json, out, quiet)
 
 
-@app.command()
-def skip(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+@_command("skip")
+def _skip() -> None:
     """What leaving out what a scene does not need saves, one thing at a time."""
-    _run(["skip"], {}, as_json, out, quiet)
 
 
-@app.command()
-def solve(
+@_command("solve")
+def _solve(
     problem: Annotated[
         str | None, typer.Option("--problem", metavar="NAME", help="One problem, or its file (default: all).")
     ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Starts: the plain one, and perturbed ones.")] = 3,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Of one solve [s].")] = 60.0,
-    solver: Annotated[
+    solvers: Annotated[
         list[str] | None,
         typer.Option("--solver", metavar="NAME", help="One solver, as ipopt or sqp:piqp; may be repeated."),
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Take up what results/bench/solve.jsonl has.")
     ] = False,
-    few: Annotated[bool, typer.Option("--quick", help="One start, our default solver and IPOPT.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="One start, our default solver and IPOPT.")] = False,
     seed: Seed = 0,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
 ) -> None:
     """Which solver solves which problem, how reliably and how fast: ours, IPOPT, CasADi's, SciPy's."""
-    options = {
-        "problem": problem,
-        "starts": starts,
-        "time_limit": time_limit,
-        "solvers": tuple(solver or ()),
-        "resume": resume,
-        "quick": few,
-        "seed": seed,
-    }
-    _run(["solve"], {"solve": options}, as_json, out, quiet)
 
 
-@app.command()
-def zoo(
+@_command("zoo")
+def _zoo(
     random: Annotated[
         int | None,
         typer.Option("--random", min=1, metavar="N", help="Draw N problems (default: those of problems/)."),
@@ -229,17 +193,12 @@ def zoo(
         bool, typer.Option("--resume", help="Take up what results/bench/zoo.jsonl has.")
     ] = False,
     seed: Seed = 0,
-    as_json: Json = False,
-    out: Out = None,
-    quiet: Quiet = False,
 ) -> None:
     """Problems that nobody has tuned, drawn at random: solved from one start, do they stand on free soles?"""
-    options = {"random": random, "robot": robot, "resume": resume, "seed": seed}
-    _run(["zoo"], {"zoo": options}, as_json, out, quiet)
 
 
 @app.command("all")
-def run_all(
+def _all(
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
     seed: Seed = 0,
     workers: Workers = 2,
@@ -248,7 +207,7 @@ def run_all(
     quiet: Quiet = False,
 ) -> None:
     """Every bench, one after the other; the JSON has each under its name."""
-    from impactopt.studies.bench.registry import BENCHES
+    from impactopt.studies.registry import BENCHES
 
     drawn = {"seed": seed, "workers": workers}
     options: dict[str, dict[str, Any]] = {
@@ -279,7 +238,7 @@ def _run(
     """Run benches by name, show each when it is done; ``options`` by bench."""
 
     def run(name: str, say: Say) -> Report:
-        from impactopt.studies.bench.registry import run_bench
+        from impactopt.studies.registry import run_bench
 
         return run_bench(name, say, **options.get(name, {}))
 

@@ -1,4 +1,7 @@
-"""The held robot's acceleration, with H, J and bias anew at every call: two ways to the same numbers."""
+"""The held robot in Pinocchio, with H, J and bias anew at every call: what replays and references move.
+
+Two ways to the same numbers: the paper's dense system, and Pinocchio's own algorithms along the tree.
+"""
 
 from __future__ import annotations
 
@@ -45,18 +48,28 @@ class Body(ABC):
         """Speed of the striking point along the normal [m/s] at q (nq), v (nv), to which it goes."""
 
     @abstractmethod
-    def accelerate(self, torque: Array, force: float) -> tuple[Array, Array]:
-        """(acceleration (nv), wrenches on the held frames (6 a frame), world axes) where it has been last.
+    def accelerate(self, torque: Array, force: float) -> Array:
+        """Acceleration (nv) where it has been last.
 
         torque : (n) [N m] at the joints, friction included.
         force : [N] of the contact, pushing the hand against the normal.
         """
 
+    @abstractmethod
+    def wrenches(self) -> Array:
+        """On the held frames (frames, 6), at their origins in world axes, of the last acceleration."""
+
+    def hand_place(self) -> Array:
+        """(3,) [m] of the striking point, where it has been last."""
+        return np.array(pin.updateFramePlacement(self.model, self.data, self.hand).translation)
+
+    def placements(self) -> list[pin.SE3]:
+        """Of the held frames in the world, where it has been last."""
+        return [pin.updateFramePlacement(self.model, self.data, i).copy() for i in self.frames]
+
     def places(self) -> Array:
         """(held frames, 3) [m]: their origins in the world, where it has been last."""
-        return np.array(
-            [pin.updateFramePlacement(self.model, self.data, i).translation for i in self.frames]
-        ).reshape(-1, 3)
+        return np.array([placement.translation for placement in self.placements()]).reshape(-1, 3)
 
     def _jacobian(self, frame: int) -> Array:
         J = pin.getFrameJacobian(self.model, self.data, frame, _AXES)
@@ -98,10 +111,14 @@ class DenseBody(Body):
         self._bias = pin.nonLinearEffects(model, data, q, v)
         return float(self.row @ v)
 
-    def accelerate(self, torque: Array, force: float) -> tuple[Array, Array]:
+    def accelerate(self, torque: Array, force: float) -> Array:
         self._right[: self.nv] = self._push(torque, force) - self._bias
         found = np.array(np.linalg.solve(self._matrix, self._right), dtype=np.float64)
-        return found[: self.nv], found[self.nv :]
+        self._wrenches = found[self.nv :].reshape(-1, 6)
+        return found[: self.nv]
+
+    def wrenches(self) -> Array:
+        return self._wrenches
 
     def fastest_rate(self, damping: Array) -> float:
         """[1/s] Largest rate at which joint damping (n, n) alone slows the joints, where it has been last."""
@@ -155,20 +172,28 @@ class PinocchioBody(Body):
         self.row = self.normal @ self._jacobian(self.hand)[:3]
         return float(self.row @ v)
 
-    def accelerate(self, torque: Array, force: float) -> tuple[Array, Array]:
+    def accelerate(self, torque: Array, force: float) -> Array:
         push, model = self._push(torque, force), self.model
         if not self.frames:
-            return np.array(pin.aba(model, self._dynamics, *self._at, push)), np.zeros(0)
+            return np.array(pin.aba(model, self._dynamics, *self._at, push))
         a = pin.constraintDynamics(
             model, self._dynamics, *self._at, push, self._constraints, self._found, self._proximal
         )
-        wrench = np.empty(6 * len(self.frames))
-        for k, i in enumerate(self.frames):
-            R = pin.updateFramePlacement(model, self.data, i).rotation
+        return np.array(a)
+
+    def wrenches(self) -> Array:
+        out = np.empty((len(self.frames), 6))
+        for k, placement in enumerate(self.placements()):
             local = self._found[k].contact_force
-            wrench[6 * k : 6 * k + 3] = R @ local.linear
-            wrench[6 * k + 3 : 6 * k + 6] = R @ local.angular
-        return np.array(a), wrench
+            out[k, :3] = placement.rotation @ local.linear
+            out[k, 3:] = placement.rotation @ local.angular
+        return out
+
+    def drift(self, a: Array) -> float:
+        """[m/s2] of the striking point along the normal at accelerations (nv), where it has been last."""
+        pin.forwardKinematics(self.model, self.data, *self._at, a)
+        found = pin.getFrameClassicalAcceleration(self.model, self.data, self.hand, _AXES)
+        return float(self.normal @ found.linear)
 
 
 FORMS: dict[str, type[Body]] = {"lagrange": DenseBody, "pinocchio": PinocchioBody}

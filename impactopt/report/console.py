@@ -13,8 +13,7 @@ from rich.status import Status
 from rich.table import Table
 
 from impactopt.errors import printable
-from impactopt.solvers.program import IterationRecord
-from impactopt.terminal.result_rows import (
+from impactopt.report.result_rows import (
     PHASES,
     Row,
     collision_rows,
@@ -23,6 +22,7 @@ from impactopt.terminal.result_rows import (
     result_columns,
     result_rows,
 )
+from impactopt.solvers.program import IterationRecord
 
 __all__ = [
     "Progress",

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from impactopt.storage.files import open_own
+from impactopt.codegen.files import open_own
 
 __all__ = [
     "UnsafePath",

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from impactopt.studies.bench.report import Say
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
+from impactopt.studies.report import Say
 
 if TYPE_CHECKING:
     from impactopt.pictures.style import Picture
@@ -63,7 +63,7 @@ def figures(
     """
     with plain_errors("interrupted before all figures were made") as console:
         from impactopt.files.output import make_directory, write_file
-        from impactopt.terminal.console import Progress
+        from impactopt.report.console import Progress
 
         wanted = chosen(names or [name for name, (how, _) in FIGURES.items() if how not in DEAR])
         directory = make_directory(out)
@@ -116,14 +116,14 @@ def _plot(problem: str, say: Say) -> Maker:
 
 
 def _reproduce(name: str, say: Say) -> Maker:
-    from impactopt.studies.reproduce.registry import reproduce
+    from impactopt.studies.registry import reproduce
 
     made = reproduce(name, say).figures
     return lambda figure: made[figure]()
 
 
 def _bench(name: str, say: Say) -> Maker:
-    from impactopt.studies.bench.registry import run_bench
+    from impactopt.studies.registry import run_bench
 
     made = run_bench(name, say).figures
     return lambda figure: made[figure]()

@@ -1,4 +1,4 @@
-"""What a bench gives, and how it is kept."""
+"""What a bench, or a table or figure of the paper, gives; its tables, and how it is kept."""
 
 from __future__ import annotations
 

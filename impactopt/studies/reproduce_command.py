@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from impactopt.studies.bench.running import show_reports
-from impactopt.terminal.plain_errors import plain_errors
+from impactopt.report.plain_errors import plain_errors
+from impactopt.studies.running import show_reports
 
 
 def reproduce(
@@ -30,8 +30,8 @@ def reproduce(
     done, 2 bad input.
     """
     with plain_errors("interrupted"):
-        from impactopt.studies.reproduce.registry import names_of
-        from impactopt.studies.reproduce.registry import reproduce as run
+        from impactopt.studies.registry import names_of
+        from impactopt.studies.registry import reproduce as run
 
         names = names_of(name)
     show_reports(

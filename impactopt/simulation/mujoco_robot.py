@@ -1,0 +1,81 @@
+"""The robot in MuJoCo, in Pinocchio's conventions: what replays and references move."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.robots.robot import Robot
+from impactopt.simulation.mujoco_world import mujoco_module
+
+__all__ = ["MujocoRobot"]
+
+Array = NDArray[np.float64]
+
+
+class MujocoRobot:
+    """A robot in a compiled MuJoCo model, struck at one of its sites.
+
+    world, data : MuJoCo's model and its data.  dof, place : where the joints' rates and angles are in qvel
+    and qpos.  site : of the striking point, and along (nv,): its Jacobian along the normal, where it has been
+    last.
+    """
+
+    def __init__(self, robot: Robot, world: Any, striker: str) -> None:
+        self.mujoco, self.robot, self.world = mujoco_module(), robot, world
+        self.data = self.mujoco.MjData(world)
+        self.floating = robot.floating
+        joints = [world.joint(name) for name in robot.joint_names]
+        self.dof = np.array([joint.dofadr[0] for joint in joints])
+        self.place = np.array([joint.qposadr[0] for joint in joints])
+        own = list(robot.model.joints)[-robot.n :]
+        self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
+        # a continuous joint's angle is (cosine, sine) in Pinocchio
+        self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
+        self.site = world.site(striker).id
+        self._rows, self.along = np.zeros((3, world.nv)), np.zeros(world.nv)
+
+    def put(self, q: Array, v: Array | None = None) -> None:
+        """Go to q (nq), v (nv; None: the rates stay); what depends on them is not computed yet."""
+        d, robot = self.data, self.robot
+        if self.floating:
+            d.qpos[:3], d.qpos[3:7] = q[:3], q[[6, 3, 4, 5]]
+        d.qpos[self.place] = robot.joint_positions(q)
+        if v is not None:
+            if self.floating:
+                d.qvel[:3], d.qvel[3:6] = self.base_rotation() @ v[:3], v[3:6]
+            d.qvel[self.dof] = v[-robot.n :]
+
+    def state(self) -> tuple[Array, Array]:
+        """q (nq), v (nv)."""
+        d, robot = self.data, self.robot
+        q, v = np.zeros(robot.nq), np.zeros(robot.nv)
+        if self.floating:
+            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
+            v[:3], v[3:6] = self.base_rotation().T @ d.qvel[:3], d.qvel[3:6]
+        angles = d.qpos[self.place]
+        q[self._place] = angles
+        for k in self._continuous:
+            at = self._place[k]
+            q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
+        v[-robot.n :] = d.qvel[self.dof]
+        return q, v
+
+    def base_rotation(self) -> Array:
+        """(3, 3) of a floating base."""
+        rotation = np.zeros(9)
+        self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
+        return rotation.reshape(3, 3)
+
+    def speed_along(self, normal: Array) -> float:
+        """Speed [m/s] of the striking point along a normal (3,); leaves its row in `along`."""
+        self.mujoco.mj_jacSite(self.world, self.data, self._rows, None, self.site)
+        self.along = normal @ self._rows
+        return float(self.along @ self.data.qvel)
+
+    def apply(self, torque: Array, force: float) -> None:
+        """Torque (n) [N m] at the joints, and the contact's force [N], which pushes against the normal."""
+        self.data.qfrc_applied[:] = -force * self.along
+        self.data.qfrc_applied[self.dof] += torque

@@ -16,15 +16,16 @@ from small_plans import changed
 
 from impactopt.bodies.shapes import face_axes
 from impactopt.errors import InputError
-from impactopt.problem.extra_terms import (
+from impactopt.problem.problem import Phase
+from impactopt.problem.terms import (
     Gaze,
     HandOrientation,
     HitCone,
     HitRegion,
+    Incidence,
+    Term,
     TorqueRate,
 )
-from impactopt.problem.problem import Phase
-from impactopt.problem.terms import Incidence, Term
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.plan import Plan

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.contact.custom import CustomLaw
+from impactopt.contact.laws import CustomLaw
 from impactopt.problem.terms import DEFAULT_TERMS
 from impactopt.robots.robot import Robot
 from impactopt.storage.hashing import canonical, model_hash

@@ -12,8 +12,7 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.nail import Nail
-from impactopt.contact.targets import FreeMass, Target
+from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.transcription.layout import Array
 

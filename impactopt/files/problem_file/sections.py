@@ -22,7 +22,7 @@ from impactopt.files.problem_file.contacts import Contact, Target
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.solver_sections import Solver
-from impactopt.files.problem_file.term_sections import Terms
+from impactopt.files.problem_file.term_sections import Objectives, Terms
 from impactopt.files.problem_file.values import (
     AtLeastOne,
     Duration,
@@ -37,7 +37,6 @@ from impactopt.files.problem_file.values import (
 )
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
 from impactopt.kinematics.stance import Stance as Stances
-from impactopt.problem import objectives
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Robot
@@ -160,59 +159,6 @@ class Objective(Section):
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         return _of_problem(cls)
-
-
-class Weighted(Section):
-    """A quantity that counts in what is maximized."""
-
-    weight: float = optional("what one unit of it is worth [N s a unit]")
-
-
-class Impulse(Weighted):
-    """The impulse to the target."""
-
-    kind = objectives.Impulse
-
-
-class PeakForce(Weighted):
-    """The largest contact force; a weight below zero keeps it small."""
-
-    kind = objectives.PeakForce
-
-
-class TargetEnergy(Weighted):
-    """What the target holds at separation, or has used up in what it was hit for."""
-
-    kind = objectives.TargetEnergy
-
-
-class Penetration(Weighted):
-    """The deepest penetration; a weight below zero keeps it small."""
-
-    kind = objectives.Penetration
-
-
-class AngularMomentum(Weighted):
-    """Cost: angular momentum after contact, squared."""
-
-    kind = objectives.AngularMomentum
-
-
-class Effort(Weighted):
-    """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints."""
-
-    kind = objectives.Effort
-
-
-class Objectives(Section):
-    """What is maximized; if there are any, only those that are given."""
-
-    impulse: Impulse = optional("")
-    peak_force: PeakForce = optional("")
-    target_energy: TargetEnergy = optional("")
-    penetration: Penetration = optional("")
-    angular_momentum: AngularMomentum = optional("")
-    effort: Effort = optional("")
 
 
 class File(Section):

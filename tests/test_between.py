@@ -10,6 +10,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from small_plans import BODILESS, Planned, changed
+from term_cases import MILD
 
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
@@ -31,9 +32,6 @@ from impactopt.problem.terms import (
     DEFAULT_TERMS,
     TERMS,
     ContactWrenchCone,
-    Gaze,
-    HandOrientation,
-    HitCone,
     HitRegion,
     Term,
     TorqueLimit,
@@ -154,11 +152,7 @@ ON_TOP: dict[str, Objective | Term] = {
     "energy": TargetEnergy(),
     "penetration": Penetration(weight=10.0),
     "effort": Effort(),
-    "torque rate": TorqueRate(limit=200.0),
-    "hand orientation": HandOrientation(axis=(0, 0, 1), angle=1.3),
-    "gaze": Gaze(frame="elbow", axis=(0, 0, 1), angle=0.5),
-    "hit region": HitRegion(radius=0.02),
-    "hit cone": HitCone(angle=0.2),
+    **{term.name: term for term in MILD.values()},
 }
 KINDS = {type(thing) for thing in ON_TOP.values()} | {Impulse, AngularMomentum}
 

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_robots import arm
+from term_cases import CASES
 from test_problem_file import ARM, write
 
 import impactopt
@@ -207,6 +208,14 @@ def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any],
     start = nailing.start_posture + turn
     problem = dataclasses.replace(nailing, start=start if turn > 0 else "ready", **changes)
     assert_same(back(write_problem(problem)), problem)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_terms_that_only_some_problems_have_come_back(nailing: ImpactProblem, name: str) -> None:
+    for term in (CASES[name].tight, CASES[name].mild):
+        problem = dataclasses.replace(nailing, terms=(term,))
+        assert_same(back(write_problem(problem)), problem)
+        assert back(write_problem(problem)).terms == (term,)
 
 
 def test_impacts_without_duration_and_one_foot_come_back() -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 
-from impactopt.kinematics.coordinates import StanceCoordinates
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
 
 __all__ = ["striker_kinematics"]
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from impactopt.bodies.shapes import face_axes
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import Place, millimetres
 from impactopt.storage.fields import about
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
 
 __all__ = ["HitRegion"]
 

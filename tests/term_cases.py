@@ -13,7 +13,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.problem.terms import Gaze, HandOrientation, HitCone, HitRegion, Term, TorqueRate
+from impactopt.problem.terms import (
+    Gaze,
+    HandOrientation,
+    HitCone,
+    HitRegion,
+    JointAcceleration,
+    Term,
+    TorqueRate,
+)
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
@@ -89,6 +97,15 @@ def hit_cone(plan: Solved, term: HitCone) -> float:
     return float(np.arccos(normal @ velocity / np.linalg.norm(velocity))) / term.angle
 
 
+def joint_acceleration(plan: Solved, term: JointAcceleration) -> float:
+    """Of the arm's joints, which are its spline: everywhere, not at the nodes alone."""
+    spline, of_all = plan.plan.swing, not isinstance(term.limit, dict)
+    joints = plan.transcription.robot.joint_names
+    limit = np.array([term.limit if of_all else term.limit.get(joint, np.inf) for joint in joints])
+    accelerations = spline.sample(np.linspace(0, spline.duration, 1001))[2]
+    return float((np.abs(accelerations) / limit).max())
+
+
 CASES: dict[str, Case] = {
     "torque rate": Case(TorqueRate(limit=20.0), TorqueRate(limit=30.0), TorqueRate(limit=200.0), torque_rate),
     "rate of some joints": Case(
@@ -110,6 +127,18 @@ CASES: dict[str, Case] = {
     ),
     "disc": Case(HitRegion(radius=0.02), HitRegion(radius=0.05), HitRegion(radius=0.02)),
     "rectangle": Case(HitRegion(size=(0.1, 0.02)), HitRegion(size=(0.1, 0.05)), HitRegion(radius=0.02)),
+    "joint acceleration": Case(
+        JointAcceleration(limit=40.0),
+        JointAcceleration(limit=50.0),
+        JointAcceleration(limit=200.0),
+        joint_acceleration,
+    ),
+    "acceleration of a joint": Case(
+        JointAcceleration(limit={"wrist": 20.0}),
+        JointAcceleration(limit={"wrist": 30.0}),
+        JointAcceleration(limit=200.0),
+        joint_acceleration,
+    ),
     "hit cone": Case(HitCone(angle=0.05), HitCone(angle=0.2), HitCone(angle=0.2), hit_cone),
 }
 # one of each kind, all of which a plan of the arm can have

@@ -12,6 +12,7 @@ from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.terms.hit_cone import HitCone
 from impactopt.problem.terms.hit_region import HitRegion
 from impactopt.problem.terms.incidence import Incidence
+from impactopt.problem.terms.joint_acceleration import JointAcceleration
 from impactopt.problem.terms.keep_out import KeepOut
 from impactopt.problem.terms.leg_extension import LegExtension
 from impactopt.problem.terms.position_limit import PositionLimit
@@ -39,6 +40,7 @@ TERMS: tuple[type[Term], ...] = (
     Gaze,
     HitRegion,
     HitCone,
+    JointAcceleration,
 )
 
 __all__ = [
@@ -51,6 +53,7 @@ __all__ = [
     "HitCone",
     "HitRegion",
     "Incidence",
+    "JointAcceleration",
     "KeepOut",
     "LegExtension",
     "PositionLimit",

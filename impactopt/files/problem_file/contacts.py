@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, ClassVar, Literal, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 from pydantic import ConfigDict, Field, create_model
 
@@ -12,19 +12,13 @@ from impactopt.bodies.shapes import TargetBody
 from impactopt.contact import laws, targets
 from impactopt.files.problem_file.described import one_of, section_of
 from impactopt.files.problem_file.section import Section, optional
-from impactopt.files.problem_file.values import Positive
 
 _FIRST_TARGET, _FIRST_LAW = targets.TARGETS[0].word, laws.LAWS[0].word  # of a file that names none
 TargetKind: Any = one_of(kind.word for kind in targets.TARGETS)
 LawKind: Any = one_of(kind.word for kind in laws.LAWS)
 
 
-class Body(Section):
-    """What the target looks like; its face's middle is the hit point."""
-
-    kind = TargetBody
-    shape: Literal["box", "ball", "none"] = optional("left out: what fits the target's kind")
-    size: list[Positive] = optional("of a box [across, up, deep], of a ball [diameter] [m]", "size_m")
+Body: Any = section_of(TargetBody)
 
 
 class Target(Section):

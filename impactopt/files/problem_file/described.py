@@ -55,12 +55,14 @@ def _value(hint: Any, told: About) -> Any:
         return Annotated[Any, PlainValidator(any_margin)]
     if told.choices:
         return one_of(told.choices)
+    bounds = {"gt": told.above, "ge": told.least, "le": told.most}
+    limits: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
+    if get_args(kind) == (float, ...):
+        return list[Annotated[float, Field(**limits)]]
     if get_origin(kind) is tuple:
         size = len(get_args(kind))
         numbers = Annotated[list[float], Field(min_length=size, max_length=size)]
         return Annotated[numbers, AfterValidator(unit_vector)] if told.direction else numbers
     if kind is float:
-        bounds = {"gt": told.above, "ge": told.least, "le": told.most}
-        given: dict[str, Any] = {name: bound for name, bound in bounds.items() if bound is not None}
-        return Annotated[float, Field(**given, allow_inf_nan=True if told.endless else None)]
+        return Annotated[float, Field(**limits, allow_inf_nan=True if told.endless else None)]
     return cast(Any, kind)

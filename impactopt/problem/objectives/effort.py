@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.objectives.base import WEIGHT, Objective
 
-__all__ = ["Effort"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Effort(Objective):

@@ -7,8 +7,6 @@ from typing import Any, ClassVar
 
 from impactopt.problem.objectives.base import WEIGHT, Objective
 
-__all__ = ["Impulse"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Impulse(Objective):

@@ -11,8 +11,6 @@ import numpy as np
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.objectives.base import WEIGHT, Objective
 
-__all__ = ["PeakForce"]
-
 TYPICAL = 100.0  # [N]
 
 

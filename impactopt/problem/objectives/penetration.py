@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 from impactopt.errors import InputError
 from impactopt.problem.objectives.base import WEIGHT, Objective
 
-__all__ = ["Penetration"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Penetration(Objective):

@@ -12,8 +12,6 @@ from impactopt.contact.targets.base import Target
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.objectives.base import WEIGHT, Objective
 
-__all__ = ["TargetEnergy"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TargetEnergy(Objective):

@@ -11,8 +11,6 @@ from impactopt.errors import InputError
 from impactopt.problem.terms.base import Term
 from impactopt.storage.fields import about
 
-__all__ = ["Balance"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Balance(Term):

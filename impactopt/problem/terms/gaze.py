@@ -18,8 +18,6 @@ from impactopt.storage.fields import about
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
-__all__ = ["Gaze"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Gaze(Term):

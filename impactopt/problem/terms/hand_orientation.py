@@ -17,8 +17,6 @@ from impactopt.storage.fields import about
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
-__all__ = ["HandOrientation"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class HandOrientation(Term):

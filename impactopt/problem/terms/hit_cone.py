@@ -18,7 +18,6 @@ from impactopt.storage.fields import about
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
-__all__ = ["HitCone"]
 
 TYPICAL = 1.0  # [m/s] of a strike
 

@@ -19,7 +19,6 @@ from impactopt.storage.fields import about
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
-__all__ = ["HitRegion"]
 
 REACH = 0.2  # [m] further off the replays' target has ended
 

@@ -17,8 +17,6 @@ from impactopt.storage.fields import about
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
 
-__all__ = ["JointAcceleration"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class JointAcceleration(Term):

@@ -13,8 +13,6 @@ from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
 from impactopt.storage.fields import about
 
-__all__ = ["TorqueRate"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueRate(Term):

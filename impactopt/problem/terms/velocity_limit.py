@@ -8,8 +8,6 @@ from typing import ClassVar
 from impactopt.problem.terms.base import Term
 from impactopt.storage.fields import about
 
-__all__ = ["VelocityLimit"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class VelocityLimit(Term):

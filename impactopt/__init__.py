@@ -12,68 +12,35 @@ __version__ = "0.1.0"
 
 # public name -> module that defines it
 _EXPORTS = {
-    "AngularMomentum": "problem.objectives",
-    "Balance": "problem.terms",
-    "Board": "contact.board",
     "BothSoles": "kinematics.stance",
     "CacheWarning": "errors",
     "Conditions": "simulation.conditions",
-    "ContactLaw": "contact.laws",
-    "ContactWrenchCone": "problem.terms",
-    "CustomLaw": "contact.custom",
-    "Effort": "problem.objectives",
     "FixedBase": "kinematics.stance",
-    "FreeMass": "contact.targets",
     "FullDynamics": "simulation.reference",
-    "Gaze": "problem.extra_terms",
-    "HandOrientation": "problem.extra_terms",
-    "HertzDamped": "contact.nonlinear",
-    "HitCone": "problem.extra_terms",
-    "HitRegion": "problem.extra_terms",
-    "HuntCrossley": "contact.nonlinear",
     "ImpactProblem": "problem.problem",
-    "Impulse": "problem.objectives",
-    "Incidence": "problem.terms",
     "InputError": "errors",
     "JointFriction": "collision",
-    "KeepOut": "problem.terms",
-    "KelvinVoigt": "contact.laws",
-    "LegExtension": "problem.terms",
     "MujocoDynamics": "simulation.reference",
-    "Nail": "contact.nail",
     "NoCompilerWarning": "errors",
-    "Objective": "problem.objectives",
     "Obstacle": "bodies.shapes",
     "OneSole": "kinematics.stance",
-    "PeakForce": "problem.objectives",
-    "Penetration": "problem.objectives",
     "Phase": "problem.problem",
     "Plan": "transcription.plan",
-    "PositionLimit": "problem.terms",
     "RigidBody": "rigid_body",
-    "RigidWall": "contact.targets",
     "Robot": "robots.robot",
     "Robustness": "simulation.robustness",
     "SDC": "collision",
     "Scenario": "problem.scenario",
-    "SelfCollision": "problem.terms",
     "Sole": "robots.robot",
     "Solution": "planning.solution",
     "Spread": "simulation.robustness",
-    "SpringDamper": "contact.laws",
     "Status": "solvers.program",
     "StrikeSolution": "planning.strike",
     "Striker": "robots.robot",
-    "Target": "contact.targets",
     "TargetBody": "bodies.shapes",
-    "TargetEnergy": "problem.objectives",
-    "Term": "problem.terms",
     "Terms": "collision",
     "Tool": "robots.robot",
-    "TorqueLimit": "problem.terms",
-    "TorqueRate": "problem.extra_terms",
     "Trajectory": "transcription.plan",
-    "VelocityLimit": "problem.terms",
     "VirtualMass": "collision",
     "animate": "report.solutions",
     "arm7": "robots.presets",
@@ -102,19 +69,34 @@ _EXPORTS = {
     "write_problem": "files.problem_file",
 }
 
-__all__ = ["__version__", *sorted(_EXPORTS)]
+# families of one class a file: the classes that their packages list
+_FAMILIES = ("contact.laws", "contact.targets", "problem.objectives", "problem.terms")
+
+
+def _all_exports() -> dict[str, str]:
+    """Public name -> module, those of the families too, which are imported for it."""
+    found = dict(_EXPORTS)
+    for module in _FAMILIES:
+        family = importlib.import_module(f"impactopt.{module}")
+        found |= {name: module for name in family.__all__ if isinstance(getattr(family, name), type)}
+    return found
 
 
 def __getattr__(name: str) -> Any:
-    module = _EXPORTS.get(name)
+    if name == "__all__":
+        return ["__version__", *sorted(_all_exports())]
+    exports = _EXPORTS
+    if name not in exports and name[:1].isupper():  # else it is a module of the package, or nothing
+        exports = _all_exports()
+    module = exports.get(name)
     if module is None:
         from impactopt.errors import did_you_mean
 
-        raise AttributeError(f"module 'impactopt' has no attribute {name!r}{did_you_mean(name, _EXPORTS)}")
+        raise AttributeError(f"module 'impactopt' has no attribute {name!r}{did_you_mean(name, exports)}")
     value = getattr(importlib.import_module(f"impactopt.{module}"), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_EXPORTS})
+    return sorted({*globals(), *_all_exports()})

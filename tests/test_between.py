@@ -10,19 +10,14 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from small_plans import BODILESS, Planned, changed
+from term_cases import MILD
 
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.planning import planner
-from impactopt.problem.extra_terms import (
-    Gaze,
-    HandOrientation,
-    HitCone,
-    HitRegion,
-    TorqueRate,
-)
 from impactopt.problem.objectives import (
+    OBJECTIVES,
     AngularMomentum,
     Effort,
     Impulse,
@@ -33,7 +28,15 @@ from impactopt.problem.objectives import (
 )
 from impactopt.problem.problem import Phase
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import ContactWrenchCone, Term, TorqueLimit
+from impactopt.problem.terms import (
+    DEFAULT_TERMS,
+    TERMS,
+    ContactWrenchCone,
+    HitRegion,
+    Term,
+    TorqueLimit,
+    TorqueRate,
+)
 from impactopt.simulation.result import distance_inside
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import solve_sqp
@@ -149,24 +152,14 @@ ON_TOP: dict[str, Objective | Term] = {
     "energy": TargetEnergy(),
     "penetration": Penetration(weight=10.0),
     "effort": Effort(),
-    "torque rate": TorqueRate(limit=200.0),
-    "hand orientation": HandOrientation(axis=(0, 0, 1), angle=1.3),
-    "gaze": Gaze(frame="elbow", axis=(0, 0, 1), angle=0.5),
-    "hit region": HitRegion(radius=0.02),
-    "hit cone": HitCone(angle=0.2),
+    **{term.name: term for term in MILD.values()},
 }
 KINDS = {type(thing) for thing in ON_TOP.values()} | {Impulse, AngularMomentum}
 
 
 def test_all_objectives_and_extra_terms_are_tried_here() -> None:
     """The biped's test below has the angular momentum."""
-    known = {*Objective.__subclasses__(), *Term.__subclasses__()}
-    ours = {
-        kind
-        for kind in known
-        if kind.__module__ in ("impactopt.problem.objectives", "impactopt.problem.extra_terms")
-    }
-    assert ours == KINDS
+    assert {*OBJECTIVES, *TERMS} - {*map(type, DEFAULT_TERMS)} == KINDS
 
 
 def with_more(t: Transcription, *things: Objective | Term, **changes: Any) -> Transcription:

@@ -16,15 +16,14 @@ from small_plans import changed
 from impactopt.errors import InputError
 from impactopt.files.problem_file import write_problem
 from impactopt.planning.strike import optimize_strike
-from impactopt.problem.extra_terms import Gaze
 from impactopt.problem.objectives import Effort, Impulse, Objective
-from impactopt.problem.terms import Term, TorqueLimit
+from impactopt.problem.terms import Gaze, Term, TorqueLimit
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
 from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription.blocks import make_block
+from impactopt.transcription.extra_blocks import key_of
 from impactopt.transcription.objective import Quantity
-from impactopt.transcription.own_blocks import key_of
 from impactopt.transcription.rows import millimetres
 from impactopt.transcription.start import first_iterate, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription

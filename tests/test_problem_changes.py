@@ -25,7 +25,7 @@ from impactopt.files.problem_file import (
     read_toml,
     write_toml,
 )
-from impactopt.problem import extra_terms, objectives, terms
+from impactopt.problem import objectives, terms
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.robot import Striker
@@ -302,8 +302,8 @@ def test_what_python_can_say_a_file_can_too(problem: ImpactProblem) -> None:
 
 
 def test_all_that_is_wrong_with_a_problem_is_said_at_once(problem: ImpactProblem) -> None:
-    gaze = extra_terms.Gaze(frame="heed", axis=(1, 0, 0))
-    rate = extra_terms.TorqueRate(limit={"elbo": 1.0, "wrst": 1.0})
+    gaze = terms.Gaze(frame="heed", axis=(1, 0, 0))
+    rate = terms.TorqueRate(limit={"elbo": 1.0, "wrst": 1.0})
     with pytest.raises(InputError) as caught:
         dataclasses.replace(
             problem,

@@ -25,27 +25,19 @@ from impactopt.contact import (
     RigidWall,
     SpringDamper,
 )
+from impactopt.contact.laws import LAWS
+from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.files.problem_file.mistakes import key_lines
 from impactopt.files.problem_file.section import Section, attribute_docs
 from impactopt.kinematics.stance import FixedBase, OneSole
-from impactopt.problem import extra_terms, objectives, terms
+from impactopt.problem import objectives, terms
 from impactopt.problem.problem import COLLISIONS, ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Tool
 from impactopt.solvers.sqp import SQPOptions
 
-TARGETS_AND_LAWS = (
-    Board,
-    FreeMass,
-    HertzDamped,
-    HuntCrossley,
-    KelvinVoigt,
-    Nail,
-    RigidWall,
-    SpringDamper,
-)
 PUNCH = Path(__file__).parents[1] / "problems" / "punch.toml"
 
 GOOD = """\
@@ -276,14 +268,14 @@ def test_extra_terms_reach_the_problem(tmp_path: Path) -> None:
     assert problem.terms == (
         terms.SelfCollision(margin=0.03),
         terms.KeepOut(enabled=False),
-        extra_terms.TorqueRate(limit={"arm_right_4_joint": 300}),
-        extra_terms.HandOrientation(axis=(0, 0, 1), direction=(0, 0, -1), angle=0.3),
-        extra_terms.Gaze(frame="head_2_link", axis=(1, 0, 0), angle=0.4, since=0.2),
-        extra_terms.HitRegion(size=(0.1, 0.2)),
-        extra_terms.HitCone(angle=0.15),
+        terms.TorqueRate(limit={"arm_right_4_joint": 300}),
+        terms.HandOrientation(axis=(0, 0, 1), direction=(0, 0, -1), angle=0.3),
+        terms.Gaze(frame="head_2_link", axis=(1, 0, 0), angle=0.4, since=0.2),
+        terms.HitRegion(size=(0.1, 0.2)),
+        terms.HitCone(angle=0.15),
     )
     disc = load_problem(write(tmp_path, GOOD + "[terms.hit_region]\nradius_m = 0.05\n"))
-    assert disc.terms == (extra_terms.HitRegion(radius=0.05),)
+    assert disc.terms == (terms.HitRegion(radius=0.05),)
 
 
 WORLD = """
@@ -403,14 +395,7 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
         return [section, *(s for inner in section.__subclasses__() for s in below(inner))]
 
     kinds = {section.kind: section for section in below(Section) if section.kind is not None}
-    for term in terms.DEFAULT_TERMS:
-        assert type(term) in kinds
-        assert {f.name for f in dataclasses.fields(term)} == set(kinds[type(term)].model_fields)
-    extra = [kind for kind in terms.Term.__subclasses__() if kind.__module__ == extra_terms.__name__]
-    assert len(extra) == 5
-    extra += [terms.SelfCollision, terms.KeepOut]
-    aims = [kind for kind in objectives.Objective.__subclasses__() if kind.__module__ == objectives.__name__]
-    described = (*aims, *extra, Obstacle, TargetBody, *TARGETS_AND_LAWS)
+    described = (*objectives.OBJECTIVES, *terms.TERMS, Obstacle, TargetBody, *LAWS, *TARGETS)
     for kind in (Phase, Scenario, Tool, *described):
         keys = set(kinds[kind].model_fields) - {kinds[kind].choice, *kinds[kind].apart}
         assert {f.name for f in dataclasses.fields(kind)} == keys

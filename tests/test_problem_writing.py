@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from small_robots import arm
+from term_cases import CASES
 from test_problem_file import ARM, write
 
 import impactopt
@@ -32,7 +33,7 @@ from impactopt.files.problem_file.reference import reference
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.template import problem_template
 from impactopt.kinematics.stance import FixedBase, OneSole
-from impactopt.problem import extra_terms, objectives, terms
+from impactopt.problem import objectives, terms
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
@@ -124,18 +125,18 @@ TERMS: dict[str, st.SearchStrategy[Any]] = {
     "balance": st.builds(
         terms.Balance, capture_margin=SMALL | st.none(), vertical_speed=ANY, angular_momentum=ANY
     ),
-    "direction": st.builds(terms.Incidence, speed=ANY) | st.builds(extra_terms.HitCone, angle=SMALL),
+    "direction": st.builds(terms.Incidence, speed=ANY) | st.builds(terms.HitCone, angle=SMALL),
     "legs": st.builds(terms.LegExtension, minimum=st.floats(0, 1)),
     "rate": st.builds(
-        extra_terms.TorqueRate,
+        terms.TorqueRate,
         limit=POSITIVE | st.dictionaries(st.sampled_from(["elbow", "wrist"]), POSITIVE),
     ),
     "self": st.builds(terms.SelfCollision, margin=SMALL, enabled=st.booleans()),
     "keep": st.builds(terms.KeepOut, margin=SMALL, enabled=st.booleans()),
-    "hand": st.builds(extra_terms.HandOrientation, axis=AXES, direction=st.none() | AXES, angle=SMALL),
-    "gaze": st.builds(extra_terms.Gaze, frame=st.just("elbow"), axis=AXES, angle=SMALL, since=FRACTION),
-    "region": st.builds(extra_terms.HitRegion, radius=st.floats(0.01, 0.19))
-    | st.builds(extra_terms.HitRegion, size=st.tuples(st.floats(0.01, 0.1), st.floats(0.01, 0.1))),
+    "hand": st.builds(terms.HandOrientation, axis=AXES, direction=st.none() | AXES, angle=SMALL),
+    "gaze": st.builds(terms.Gaze, frame=st.just("elbow"), axis=AXES, angle=SMALL, since=FRACTION),
+    "region": st.builds(terms.HitRegion, radius=st.floats(0.01, 0.19))
+    | st.builds(terms.HitRegion, size=st.tuples(st.floats(0.01, 0.1), st.floats(0.01, 0.1))),
 }
 WEIGHT = st.floats(-9, 9).filter(lambda w: w != 0)
 OBJECTIVES = st.lists(
@@ -207,6 +208,14 @@ def test_any_problem_comes_back(nailing: ImpactProblem, changes: dict[str, Any],
     start = nailing.start_posture + turn
     problem = dataclasses.replace(nailing, start=start if turn > 0 else "ready", **changes)
     assert_same(back(write_problem(problem)), problem)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_terms_that_only_some_problems_have_come_back(nailing: ImpactProblem, name: str) -> None:
+    for term in (CASES[name].tight, CASES[name].mild):
+        problem = dataclasses.replace(nailing, terms=(term,))
+        assert_same(back(write_problem(problem)), problem)
+        assert back(write_problem(problem)).terms == (term,)
 
 
 def test_impacts_without_duration_and_one_foot_come_back() -> None:

@@ -23,10 +23,17 @@ from impactopt.files.problem_file import ProblemFile
 from impactopt.kinematics.support import support_polygon
 from impactopt.planning.planner import solve
 from impactopt.planning.strike import StrikeSolution, optimize_strike
-from impactopt.problem.extra_terms import HitCone, HitRegion, TorqueRate
 from impactopt.problem.objectives import AngularMomentum, Effort, Impulse, PeakForce
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import Balance, Incidence, TorqueLimit, VelocityLimit
+from impactopt.problem.terms import (
+    Balance,
+    HitCone,
+    HitRegion,
+    Incidence,
+    TorqueLimit,
+    TorqueRate,
+    VelocityLimit,
+)
 from impactopt.simulation.reference import FullDynamics
 from impactopt.solvers.program import Status, check_program
 from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
+from impactopt.storage.fields import Described, about
 
 Vector = tuple[float, float, float]
 
@@ -19,22 +20,25 @@ def vector(name: str, value: Sequence[float]) -> Vector:
     return x, y, z
 
 
+TARGET_SHAPES = ("box", "ball", "none")
+
+
 @dataclass(frozen=True, kw_only=True)
-class TargetBody:
-    """What the target looks like to everything but the striking point: its face's middle is the hit point.
+class TargetBody(Described):
+    """What the target looks like; its face's middle is the hit point.
 
-    shape : "box", "ball" or "none"; None: what fits the target, a box of 18 cm for a free mass, a wall of 1.5
-        x 1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x 6 cm.
-    size [m] : (across, up, deep) of a box, of the board or of the nail's block; (diameter,) of a ball; None:
-        those.
-
-    Raises
-    ------
-    InputError : an unknown shape, lengths that are not positive or too many.
+    To everything but the striking point. What fits the target's kind is a box of 18 cm for a free mass, a
+    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x
+    6 cm. A size is that of the board or of the nail's block; None: those.
     """
 
-    shape: str | None = None
-    size: tuple[float, ...] | None = None
+    shape: str | None = field(
+        default=None, metadata=about("left out: what fits the target's kind", choices=TARGET_SHAPES)
+    )
+    size: tuple[float, ...] | None = field(
+        default=None,
+        metadata=about("of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
+    )
 
     def __post_init__(self) -> None:
         if self.shape is not None and not (isinstance(self.shape, str) and self.shape in TARGET_SHAPES):
@@ -54,28 +58,23 @@ class TargetBody:
         object.__setattr__(self, "size", tuple(size.tolist()))
 
 
-TARGET_SHAPES = ("box", "ball", "none")
-
-
 @dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """A box or a capsule that nothing of the robot may touch, fixed in the world.
+class Obstacle(Described):
+    """A box or a capsule that nothing of the robot may touch.
 
-    size (3,) [m] : the sides of a box about ``position`` (3,) [m], turned by ``rpy`` [rad] about x, y and z.
-    start, end (3,) [m], radius [m] : of a capsule in their place; without an end, a sphere.
-
-    Raises
-    ------
-    InputError : neither of them, or both; lengths that are not positive.
+    It is fixed in the world: a box of a size about a position, or a capsule of a radius from start to end.
+    Neither of them, or both, is an InputError.
     """
 
-    name: str
-    size: Vector | None = None
-    position: Vector = (0.0, 0.0, 0.0)
-    rpy: Vector = (0.0, 0.0, 0.0)
-    start: Vector | None = None
-    end: Vector | None = None
-    radius: float = 0.0
+    name: str = field(metadata=about("what reports call it"))
+    size: Vector | None = field(default=None, metadata=about("sides of a box", unit="m"))
+    position: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("middle of the box, world", unit="m"))
+    rpy: Vector = field(
+        default=(0.0, 0.0, 0.0), metadata=about("turns of the box about x, y and z", unit="rad")
+    )
+    start: Vector | None = field(default=None, metadata=about("of a capsule's axis, world", unit="m"))
+    end: Vector | None = field(default=None, metadata=about("of its axis; left out: a sphere", unit="m"))
+    radius: float = field(default=0.0, metadata=about("of the capsule", unit="m", above=0))
 
     def __post_init__(self) -> None:
         where = f"obstacle {self.name!r}"

@@ -14,9 +14,7 @@ from impactopt.bodies.fit import Planes, enclose
 from impactopt.bodies.shapes import Obstacle, TargetBody, face_axes
 from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
-from impactopt.contact.board import Board
-from impactopt.contact.nail import Nail
-from impactopt.contact.targets import RigidWall, Target
+from impactopt.contact.targets import Board, Nail, RigidWall, Target
 
 __all__ = ["BEHIND", "WorldBody", "ground", "obstacle_bodies", "target_bodies"]
 

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.errors import MOST, InputError, check_array
+from impactopt.contact.fields import abouts
 
 Parameters = Mapping[str, Any]
 
@@ -41,18 +42,19 @@ def numbers_of(instance: Any) -> dict[str, float]:
     return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
 
 
-def positive(name: str, value: Any, *, zero: bool = False) -> float:
-    """`value` as a float; InputError unless it is one number > 0 (or >= 0 where `zero`), neither too large
-    nor so small that what is divided by it is.
+def check_numbers(instance: Any) -> None:
+    """InputError unless all numbers of a law or a target are such, and in their ranges.
+
+    None may be too large, or so small that what is divided by it is.
     """
-    number = float(check_array(name, value, (), most=MOST))
-    if number < 0 or (number == 0 and not zero):
-        raise InputError(f"{name}: {number:g}; give a number {'>= 0' if zero else '> 0'}")
-    if 0 < number < 1 / MOST:
-        raise InputError(
-            f"{name}: {number:g}; give {'0, or ' if zero else ''}a number of at least {1 / MOST:g}"
-        )
-    return number
+    for field, told in abouts(type(instance)):
+        name = f"{type(instance).__name__}: {field.name}" + (f" [{told.unit}]" if told.unit else "")
+        number = float(check_array(name, getattr(instance, field.name), (), most=MOST))
+        if not told.allows(number):
+            raise InputError(f"{name}: {number:g}; give a number {told.range}")
+        if 0 < number < 1 / MOST:
+            zero = "0, or " if told.allows(0.0) else ""
+            raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")
 
 
 def text_of(expressions: Sequence[Any]) -> str:

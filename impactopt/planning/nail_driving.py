@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from impactopt.contact.nail import Nail
+from impactopt.contact.targets import Nail
 from impactopt.errors import InputError, check_array
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution

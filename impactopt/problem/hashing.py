@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.codegen.hashing import canonical, model_hash
-from impactopt.contact.custom import CustomLaw
+from impactopt.contact.laws import CustomLaw
 from impactopt.problem.terms import DEFAULT_TERMS
 from impactopt.robots.robot import Robot
 

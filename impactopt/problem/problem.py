@@ -31,12 +31,13 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import reach
 from impactopt.kinematics.stance import BothSoles, Stance
 from impactopt.problem.checks import COLLISIONS, check_apart, check_at_rest, check_collision, check_names
-from impactopt.problem.extra_terms import HandOrientation, HitCone
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
+    HandOrientation,
+    HitCone,
     Incidence,
     KeepOut,
     SelfCollision,

@@ -2,62 +2,63 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 from impactopt.contact.factors import scaled_numbers
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import MOST, InputError, check_array, check_name
+from impactopt.contact.fields import Described, about, abouts
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scenario:
-    """A target that differs from the expected one: the same swing has to be safe with it too.
+class Scenario(Described):
+    """What else may happen, and has to be survived with the same swing.
 
-    The impulse to the expected target is what is maximized; in a scenario the collision's rows (torque,
-    wrench cones) and the balance after it hold, with margins of their own, under the same reference and
-    servo.
-
-    Attributes
-    ----------
-    name : for reports.
-    mass, stiffness, damping : factors of the target's mass and the contact's numbers.
-    missing : there is nothing to hit; what the robot has at contact it has to stop by itself.
-    brake_after [s] : with ``missing``: a robot that has felt nothing by then after the planned contact goes
-        on to a motion to rest that is planned with the swing, not to the follow-through of a blow that was
-        none; None: it feels nothing.
-    torque : fraction of each joint's limit in the collision.
-    cone_margin [m] : of each sole's CoP in the collision.
-    capture_margin [m] : of the capture point after it; with ``missing``, of that at contact.
-
-    Raises
-    ------
-    InputError : no name; a factor that is not positive (damping: negative), a negative margin; ``missing``
-        with numbers of a collision.
+    A target that differs from the expected one. The impulse to the expected target is what is maximized; in a
+    scenario the collision's rows (torque, wrench cones) and the balance after it hold, with margins of their
+    own, under the same reference and servo. Where there is nothing to hit, what the robot has at contact it
+    has to stop by itself: the margin of balance is that at contact, and a robot that brakes goes on to a
+    motion to rest that is planned with the swing, not to the follow-through of a blow that was none.
     """
 
-    name: str
-    mass: float = 1.0
-    stiffness: float = 1.0
-    damping: float = 1.0
-    missing: bool = False
-    brake_after: float | None = None
-    torque: float = 1.0
-    cone_margin: float = 0.005
-    capture_margin: float = 0.0
+    name: str = field(metadata=about("what reports call it"))
+    mass: float = field(
+        default=1.0, metadata=about("of the target, as a factor of the expected one", above=0)
+    )
+    stiffness: float = field(default=1.0, metadata=about("of the contact, as a factor", above=0))
+    damping: float = field(default=1.0, metadata=about("of the contact, as a factor", least=0))
+    missing: bool = field(default=False, metadata=about("there is nothing to hit"))
+    brake_after: float | None = field(
+        default=None,
+        metadata=about(
+            "when a robot that has felt nothing goes on to a stop planned for that", unit="s", above=0
+        ),
+    )
+    torque: float = field(
+        default=1.0, metadata=about("fraction of each joint's limit in the collision", above=0)
+    )
+    cone_margin: float = field(
+        default=0.005,
+        metadata=about(
+            "from each sole's centre of pressure to its edges in the collision", unit="m", least=0
+        ),
+    )
+    capture_margin: float = field(
+        default=0.0,
+        metadata=about("from the capture point to the support polygon's edges, after it", unit="m", least=0),
+    )
 
     def __post_init__(self) -> None:
         check_name("a scenario", self.name)
         where = f"scenario {self.name!r}"
-        for f in fields(self)[1:]:
+        for f, told in list(abouts(type(self)))[1:]:
             value = getattr(self, f.name)
             if value is None and f.default is None:
                 continue
-            if not check_array(f"{where}: {f.name}", value, (), most=MOST) >= 0:
-                raise InputError(f"{where}: {f.name} is {value:g}; give a number >= 0")
-        for name in ("mass", "stiffness", "torque"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{where}: {name} is {getattr(self, name):g}; give a number > 0")
+            number = check_array(f"{where}: {f.name}", value, (), most=MOST)
+            if f.name != "brake_after" and not told.allows(float(number)):
+                raise InputError(f"{where}: {f.name} is {value:g}; give a number {told.range}")
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
         unused = [name for name in changed if name not in ("missing", "brake_after", "capture_margin")]
         if self.missing and unused:

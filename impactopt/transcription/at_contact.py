@@ -11,17 +11,16 @@ import numpy as np
 
 from impactopt.kinematics.support import support_polygon
 from impactopt.kinematics.wrench_cone import inward_edges
-from impactopt.problem.extra_terms import HitCone, HitRegion
 from impactopt.problem.objectives import AngularMomentum, Objective
-from impactopt.problem.terms import Term
+from impactopt.problem.terms import HitCone, HitRegion, Term
 from impactopt.transcription.apart import ApartRow, Held, add_apart_rows
+from impactopt.transcription.blocks import DEPTH_SCALE
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.extra_terms import add_extra_terms
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh
-from impactopt.transcription.objective import Prices, assemble, quantities
+from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.plan import PlannedScenario
 from impactopt.transcription.rows import Index, Measure, Place, Rank, millimetres, percent
 from impactopt.transcription.structured import StructuredProgram
@@ -154,7 +153,7 @@ class ContactProgram(Builder):
         at = {name: self.add_block(name, slots[name], np.array(parameters[name])) for name in slots}
         sizes = {block.name: block.n_out for block in self.blocks}
         if isinstance(self.expected, Collision):
-            self.deepest = (
+            self._deepest = (
                 at["force"] + self.expected.end[-2] * sizes["force"] + self.parts("force")["penetration"]
             )
         for collision, index in zip(self.collisions, first, strict=True):
@@ -242,8 +241,10 @@ class ContactProgram(Builder):
         return out
 
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
-        """Rows of the extra ones among these terms, the objective, and the program."""
-        add_extra_terms(self, terms)
+        """Rows that these terms bring, the objective, and the program."""
+        for term in terms:
+            if type(term).add_rows is not Term.add_rows:  # those of the others are there
+                term.add_rows(self)
         self.objectives = quantities(self, objectives)
         self._worth = assemble(self.layout, self.objectives, self._prices())
         self.apart_rows: Mapping[ApartRow, Held] = {}
@@ -272,6 +273,15 @@ class ContactProgram(Builder):
         other.apart_rows = dict(rows)
         add_apart_rows(other, other.apart_rows)
         return other
+
+    # ------------------------------------------------------------------ for objectives
+    def deepest_penetration(self) -> Affine:
+        """[m], of a contact that lasts: at the end of compression, as a variable."""
+        return self.lift("deepest penetration", self._deepest)[0] * DEPTH_SCALE
+
+    def squares(self, group: Group) -> Quantity:
+        """The sum of the squares of a group's variables, in physical units."""
+        return Quantity(Affine.zeros(1), group)
 
     # ------------------------------------------------------------------ structure
     def _determined(self) -> list[tuple[Rank, Index]]:

@@ -8,7 +8,6 @@ derivatives in the phase's own s in [0, 1], so ydot = y'/T and yddot = y''/T^2.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -17,49 +16,24 @@ import numpy as np
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.transcription.lanes import LANES
+from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.problem.block import BlockExpression, make_block
+
+__all__ = [
+    "DEPTH_SCALE",
+    "FORCE_SCALE",
+    "RESTITUTING",
+    "BlockExpression",
+    "builders",
+    "make_block",
+    "sizes",
+    "two_mass_restitution",
+    "typical_state",
+]
 
 FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
 DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
 RESTITUTING = 6  # which parameter of `force` says so
-
-
-@dataclass(frozen=True)
-class BlockExpression:
-    """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``.
-
-    through : numbers that ``out`` is written with, and what they are of (z, p).  lanes : of `in_lanes`, about
-        as many as there are instances.
-    """
-
-    z: Any
-    p: Any
-    out: Any
-    sizes: dict[str, int]
-    through: tuple[Any, Any] | None = None
-    lanes: int = LANES
-
-
-def make_block(
-    z: list[Any],
-    p: list[Any],
-    out: dict[str, Any],
-    through: list[tuple[Any, Any]] | None = None,
-    lanes: int = LANES,
-) -> BlockExpression:
-    """A block from parts of z and of p, and the named slices of its output.
-
-    through : numbers that it is written with, in place of an expression of z and p each.
-    """
-    inner = None if through is None else tuple(ca.vertcat(*parts) for parts in zip(*through, strict=True))
-    return BlockExpression(
-        ca.vertcat(*z),
-        ca.vertcat(*p),
-        ca.vertcat(*out.values()),
-        {k: int(v.numel()) for k, v in out.items()},
-        inner,
-        lanes,
-    )
 
 
 def sizes(c: StanceCoordinates, target: Target, block: str) -> dict[str, int]:
@@ -151,17 +125,6 @@ def approach(c: StanceCoordinates, striker: str) -> BlockExpression:
     q, v, _ = c.upper_motion(y, zero, zero)
     point = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
     return make_block([y], [normal], {"along": ca.dot(normal, point)})
-
-
-def striker_kinematics(c: StanceCoordinates, striker: str) -> Any:
-    """CasADi function (q, v, a) -> point [m], velocity [m/s], acceleration [m/s^2] of the striking point.
-
-    World axes.
-    """
-    rb, frame = c.rb, f"striker:{striker}"
-    _, point = rb.frame(frame)
-    outs = [point, rb.frame_velocity(frame, rb.v)[:3], rb.frame_acceleration(frame, rb.v, rb.a)[:3]]
-    return ca.Function("striker", [rb.q, rb.v, rb.a], outs)
 
 
 def coasting(c: StanceCoordinates) -> BlockExpression:

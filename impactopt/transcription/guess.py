@@ -11,8 +11,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from impactopt.contact.laws import ContactLaw
-from impactopt.contact.nail import Nail
-from impactopt.contact.targets import FreeMass, Target
+from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
 from impactopt.transcription.layout import Array

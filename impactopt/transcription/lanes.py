@@ -13,12 +13,10 @@ from itertools import pairwise, zip_longest
 import casadi as ca
 
 from impactopt.codegen.library import NativeCode
+from impactopt.problem.block import LANES
 
-__all__ = ["LANES", "in_lanes"]
+__all__ = ["in_lanes"]
 
-# of any CPU: where its vectors are narrower, the compiler takes several. Fewer, a power of two, for functions
-# of few instances: lanes that are idle cost as much as the others, in memory between the caches above all
-LANES = 8
 # a compiler takes more than linear time for a long function: it gets parts of so many operations
 _PART = 500
 # what runs one after the other stands one after the other

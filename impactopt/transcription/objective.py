@@ -7,7 +7,6 @@ is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,21 +14,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.errors import InputError
-from impactopt.kinematics.statics import static_wrenches
-from impactopt.problem.objectives import (
-    AngularMomentum,
-    Effort,
-    Impulse,
-    Objective,
-    PeakForce,
-    Penetration,
-    TargetEnergy,
-)
-from impactopt.problem.terms import kind_of
-from impactopt.transcription.blocks import DEPTH_SCALE, FORCE_SCALE
-from impactopt.transcription.collision import Collision
+from impactopt.problem.objectives import Objective
 from impactopt.transcription.layout import Affine, Array, Group, Layout, stack
-from impactopt.transcription.plan import complete_reference
 
 if TYPE_CHECKING:
     from impactopt.transcription.at_contact import ContactProgram
@@ -55,9 +41,7 @@ def quantities(t: ContactProgram, objectives: tuple[Objective, ...]) -> list[tup
 
 
 def _quantity(t: ContactProgram, objective: Objective) -> Quantity:
-    if type(objective).quantity is Objective.quantity:
-        return _QUANTITIES[kind_of(objective, Objective)](t)
-    found = objective.quantity(t)  # a user's own
+    found = objective.quantity(t)
     whole = found if isinstance(found, Quantity) else Quantity(found)
     if not isinstance(whole.affine, Affine) or whole.affine.size != 1:
         raise InputError(
@@ -65,72 +49,6 @@ def _quantity(t: ContactProgram, objective: Objective) -> Quantity:
             "program.swing_T[0], or an impactopt.transcription.objective.Quantity"
         )
     return whole
-
-
-def _impulse(t: ContactProgram) -> Quantity:
-    return Quantity(t.expected.impulse)
-
-
-def _peak_force(t: ContactProgram) -> Quantity:
-    hit = t.expected
-    assert isinstance(hit, Collision)  # the problem is refused otherwise
-    forces = hit.f
-    at = t.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
-    return Quantity(t.lift("peak force", np.array([at]))[0] * FORCE_SCALE)
-
-
-def _target_energy(t: ContactProgram) -> Quantity:
-    numbers = np.array(list(t.problem.target.parameters.values()))
-    at = t.add_block("energy", [[t.expected.target_state]], numbers)
-    return Quantity(t.lift("target energy", np.array([at]))[0])
-
-
-def _penetration(t: ContactProgram) -> Quantity:
-    return Quantity(t.lift("deepest penetration", t.deepest)[0] * DEPTH_SCALE)
-
-
-def _angular_momentum(t: ContactProgram) -> Quantity:
-    assert t.angular_momentum is not None
-    return Quantity(Affine.zeros(1), t.angular_momentum)
-
-
-def _effort(t: Transcription) -> Quantity:
-    """T sum(tau^2) at each node is a variable; their sum is the trapezoidal rule's."""
-    swing, follow = len(t.swing_nodes), len(t.follow_nodes)
-    durations = [t.swing_T] * swing + [t.follow.T] * follow
-    slots = [[tau, T[0]] for tau, T in zip(t.torques, durations, strict=False)]
-    at = t.add_block("effort", slots, np.zeros(0))
-    places = [*map(t.swing_place, t.swing_nodes), *map(t.follow.place_at, t.follow_nodes)]
-    labels = [place.name for place in places]  # by which a program with more nodes finds them again
-    of_node = t.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
-    first, *of_swing = trapezoid(np.concatenate([[0.0], t.swing_nodes]))
-    weights = np.array([*of_swing, *trapezoid(t.follow_nodes)])
-    start = first * float(np.sum(start_torque(t) ** 2))
-    return Quantity(of_node.apply(weights[None]) + t.swing_T[0] * start)
-
-
-_QUANTITIES: dict[type[Objective], Callable[[Any], Quantity]] = {
-    Impulse: _impulse,
-    PeakForce: _peak_force,
-    TargetEnergy: _target_energy,
-    Penetration: _penetration,
-    AngularMomentum: _angular_momentum,
-    Effort: _effort,
-}
-
-
-def trapezoid(nodes: Array) -> Array:
-    """Weights (k,) of the trapezoidal rule on ascending nodes (k,)."""
-    half = np.diff(nodes) / 2
-    return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
-
-
-def start_torque(t: Transcription) -> Array:
-    """Torque over limit (n,) at rest in the start posture."""
-    c, rest = t.coordinates, np.zeros((1, t.ny))
-    wrench = static_wrenches(c, t.y0, t.legs0)[None]
-    torque = complete_reference(t.problem, t.y0[None], rest, rest, wrench, t.legs0)[3][0]
-    return np.asarray(torque / t.robot.torque_limit)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,23 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.problem.violation import Measure, Place, degrees, millimetres, percent
 from impactopt.transcription.layout import Affine, Array
+
+__all__ = [
+    "Index",
+    "Measure",
+    "Place",
+    "Rank",
+    "Row",
+    "Rows",
+    "along",
+    "by_leg",
+    "degrees",
+    "millimetres",
+    "percent",
+    "rates",
+]
 
 Index = NDArray[np.intp]
 Rank = tuple[int, int]  # of variables that rows determine: those of lower rank are eliminated first
@@ -21,65 +37,6 @@ Rank = tuple[int, int]  # of variables that rows determine: those of lower rank 
 def by_leg(joints: Index) -> list[Index]:
     """Numbers of leg joints (6 a leg), leg by leg."""
     return list(joints.reshape(-1, 6))
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where in the motion a row holds.
-
-    name : in the program, where no other place has it: "swing, 93 %".
-    text : to a reader; ``{s}`` and ``{ms}`` stand for the time [s] and [ms].
-    time : [s], an expression in the program's variables; None if the text has none.
-    """
-
-    name: str
-    text: str
-    time: Affine | None = None
-
-    @classmethod
-    def plain(cls, name: str) -> Place:
-        """A place without a time."""
-        return cls(name, name.replace("{", "{{").replace("}", "}}"))
-
-    def told(self, x: Array) -> str:
-        """The text, with the time that solver variables (n,) say."""
-        t = float(self.time.evaluate(x)[0]) if self.time is not None else np.nan
-        return self.text.format(s=f"{t:.2f} s", ms=f"{1e3 * t:.0f} ms")
-
-
-@dataclass(frozen=True, eq=False)
-class Measure:
-    """How far a violation goes, in words: the amount x ``factor`` in ``unit``, and a ``phrase``.
-
-    over : what the amount is divided by first, such as a sole's normal force; at least ``least``.
-    """
-
-    unit: str
-    factor: float
-    phrase: str
-    over: Affine | None = None
-    least: float = 1e-3
-
-    def told(self, x: Array, amount: float) -> str:
-        by = max(float(self.over.evaluate(x)[0]), self.least) if self.over is not None else 1.0
-        value = abs(amount * self.factor / by)
-        number = f"{value:.0f}" if 9.5 <= value < np.inf else f"{value:.2g}"
-        return f"{number} {self.unit} {self.phrase}"
-
-
-def millimetres(phrase: str, *, scale: float = 1.0) -> Measure:
-    """Of rows in ``scale`` [m]."""
-    return Measure("mm", 1e3 * scale, phrase)
-
-
-def degrees(phrase: str) -> Measure:
-    """Of rows in [rad]."""
-    return Measure("deg", float(np.degrees(1)), phrase)
-
-
-def percent(phrase: str, *, of: float = 1.0) -> Measure:
-    """Of rows whose ``of`` is the whole."""
-    return Measure("%", 100 / of if of > 0 else 100.0, phrase)
 
 
 def along(labels: Sequence[str], phrase: str) -> list[Measure]:

@@ -25,6 +25,7 @@ from impactopt.transcription import blocks as symbolic
 from impactopt.transcription.apart import apart_functions
 from impactopt.transcription.at_contact import BodyState, ContactProgram
 from impactopt.transcription.clearance import add_clearance
+from impactopt.transcription.courses import TorqueCourse, torque_courses
 from impactopt.transcription.extra_blocks import ExtraBlock, extra_blocks
 from impactopt.transcription.follow import FollowThrough
 from impactopt.transcription.lanes import in_lanes
@@ -157,6 +158,18 @@ class Transcription(ContactProgram):
             for k, s in enumerate(self.swing_nodes)
             if s >= since
         ]
+
+    def swing_motion(self) -> list[tuple[Place, list[Affine]]]:
+        """Places of the swing's nodes with y, y', y'', legs and T [s], that y' and y'' are of."""
+        out = []
+        for k, s in enumerate(self.swing_nodes):
+            y, y1, y2 = self.at(self.swing_control, self.swing_breaks, s)
+            out.append((self.swing_place(s), [y, y1, y2, self.swing_legs[k], self.swing_T[0]]))
+        return out
+
+    def torque_courses(self) -> list[TorqueCourse]:
+        """Torques over limit of swing, follow-through and brake, of a program that has them as variables."""
+        return torque_courses(self)
 
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         return [spot for follow in self.follows for spot in follow.spots()]

@@ -19,16 +19,16 @@ from pydantic import Field
 from impactopt.bodies.shapes import Obstacle
 from impactopt.errors import InputError
 from impactopt.files.problem_file.contacts import Contact, Target
+from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.solver_sections import Solver
-from impactopt.files.problem_file.term_sections import Terms
+from impactopt.files.problem_file.term_sections import Objectives, Terms
 from impactopt.files.problem_file.values import (
     AtLeastOne,
     Duration,
     Fractions,
     NotNegative,
-    Positive,
     Posture,
     Preset,
     Restitution,
@@ -37,7 +37,6 @@ from impactopt.files.problem_file.values import (
 )
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
 from impactopt.kinematics.stance import Stance as Stances
-from impactopt.problem import objectives
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Robot
@@ -115,39 +114,8 @@ class Collision(Section):
         return _of_problem(cls) | dict(zip(ELEMENTS, ImpactProblem.collision_elements, strict=True))
 
 
-class ScenarioSection(Section):
-    """What else may happen, and has to be survived with the same swing."""
-
-    kind = Scenario
-    name: str = required("what reports call it")
-    mass: Positive = optional("of the target, as a factor of the expected one")
-    stiffness: Positive = optional("of the contact, as a factor")
-    damping: NotNegative = optional("of the contact, as a factor")
-    missing: bool = optional("there is nothing to hit")
-    brake_after: Positive = optional(
-        "when a robot that has felt nothing goes on to a stop planned for that [s]",
-        "brake_after_s",
-    )
-    torque: Positive = optional("fraction of each joint's limit in the collision")
-    cone_margin: NotNegative = optional(
-        "from each sole's centre of pressure to its edges in the collision [m]", "cone_margin_m"
-    )
-    capture_margin: NotNegative = optional(
-        "from the capture point to the support polygon's edges, after it [m]", "capture_margin_m"
-    )
-
-
-class ObstacleSection(Section):
-    """A box or a capsule that nothing of the robot may touch."""
-
-    kind = Obstacle
-    name: str = required("what reports call it")
-    size: Vector = optional("sides of a box [m]", "size_m")
-    position: Vector = optional("middle of the box, world [m]", "position_m")
-    rpy: Vector = optional("turns of the box about x, y and z [rad]", "rpy_rad")
-    start: Vector = optional("of a capsule's axis, world [m]", "start_m")
-    end: Vector = optional("of its axis [m]; left out: a sphere", "end_m")
-    radius: Positive = optional("of the capsule [m]", "radius_m")
+ScenarioSection: Any = section_of(Scenario)
+ObstacleSection: Any = section_of(Obstacle)
 
 
 class Objective(Section):
@@ -160,59 +128,6 @@ class Objective(Section):
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         return _of_problem(cls)
-
-
-class Weighted(Section):
-    """A quantity that counts in what is maximized."""
-
-    weight: float = optional("what one unit of it is worth [N s a unit]")
-
-
-class Impulse(Weighted):
-    """The impulse to the target."""
-
-    kind = objectives.Impulse
-
-
-class PeakForce(Weighted):
-    """The largest contact force; a weight below zero keeps it small."""
-
-    kind = objectives.PeakForce
-
-
-class TargetEnergy(Weighted):
-    """What the target holds at separation, or has used up in what it was hit for."""
-
-    kind = objectives.TargetEnergy
-
-
-class Penetration(Weighted):
-    """The deepest penetration; a weight below zero keeps it small."""
-
-    kind = objectives.Penetration
-
-
-class AngularMomentum(Weighted):
-    """Cost: angular momentum after contact, squared."""
-
-    kind = objectives.AngularMomentum
-
-
-class Effort(Weighted):
-    """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints."""
-
-    kind = objectives.Effort
-
-
-class Objectives(Section):
-    """What is maximized; if there are any, only those that are given."""
-
-    impulse: Impulse = optional("")
-    peak_force: PeakForce = optional("")
-    target_energy: TargetEnergy = optional("")
-    penetration: Penetration = optional("")
-    angular_momentum: AngularMomentum = optional("")
-    effort: Effort = optional("")
 
 
 class File(Section):

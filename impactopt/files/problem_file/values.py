@@ -54,7 +54,7 @@ def _ascending(value: list[float]) -> list[float]:
     return value
 
 
-def _unit(value: list[float]) -> list[float]:
+def unit_vector(value: list[float]) -> list[float]:
     """A unit vector."""
     length = float(np.linalg.norm(value))
     if abs(length - 1) > 1e-6:
@@ -63,7 +63,7 @@ def _unit(value: list[float]) -> list[float]:
     return value
 
 
-def _per_joint(value: Any) -> Any:
+def per_joint(value: Any) -> Any:
     """A number >= 0, or a table by joint."""
     numbers = value.values() if isinstance(value, dict) else [value]
     if not all(_is_number(x) and 0 <= x < np.inf for x in numbers):
@@ -78,7 +78,7 @@ def _posture(value: Any) -> Any:
     return value
 
 
-def _margin(value: Any) -> float | None:
+def any_margin(value: Any) -> float | None:
     """A number >= 0, or "anywhere"."""
     if value == "anywhere":
         return None
@@ -151,16 +151,16 @@ Fraction = Annotated[float, Field(gt=0, le=1)]
 Restitution = Annotated[float, Field(ge=0, le=1)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Point2 = Annotated[list[float], Field(min_length=2, max_length=2)]
-UnitVector = Annotated[Vector, AfterValidator(_unit)]
+UnitVector = Annotated[Vector, AfterValidator(unit_vector)]
 Bound = Annotated[float, Field(allow_inf_nan=True)]  # inf: none
 Range = Annotated[list[Bound], Field(min_length=2, max_length=2), AfterValidator(_ascending)]
-Margin = Annotated[Any, PlainValidator(_margin)]
+Margin = Annotated[Any, PlainValidator(any_margin)]
 Posture = Annotated[Any, PlainValidator(_posture)]
 Rotation = Annotated[Any, PlainValidator(_rotation)]
 Inertia = Annotated[Any, PlainValidator(_inertia)]
 Duration = Annotated[Any, PlainValidator(_duration)]
 Fractions = Annotated[list[Positive], AfterValidator(_fractions)]
-PerJoint = Annotated[Any, PlainValidator(_per_joint)]
+PerJoint = Annotated[Any, PlainValidator(per_joint)]
 Preset = Annotated[str, AfterValidator(_known_robot)]
 Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 IpoptOptions = Annotated[dict[str, Any], AfterValidator(_ipopt_options)]

@@ -23,14 +23,13 @@ from impactopt.files.problem_file.sections import (
     File,
     Follow,
     Objective,
-    Objectives,
     ObstacleSection,
     Problem,
     ScenarioSection,
     Swing,
 )
 from impactopt.files.problem_file.solver_sections import SolverSettings
-from impactopt.files.problem_file.term_sections import Terms
+from impactopt.files.problem_file.term_sections import Objectives, Terms
 from impactopt.files.problem_file.toml import plain_value, write_toml
 from impactopt.kinematics.stance import OneSole
 from impactopt.problem.problem import ImpactProblem

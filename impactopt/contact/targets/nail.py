@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact._expressions import Parameters, choose, positive
-from impactopt.contact.targets import Target
+from impactopt.contact._expressions import Parameters, choose
+from impactopt.contact.targets.base import Target
+from impactopt.contact.fields import about
 
 __all__ = ["Nail"]
 
@@ -15,32 +16,25 @@ SOON, LEFT = 1e-3, 1e-4  # of a plan's start: the unit of time [s], and what is 
 
 @dataclass(frozen=True, kw_only=True)
 class Nail(Target):
-    """A nail in wood, which resists with R = resistance + hardening (depth + z), z driven by this blow.
+    """A nail in wood, which resists with resistance + hardening x depth.
 
-    m dv/dt = f - R while the nail moves (v > 0) or is pushed harder than that (f > R); else it stands still,
-    as the wood holds on to it. It never comes back. The state is (v, z). Its result is `depth` [m], what the
-    blow has driven once the nail has stopped: after separation it coasts on until R has used up its energy.
-    The next blow of a series begins at this nail's `depth` plus that.
+    R = resistance + hardening (depth + z), z driven by this blow. m dv/dt = f - R while the nail moves
+    (v > 0) or is pushed harder than that (f > R); else it stands still, as the wood holds on to it. It never
+    comes back. The state is (v, z). Its result is `depth` [m], what the blow has driven once the nail has
+    stopped: after separation it coasts on until R has used up its energy. The next blow of a series begins at
+    this nail's `depth` plus that.
 
     Kind of model: Tsujita et al., "Analysis of nailing task motion for a humanoid robot", IROS 2008,
     1570-1575 (the paper's [10]).
-
-    Attributes
-    ----------
-    mass : m [kg] > 0.
-    resistance : [N] > 0, at the wood's surface.
-    hardening : [N/m] >= 0, growth of the resistance with depth.
-    depth : [m] >= 0 in the wood before the blow.
-
-    Raises
-    ------
-    InputError : a number out of its range.
     """
 
-    mass: float
-    resistance: float
-    hardening: float = 0.0
-    depth: float = 0.0
+    word: ClassVar[str] = "nail"
+    mass: float = field(metadata=about("", unit="kg", above=0))
+    resistance: float = field(metadata=about("of the wood at its surface", unit="N", above=0))
+    hardening: float = field(
+        default=0.0, metadata=about("growth of the resistance with depth", unit="N/m", least=0)
+    )
+    depth: float = field(default=0.0, metadata=about("in the wood before the blow", unit="m", least=0))
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("depth",)
@@ -49,12 +43,6 @@ class Nail(Target):
     phases: ClassVar[tuple[str, ...]] = ("press", "drive", "release")
     at_once: ClassVar[bool] = True
     stays: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        positive("Nail: mass [kg]", self.mass)
-        positive("Nail: resistance [N]", self.resistance)
-        positive("Nail: hardening [N/m]", self.hardening, zero=True)
-        positive("Nail: depth [m]", self.depth, zero=True)
 
     def _resistance(self, state: Any, p: Parameters) -> Any:
         return p["resistance"] + p["hardening"] * (p["depth"] + state[1])

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 
-from impactopt.contact._expressions import Parameters, numbers_of, positive, text_of
+from impactopt.contact._expressions import Parameters, check_numbers, numbers_of, text_of
 from impactopt.errors import InputError
+from impactopt.contact.fields import Described
 
-__all__ = ["FreeMass", "RigidWall", "Target"]
+__all__ = ["UNITS", "Target"]
 
 UNITS = {"speed": "m_s", "depth": "m"}  # of targets' results
 
 
-class Target(ABC):
+class Target(Described, ABC):
     """Something that is hit, at rest when contact begins; motion is along the contact normal only.
 
     To write one, make a frozen dataclass whose fields are its numbers, and give the methods below. They have
     to be smooth but where one of `switches` changes its sign; `state` is a column of `n_states` numbers or
-    CasADi symbols, zero at rest.
+    CasADi symbols, zero at rest. Fields with `impactopt.contact.fields.about` as metadata are checked when a
+    target is made.
 
     Attributes
     ----------
+    word : what problem files call it; "" for one that they do not know.
     n_states : size of the state.
     results : names of what `result` gives.
     analytic : whether there are derivatives of all orders between switches, as Taylor steps need them.
@@ -37,6 +39,7 @@ class Target(ABC):
     stays : whether it waits where a blow has left it, so that the striker must keep off it afterwards.
     """
 
+    word: ClassVar[str] = ""
     n_states: int
     results: ClassVar[tuple[str, ...]] = ()
     analytic: ClassVar[bool] = True
@@ -45,6 +48,9 @@ class Target(ABC):
     phases: ClassVar[tuple[str, ...]] = ("compression", "restitution")
     at_once: ClassVar[bool] = False
     stays: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
 
     @property
     def turns(self) -> bool:
@@ -139,58 +145,3 @@ class Target(ABC):
             ]
         made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
         return (*made, f"results: {', '.join(self.results)}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class FreeMass(Target):
-    """A point mass that moves freely along the normal (paper, figs. 1 and 9); its state is its velocity.
-
-    Its result is `speed` [m/s], after the blow.
-
-    Attributes
-    ----------
-    mass : [kg] > 0.
-
-    Raises
-    ------
-    InputError : a mass that is not a positive number.
-    """
-
-    mass: float
-
-    n_states = 1
-    results: ClassVar[tuple[str, ...]] = ("speed",)
-
-    def __post_init__(self) -> None:
-        positive("FreeMass: mass [kg]", self.mass)
-
-    def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
-        return state[0]
-
-    def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        p = self.parameters if parameters is None else parameters
-        return [force / p["mass"]]
-
-    def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        p = self.parameters if parameters is None else parameters
-        return 0.5 * p["mass"] * state[0] ** 2
-
-    def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
-        return [state[0]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class RigidWall(Target):
-    """A wall that never moves: it takes impulse, but no energy. It has no state and no numbers."""
-
-    n_states = 0
-    stays: ClassVar[bool] = True
-
-    def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
-        return 0.0
-
-    def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        return []
-
-    def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        return 0.0

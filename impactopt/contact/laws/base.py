@@ -9,31 +9,36 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
-from impactopt.contact._expressions import Parameters, choose, numbers_of, positive, text_of
+from impactopt.contact._expressions import Parameters, check_numbers, choose, numbers_of, text_of
+from impactopt.contact.fields import Described
 
-__all__ = ["ContactLaw", "KelvinVoigt", "SpringDamper", "rough_at"]
+__all__ = ["ContactLaw", "rough_at"]
 
 
-class ContactLaw(ABC):
+class ContactLaw(Described, ABC):
     """A contact law with one smooth branch for compression (rate > 0) and one for restitution (rate <= 0).
 
     To write one, make a frozen dataclass whose fields are its numbers, and give `branch`. The branches have
     to agree where the rate is zero; contact ends when, in restitution, the branch's force has fallen to
-    zero.
+    zero. Fields with `impactopt.contact.fields.about` as metadata are checked when a law is made.
 
     Attributes
     ----------
+    word : what problem files call it; "" for one that they do not know.
     analytic : whether the branches have derivatives of all orders at and around x = 0, as Taylor steps need
         them; a law that has only the first, as x^1.5, says False and is integrated by Runge-Kutta steps.
     """
 
+    word: ClassVar[str] = ""
     analytic: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -99,65 +104,3 @@ def rough_at(branches: Sequence[Callable[[Any, Any], Any]]) -> float | None:
         if not all(np.isfinite(np.array(values(depth, speed))).all() for speed in (0.1, -0.1)):
             return depth
     return None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SpringAndDamper(ContactLaw):
-    """The numbers of a linear spring and a linear damper."""
-
-    stiffness: float
-    damping: float
-
-    def __post_init__(self) -> None:
-        kind = type(self).__name__
-        positive(f"{kind}: stiffness [N/m]", self.stiffness)
-        positive(f"{kind}: damping [N s/m]", self.damping, zero=True)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SpringDamper(_SpringAndDamper):
-    """f = k x + d dx/dt while compressing, f = k x in restitution (paper, figs. 1 and 9).
-
-    That the damper acts in compression only is not written in the paper, but it is what its Table III
-    needs: with it all nine impulses come out to the printed digit, with a Kelvin-Voigt element none does.
-
-    Attributes
-    ----------
-    stiffness : k [N/m] > 0.
-    damping : d [N s/m] >= 0.
-
-    Raises
-    ------
-    InputError : a number out of its range.
-    """
-
-    def branch(
-        self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
-    ) -> Any:
-        p = self.parameters if parameters is None else parameters
-        spring = p["stiffness"] * penetration
-        return spring + p["damping"] * rate if compressing else spring
-
-
-@dataclass(frozen=True, kw_only=True)
-class KelvinVoigt(_SpringAndDamper):
-    """f = k x + d dx/dt in both phases, until the force has fallen to zero: it never pulls.
-
-    Two masses part with e = exp(-2 zeta acos(zeta) / sqrt(1 - zeta^2)) of their speed of approach, where
-    zeta = d / (2 sqrt(k mu)) < 1 and 1/mu = 1/m_1 + 1/m_2; they part while the spring is still compressed.
-
-    Attributes
-    ----------
-    stiffness : k [N/m] > 0.
-    damping : d [N s/m] >= 0.
-
-    Raises
-    ------
-    InputError : a number out of its range.
-    """
-
-    def branch(
-        self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
-    ) -> Any:
-        p = self.parameters if parameters is None else parameters
-        return p["stiffness"] * penetration + p["damping"] * rate

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from impactopt.contact._expressions import Parameters, choose, positive
-from impactopt.contact.targets import Target
+from impactopt.contact._expressions import Parameters, choose
+from impactopt.contact.targets.base import Target
+from impactopt.contact.fields import about
 
 __all__ = ["Board"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Board(Target):
-    """A board held at its edges: a modal mass on a spring, which breaks at a given force of the spring.
+    """A board held at its edges: a modal mass on a spring that breaks.
 
     m dv/dt = f - k w - d v up to the deflection w = breaking_force / k, and m dv/dt = f beyond it: the pieces
     are a free mass. As f >= 0, and v > 0 at the break, they only move on: broken is broken. The state is
@@ -21,35 +22,19 @@ class Board(Target):
     left swinging breaks later is not looked at.
 
     Source: lowest mode of a brittle beam, as in Walker, "Karate strikes", Am. J. Phys. 43 (1975) 845-849.
-
-    Attributes
-    ----------
-    mass : m [kg] > 0, modal, at the point that is hit.
-    stiffness : k [N/m] > 0.
-    breaking_force : [N] > 0, of the spring.
-    damping : d [N s/m] >= 0, of the bending.
-
-    Raises
-    ------
-    InputError : a number out of its range.
     """
 
-    mass: float
-    stiffness: float
-    breaking_force: float
-    damping: float = 0.0
+    word: ClassVar[str] = "board"
+    mass: float = field(metadata=about("modal mass where it is hit", unit="kg", above=0))
+    stiffness: float = field(metadata=about("of the bending", unit="N/m", above=0))
+    breaking_force: float = field(metadata=about("of the spring", unit="N", above=0))
+    damping: float = field(default=0.0, metadata=about("of the bending", unit="N s/m", least=0))
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("broken",)
     typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
     events: ClassVar[tuple[str, ...]] = ("break",)
     phases: ClassVar[tuple[str, ...]] = ("compression", "compression after the break", "restitution")
-
-    def __post_init__(self) -> None:
-        positive("Board: mass [kg]", self.mass)
-        positive("Board: stiffness [N/m]", self.stiffness)
-        positive("Board: breaking_force [N]", self.breaking_force)
-        positive("Board: damping [N s/m]", self.damping, zero=True)
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
         return state[0]

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import casadi as ca
 
 from impactopt.contact._expressions import Parameters, choose
-from impactopt.contact.laws import ContactLaw, rough_at
+from impactopt.contact.laws.base import ContactLaw, rough_at
 from impactopt.errors import InputError, check_array
 
 __all__ = ["CustomLaw"]

@@ -1,0 +1,41 @@
+"""A mass that is pushed away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from impactopt.contact._expressions import Parameters
+from impactopt.contact.targets.base import Target
+from impactopt.contact.fields import about
+
+__all__ = ["FreeMass"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeMass(Target):
+    """A mass that moves freely along the normal.
+
+    A point mass (paper, figs. 1 and 9); its state is its velocity. Its result is `speed` [m/s], after the
+    blow.
+    """
+
+    word: ClassVar[str] = "free mass"
+    mass: float = field(metadata=about("", unit="kg", above=0))
+
+    n_states = 1
+    results: ClassVar[tuple[str, ...]] = ("speed",)
+
+    def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
+        return state[0]
+
+    def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
+        p = self.parameters if parameters is None else parameters
+        return [force / p["mass"]]
+
+    def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
+        p = self.parameters if parameters is None else parameters
+        return 0.5 * p["mass"] * state[0] ** 2
+
+    def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
+        return [state[0]]

@@ -1,0 +1,36 @@
+"""What a plan is to bring: a weighted sum of quantities, one a file; the impulse by default.
+
+`base` says what an objective has. A new one is a file here, and its lines below.
+"""
+
+from impactopt.problem.objectives.angular_momentum import AngularMomentum
+from impactopt.problem.objectives.base import Objective, check_objectives
+from impactopt.problem.objectives.effort import Effort
+from impactopt.problem.objectives.impulse import Impulse
+from impactopt.problem.objectives.peak_force import PeakForce
+from impactopt.problem.objectives.penetration import Penetration
+from impactopt.problem.objectives.target_energy import TargetEnergy
+
+DEFAULT_OBJECTIVES: tuple[Objective, ...] = (Impulse(),)
+# all that problem files know, in their order
+OBJECTIVES: tuple[type[Objective], ...] = (
+    Impulse,
+    PeakForce,
+    TargetEnergy,
+    Penetration,
+    AngularMomentum,
+    Effort,
+)
+
+__all__ = [
+    "DEFAULT_OBJECTIVES",
+    "OBJECTIVES",
+    "AngularMomentum",
+    "Effort",
+    "Impulse",
+    "Objective",
+    "PeakForce",
+    "Penetration",
+    "TargetEnergy",
+    "check_objectives",
+]

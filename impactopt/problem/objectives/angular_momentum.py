@@ -1,0 +1,30 @@
+"""The turning that a blow leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from impactopt.errors import InputError
+from impactopt.problem.objectives.base import WEIGHT, Objective
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngularMomentum(Objective):
+    """Cost: angular momentum after contact, squared.
+
+    |angular momentum|^2 about the centre of mass [(N m s)^2]. Not for a robot on a fixed base, whose balance
+    nobody asks about.
+    """
+
+    name: ClassVar[str] = "angular momentum after contact, squared"
+    unit: ClassVar[str] = "(N m s)^2"
+    cost: ClassVar[bool] = True
+    weight: float = field(default=0.01, metadata=WEIGHT)
+
+    def check_fits(self, *, turns: bool, balance: bool) -> None:
+        if not balance:
+            raise InputError("AngularMomentum is of a robot that stands: leave it out on a fixed base")
+
+    def quantity(self, program: Any) -> Any:
+        return program.squares(program.angular_momentum)

@@ -1,0 +1,56 @@
+"""How hard the joints work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.objectives.base import WEIGHT, Objective
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort(Objective):
+    """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints.
+
+    In s, by the trapezoidal rule on the nodes. To be kept small beside what is really wanted.
+    """
+
+    name: ClassVar[str] = "effort"
+    unit: ClassVar[str] = "s"
+    cost: ClassVar[bool] = True
+    whole_motion: ClassVar[bool] = True
+    needs_torques: ClassVar[bool] = True
+    weight: float = field(default=0.01, metadata=WEIGHT)
+
+    def blocks(self, problem: Any, coordinates: Any) -> dict[str, BlockRecipe]:
+        return {"effort": BlockRecipe(lambda: effort(coordinates.robot.n))}
+
+    def quantity(self, program: Any) -> Any:
+        """T sum(tau^2) at each node is a variable; their sum is the trapezoidal rule's."""
+        swing, follow = program.torque_courses()[:2]
+        slots = [[tau, swing.T] for tau in swing.torques[1:]] + [[tau, follow.T] for tau in follow.torques]
+        at = program.add_block("effort", slots, np.zeros(0))
+        places = [*map(swing.place_at, swing.nodes[1:]), *map(follow.place_at, follow.nodes)]
+        labels = [place.name for place in places]  # by which a program with more nodes finds them again
+        of_node = program.lift("effort of a node", at + np.arange(len(slots)), labels=labels)[0]
+        first, *of_swing = trapezoid(swing.nodes)
+        weights = np.array([*of_swing, *trapezoid(follow.nodes)])
+        at_start = first * float(np.sum(swing.torques[0].const ** 2))  # where the torque is given
+        return of_node.apply(weights[None]) + swing.T * at_start
+
+
+def effort(n: int) -> BlockExpression:
+    """z = torques over limits (n), T [s];  out = T x the sum of their squares [s]."""
+    torque, T = ca.SX.sym("torque", n), ca.SX.sym("T")
+    return make_block([torque, T], [], {"effort": T * ca.sumsqr(torque)})
+
+
+def trapezoid(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights (k,) of the trapezoidal rule on ascending nodes (k,)."""
+    half = np.diff(nodes) / 2
+    return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])

@@ -1,0 +1,48 @@
+"""The largest force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.objectives.base import WEIGHT, Objective
+
+TYPICAL = 100.0  # [N]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeakForce(Objective):
+    """The largest contact force; a weight below zero keeps it small.
+
+    Of the collocated ones [N]. Smooth: sum f^9 / sum f^8 (Lehmer's mean). It is the largest where the others
+    are small beside it or as large, and never above it; of a half sine it is some 2 % below. The force in the
+    first instant of a law with damping is not among the collocated ones.
+    """
+
+    name: ClassVar[str] = "peak force"
+    unit: ClassVar[str] = "N"
+    contact: ClassVar[bool] = True
+    weight: float = field(default=0.01, metadata=WEIGHT)
+
+    def blocks(self, problem: Any, coordinates: Any) -> dict[str, BlockRecipe]:
+        return {"peak": BlockRecipe(peak, of_stages=True)}
+
+    def quantity(self, program: Any) -> Any:
+        forces = program.expected.f
+        at = program.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
+        return program.lift("peak force", np.array([at]))[0] * TYPICAL
+
+
+def peak(stages: int) -> BlockExpression:
+    """Lehmer's mean of the contact forces, a smooth maximum.
+
+    z = f [N] at each stage;  out = peak / 100 N.
+    """
+    f = ca.SX.sym("f", stages)
+    g = f / TYPICAL
+    # even powers: the sum below is never zero, whatever the signs on the way
+    return make_block([f], [], {"peak": ca.sum1(g**9) / (ca.sum1(g**8) + 1e-12)}, lanes=2)

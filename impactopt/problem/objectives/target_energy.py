@@ -1,0 +1,40 @@
+"""The energy in what was hit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.targets.base import Target
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.objectives.base import WEIGHT, Objective
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetEnergy(Objective):
+    """What the target holds at separation, or has used up in what it was hit for.
+
+    In J: ``Target.energy``.
+    """
+
+    name: ClassVar[str] = "target energy"
+    unit: ClassVar[str] = "J"
+    weight: float = field(default=1.0, metadata=WEIGHT)
+
+    def blocks(self, problem: Any, coordinates: Any) -> dict[str, BlockRecipe]:
+        return {"energy": BlockRecipe(lambda: energy(problem.target), problem.target.formula())}
+
+    def quantity(self, program: Any) -> Any:
+        numbers = np.array(list(program.problem.target.parameters.values()))
+        at = program.add_block("energy", [[program.expected.target_state]], numbers)
+        return program.lift("target energy", np.array([at]))[0]
+
+
+def energy(target: Target) -> BlockExpression:
+    """What the target holds or has used up.  z = its state;  p = its numbers;  out = energy [J]."""
+    state, numbers = ca.SX.sym("state", target.n_states), ca.SX.sym("numbers", len(target.parameters))
+    named = {name: numbers[i] for i, name in enumerate(target.parameters)}
+    return make_block([state], [numbers], {"energy": ca.SX(target.energy(state, named))}, lanes=2)

@@ -1,0 +1,67 @@
+"""What a plan must respect, as named terms with units, one a file; a problem holds one of each kind at most.
+
+`base` says what a term has. DEFAULT_TERMS hold in every problem, and their rows are in the transcription; the
+others of TERMS only where they are given, and bring their own. A new one is a file here, and its lines below.
+"""
+
+from impactopt.problem.terms.balance import Balance
+from impactopt.problem.terms.base import Term, check_known, kind_of
+from impactopt.problem.terms.contact_wrench_cone import ContactWrenchCone
+from impactopt.problem.terms.gaze import Gaze
+from impactopt.problem.terms.hand_orientation import HandOrientation
+from impactopt.problem.terms.hit_cone import HitCone
+from impactopt.problem.terms.hit_region import HitRegion
+from impactopt.problem.terms.incidence import Incidence
+from impactopt.problem.terms.joint_acceleration import JointAcceleration
+from impactopt.problem.terms.keep_out import KeepOut
+from impactopt.problem.terms.leg_extension import LegExtension
+from impactopt.problem.terms.position_limit import PositionLimit
+from impactopt.problem.terms.self_collision import SelfCollision
+from impactopt.problem.terms.torque_limit import TorqueLimit
+from impactopt.problem.terms.torque_rate import TorqueRate
+from impactopt.problem.terms.velocity_limit import VelocityLimit
+
+DEFAULT_TERMS: tuple[Term, ...] = (
+    TorqueLimit(),
+    VelocityLimit(),
+    PositionLimit(),
+    ContactWrenchCone(),
+    Balance(),
+    Incidence(),
+    LegExtension(),
+    SelfCollision(),
+    KeepOut(),
+)
+# all that problem files know, in their order
+TERMS: tuple[type[Term], ...] = (
+    *map(type, DEFAULT_TERMS),
+    TorqueRate,
+    HandOrientation,
+    Gaze,
+    HitRegion,
+    HitCone,
+    JointAcceleration,
+)
+
+__all__ = [
+    "DEFAULT_TERMS",
+    "TERMS",
+    "Balance",
+    "ContactWrenchCone",
+    "Gaze",
+    "HandOrientation",
+    "HitCone",
+    "HitRegion",
+    "Incidence",
+    "JointAcceleration",
+    "KeepOut",
+    "LegExtension",
+    "PositionLimit",
+    "SelfCollision",
+    "Term",
+    "TorqueLimit",
+    "TorqueRate",
+    "VelocityLimit",
+    "check_known",
+    "kind_of",
+]

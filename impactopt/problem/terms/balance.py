@@ -1,0 +1,41 @@
+"""What the impact may leave behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from impactopt.errors import InputError
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balance(Term):
+    """What the impact may leave behind, so that the robot stays up; inf: any."""
+
+    name: ClassVar[str] = "balance after impact"
+    unit: ClassVar[str] = "m, m/s, N m s"
+    capture_margin: float | None = field(
+        default=0.02,
+        metadata=about(
+            'from the capture point to the support polygon\'s edges; "anywhere": none is asked',
+            unit="m",
+            least=0,
+            none="anywhere",
+        ),
+    )
+    vertical_speed: float = field(
+        default=0.2, metadata=about("of the centre of mass", unit="m/s", least=0, endless=True)
+    )
+    angular_momentum: float = field(
+        default=10.0,
+        metadata=about("about each axis through the centre of mass", unit="N m s", least=0, endless=True),
+    )
+
+    def __post_init__(self) -> None:
+        if isinstance(self.capture_margin, float) and self.capture_margin == np.inf:
+            raise InputError("Balance.capture_margin is inf, which nothing can keep; give None for anywhere")
+        super().__post_init__()

@@ -1,0 +1,39 @@
+"""What the ground can do to a sole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactWrenchCone(Term):
+    """Each sole's wrench lies in the cone of its corners: centre of pressure, friction and torsion.
+
+    Source: Caron et al. 2015, see :mod:`impactopt.kinematics.wrench_cone`. There are no terms for friction or
+    the centre of pressure alone: this cone bounds them foot by foot, and yaw torsion with them, which shrinks
+    where they are used up.
+    """
+
+    name: ClassVar[str] = "contact wrench cone"
+    unit: ClassVar[str] = "of weight"
+    friction: float = field(default=0.6, metadata=about("coefficient that the soles may use", above=0))
+    margin: float = field(
+        default=0.02,
+        metadata=about("from the centre of pressure to the sole's edges", unit="m", least=0),
+    )
+    collision_margin: float | None = field(
+        default=0.02,
+        metadata=about(
+            'the same, while in contact; "anywhere": the ground may then do what it cannot, to compare',
+            unit="m",
+            least=0,
+            none="anywhere",
+        ),
+    )
+    minimum_force: float = field(
+        default=50.0, metadata=about("that each sole keeps on the ground", unit="N", least=0)
+    )

@@ -1,0 +1,72 @@
+"""Where the robot looks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.bodies.shapes import Vector
+from impactopt.errors import InputError
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import degrees
+from impactopt.contact.fields import about
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gaze(Term):
+    """A frame, such as the head's, looks at the hit point in the swing.
+
+    From its origin at the problem's point: at the nodes of the swing from a fraction of it on, and at
+    contact.
+    """
+
+    name: ClassVar[str] = "gaze"
+    unit: ClassVar[str] = "rad"
+    frame: str = field(metadata=about("of the robot"))
+    axis: Vector = field(metadata=about("unit vector in the frame: the way it looks", direction=True))
+    angle: float = field(default=0.5, metadata=about("off the hit point, at most", unit="rad", above=0))
+    since: float = field(default=0.5, metadata=about("fraction of the swing from which it holds", least=0))
+
+    def __post_init__(self) -> None:
+        self.check_angle()
+        super().__post_init__()
+        if self.since > 1:
+            raise InputError(f"Gaze.since is {self.since:g}; give a fraction of the swing, from 0 to 1")
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        return (self.frame,)
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"gaze": BlockRecipe(lambda: gaze(coordinates, self.frame), (self.frame,))}
+
+    def add_rows(self, program: Any) -> None:
+        nodes = program.swing_spots(self.since)
+        numbers = np.array([*self.axis, *program.problem.point, np.sin(self.angle)])
+        at = program.add_block("gaze", [slots for _, slots in nodes], numbers)
+        for i, (place, _) in enumerate(nodes):
+            program.rows.add(
+                term=self.name,
+                place=place,
+                components=[self.frame],
+                outputs=np.array([at + i]),
+                lower=1 / np.tan(self.angle),
+                measure=degrees("too far off"),
+            )
+
+
+def gaze(c: StanceCoordinates, frame: str) -> BlockExpression:
+    """z = y, legs;  p = axis (3), point (3), sine of the angle;  out = cosine of the angle over that sine."""
+    y, legs, sine = ca.SX.sym("y", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("sin")
+    axis, point = ca.SX.sym("axis", 3), ca.SX.sym("point", 3)
+    rotation, origin = c.rb_frame(frame, c.configuration(y, legs))
+    way = point - origin
+    out = ca.dot(way, ca.mtimes(rotation, axis)) / ca.sqrt(ca.sumsqr(way) + 1e-8) / sine
+    return make_block([y, legs], [axis, point, sine], {"cosine": out})

@@ -1,0 +1,61 @@
+"""How the hand is turned at contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.bodies.shapes import Vector
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import degrees
+from impactopt.contact.fields import about
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandOrientation(Term):
+    """The hand looks some way at contact."""
+
+    name: ClassVar[str] = "hand orientation"
+    unit: ClassVar[str] = "rad"
+    axis: Vector = field(metadata=about("unit vector in the striker's frame", direction=True))
+    direction: Vector | None = field(
+        default=None,
+        metadata=about("where it looks, in the world; left out: along the normal", direction=True),
+    )
+    angle: float = field(default=0.2, metadata=about("between the two, at most", unit="rad", above=0))
+
+    def __post_init__(self) -> None:
+        self.check_angle()
+        super().__post_init__()
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"hand_orientation": BlockRecipe(lambda: hand_orientation(coordinates, problem.striker))}
+
+    def add_rows(self, program: Any) -> None:
+        direction = program.problem.normal if self.direction is None else self.direction
+        numbers = np.array([*self.axis, *direction, np.sin(self.angle)])
+        at = program.add_block("hand_orientation", [[program.contact_state[0]]], numbers)
+        program.rows.add(
+            term=self.name,
+            place="contact",
+            components=[program.problem.striker],
+            outputs=np.array([at]),
+            lower=1 / np.tan(self.angle),
+            measure=degrees("too far off"),
+        )
+
+
+def hand_orientation(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """z = y;  p = axis (3), direction (3), sine of the angle;  out = cosine between them over that sine."""
+    y, axis, direction, sine = ca.SX.sym("y", c.ny), *(ca.SX.sym(s, 3) for s in "ad"), ca.SX.sym("sin")
+    still = ca.SX.zeros(c.ny)
+    rotation, _ = c.rb_frame(f"striker:{striker}", c.upper_motion(y, still, still)[0])
+    out = ca.dot(direction, ca.mtimes(rotation, axis)) / sine
+    return make_block([y], [axis, direction, sine], {"cosine": out})

@@ -1,0 +1,66 @@
+"""From where it hits, if that is free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.bodies.shapes import face_axes
+from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import Measure
+from impactopt.contact.fields import about
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+TYPICAL = 1.0  # [m/s] of a strike
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitCone(Term):
+    """The striking point's velocity at contact is near the normal; in place of `incidence`."""
+
+    name: ClassVar[str] = "hit cone"
+    unit: ClassVar[str] = "m/s"
+    angle: float = field(default=0.1, metadata=about("between the two, at most", unit="rad", above=0))
+
+    def __post_init__(self) -> None:
+        self.check_angle()
+        super().__post_init__()
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"hit_cone": BlockRecipe(lambda: hit_cone(coordinates, problem.striker))}
+
+    def add_rows(self, program: Any) -> None:
+        y, y1, _ = program.contact_state
+        numbers = np.append(face_axes(program.problem.normal).ravel(), np.tan(self.angle))
+        at = program.add_block("hit_cone", [[y, y1, program.contact_T]], numbers)
+        program.rows.add(
+            term=self.name,
+            place="contact",
+            components=["across the normal"],
+            outputs=np.array([at]),
+            lower=0,
+            measure=Measure("m/s", 1.0, "too fast"),
+        )
+
+
+def hit_cone(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """z = y, y', T;  p = axes of the face (9, by rows), tangent of the angle.
+
+    out = ((tangent x speed along the normal)^2 - (speed across it)^2) / (2 tangent x 1 m/s) [m/s]: smooth,
+    also where there is no speed across. That the speed along the normal is one of approach is a row anyway.
+    """
+    y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
+    rows, tangent = ca.SX.sym("axes", 9), ca.SX.sym("tan")
+    q, v, _ = c.upper_motion(y, y1 / T, ca.SX.zeros(c.ny))
+    speed = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
+    along, *across = ca.vertsplit(ca.mtimes(ca.reshape(rows, 3, 3).T, speed))
+    room = ((tangent * along) ** 2 - ca.sumsqr(ca.vertcat(*across))) / (2 * tangent * TYPICAL)
+    return make_block([y, y1, T], [rows, tangent], {"room": room}, lanes=2)

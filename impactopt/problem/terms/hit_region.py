@@ -1,0 +1,92 @@
+"""Where it hits, if that is free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.bodies.shapes import face_axes
+from impactopt.errors import InputError, check_array
+from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import Place, millimetres
+from impactopt.contact.fields import about
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+REACH = 0.2  # [m] further off the replays' target has ended
+
+
+@dataclass(frozen=True, kw_only=True)
+class HitRegion(Term):
+    """The hit point is anywhere in a disc or a rectangle about `point_m`; give one of the keys.
+
+    In the plane of the normal: see :func:`impactopt.bodies.shapes.face_axes`. It reaches no further than
+    0.2 m, where the replays' target ends.
+    """
+
+    name: ClassVar[str] = "hit region"
+    unit: ClassVar[str] = "m"
+    radius: float | None = field(default=None, metadata=about("of the disc", unit="m", above=0))
+    size: tuple[float, float] | None = field(
+        default=None, metadata=about("of the rectangle, across and up", unit="m")
+    )
+
+    def __post_init__(self) -> None:
+        if (self.radius is None) == (self.size is None):
+            raise InputError("HitRegion: give either radius, of a disc, or size, of a rectangle [m]")
+        super().__post_init__()
+        given: Any = self.size if self.radius is None else [self.radius]
+        lengths = check_array("HitRegion [m]", given, (None,))
+        reach = float(lengths.sum()) if self.size is None else float(np.linalg.norm(lengths)) / 2
+        if len(lengths) != (1 if self.size is None else 2) or not (lengths > 0).all() or reach > REACH:
+            raise InputError(
+                f"HitRegion of {lengths.tolist()} m: give lengths > 0 that reach no further than {REACH} m "
+                "from the point"
+            )
+        if self.size is not None:
+            object.__setattr__(self, "size", (float(lengths[0]), float(lengths[1])))
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        disc = self.size is None
+        return {"hit_region": BlockRecipe(lambda: hit_region(coordinates, problem.striker, disc), (disc,))}
+
+    def add_rows(self, program: Any) -> None:
+        """In the place of those of the hit point."""
+        numbers = [*program.problem.point, *face_axes(program.problem.normal).ravel()]
+        numbers += [] if self.radius is None else [self.radius]
+        at = program.add_block("hit_region", [[program.contact_state[0]]], np.array(numbers))
+        away = millimetres("away")
+        program.equal("hit point", Place("contact", ""), ["along the normal"], np.array([at]), away)
+        names = ["disc"] if self.size is None else ["across", "up"]
+        most = np.zeros(1) if self.size is None else np.array(self.size) / 2
+        program.rows.add(
+            term=self.name,
+            place="contact",
+            components=names,
+            outputs=at + 1 + np.arange(len(names)),
+            lower=-np.inf if self.size is None else -most,
+            upper=most,
+            measure=millimetres("outside"),
+        )
+
+
+def hit_region(c: StanceCoordinates, striker: str, disc: bool) -> BlockExpression:
+    """z = y;  p = point (3), axes of the face (9, by rows), radius if it is a disc.
+
+    out = of the striking point, distance before the face [m]; and across and up [m], or for a disc
+    (r^2 - radius^2) / (2 radius) [m].
+    """
+    y, point, rows = ca.SX.sym("y", c.ny), ca.SX.sym("point", 3), ca.SX.sym("axes", 9)
+    radius, still = ca.SX.sym("radius", int(disc)), ca.SX.zeros(c.ny)
+    q, v, _ = c.upper_motion(y, still, still)
+    at = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[0]
+    way = ca.mtimes(ca.reshape(rows, 3, 3).T, at - point)
+    side = (ca.sumsqr(way[1:]) - radius**2) / (2 * radius) if disc else way[1:]
+    return make_block([y], [point, rows, radius], {"depth": way[0], "side": side}, lanes=2)

@@ -1,0 +1,24 @@
+"""No glancing blows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class Incidence(Term):
+    """No glancing blow: the striking point's speed across the normal at contact is bounded.
+
+    :class:`impactopt.HitCone` takes its place.
+    """
+
+    name: ClassVar[str] = "incidence"
+    unit: ClassVar[str] = "m/s"
+    speed: float = field(
+        default=0.05,
+        metadata=about("along each of two tangents; inf: any", unit="m/s", least=0, endless=True),
+    )

@@ -1,0 +1,65 @@
+"""How hard joints are thrown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term, of_joints
+from impactopt.problem.violation import Measure
+from impactopt.contact.fields import about
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointAcceleration(Term):
+    """|joint acceleration| is bounded in the swing.
+
+    At its nodes, between which those of the arms are linear, so that they are bounded everywhere. By joint,
+    those that are not named have no bound.
+    """
+
+    name: ClassVar[str] = "joint acceleration"
+    unit: ClassVar[str] = "of limit"
+    whole_motion: ClassVar[bool] = True
+    limit: float | Mapping[str, float] = field(
+        metadata=about("of all joints, or by joint", unit="rad/s^2", above=0, by_joint=True)
+    )
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"joint_acceleration": BlockRecipe(lambda: joint_acceleration(coordinates))}
+
+    def add_rows(self, program: Any) -> None:
+        names = program.robot.joint_names
+        limit = of_joints(self.limit, names)
+        spots = program.swing_motion()
+        at = program.add_block("joint_acceleration", [slots for _, slots in spots], np.zeros(0))
+        for k, (place, _) in enumerate(spots):
+            program.rows.add(
+                term=self.name,
+                place=place,
+                components=names,
+                outputs=at + len(names) * k + np.arange(len(names)),
+                lower=-limit / TYPICAL,
+                upper=limit / TYPICAL,
+                measure=[Measure("%", 100 * TYPICAL / most, "over its limit") for most in limit],
+            )
+
+
+TYPICAL = 100.0  # [rad/s^2] of a strike
+
+
+def joint_acceleration(c: StanceCoordinates) -> BlockExpression:
+    """z = y, y', y'' (ny each), legs (nl), T [s];  out = joint accelerations over 100 rad/s^2 (n)."""
+    y, y1, y2, u, udot = (ca.SX.sym(s, c.ny) for s in ("y", "y1", "y2", "u", "udot"))
+    legs, T = ca.SX.sym("legs", c.nl), ca.SX.sym("T")
+    _, a = c.motion(y, legs, u, udot)
+    through = [(u, y1 / T), (udot, y2 / T**2)]
+    return make_block([y, y1, y2, legs, T], [], {"acceleration": a[c.base :] / TYPICAL}, through)

@@ -1,0 +1,27 @@
+"""Distance from straight knees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class LegExtension(Term):
+    """Held legs stay away from a straight knee.
+
+    At the nodes of swing and follow-through the determinant of the leg's Jacobian (joints to sole) over its
+    value in the start posture is no less than a minimum. Near a straight knee the joint rates that hold the
+    sole grow without bound, and a few millimetres between two nodes are more than the leg has left: at 0.35
+    TALOS has 7 mm.
+    """
+
+    name: ClassVar[str] = "leg extension"
+    unit: ClassVar[str] = "of start"
+    minimum: float = field(
+        default=0.35,
+        metadata=about("of the start posture's leg determinant; 0 would be a straight knee", least=0, most=1),
+    )

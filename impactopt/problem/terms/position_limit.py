@@ -1,0 +1,21 @@
+"""Distance from the joints' ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionLimit(Term):
+    """Joints stay inside their limits of position.
+
+    Everywhere: it holds on the spline's control points; for the legs at the nodes.
+    """
+
+    name: ClassVar[str] = "position limit"
+    unit: ClassVar[str] = "rad"
+    margin: float = field(default=0.02, metadata=about("from each limit", unit="rad", least=0))

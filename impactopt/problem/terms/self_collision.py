@@ -1,0 +1,23 @@
+"""Distance between the robot's own links."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfCollision(Term):
+    """Links of the robot keep apart, but for those that a joint connects or that touch at the start.
+
+    From start to rest, after a miss too. Where two are nearer than the margin at the start, they may stay as
+    near.
+    """
+
+    name: ClassVar[str] = "self-collision"
+    unit: ClassVar[str] = "m"
+    margin: float = field(default=0.01, metadata=about("between two links", unit="m", least=0))
+    enabled: bool = field(default=True, metadata=about("false: links may pass through each other"))

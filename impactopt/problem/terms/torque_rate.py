@@ -1,0 +1,53 @@
+"""How fast torques may change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+
+from impactopt.problem.terms.base import Term, of_joints
+from impactopt.problem.violation import Measure
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorqueRate(Term):
+    """|d torque/dt| is bounded, from node to node of swing and follow-through.
+
+    By joint, those that are not named have no bound.
+    """
+
+    name: ClassVar[str] = "torque rate"
+    unit: ClassVar[str] = "of limit"
+    whole_motion: ClassVar[bool] = True
+    needs_torques: ClassVar[bool] = True
+    limit: float | Mapping[str, float] = field(
+        metadata=about("of all joints, or by joint", unit="N m/s", above=0, by_joint=True)
+    )
+
+    def add_rows(self, program: Any) -> None:
+        """The torques are variables, so these rows are linear, of a duration that is one too."""
+        names = program.robot.joint_names
+        limit = of_joints(self.limit, names)
+        joints = np.flatnonzero(np.isfinite(limit))
+        rate = limit[joints] / program.robot.torque_limit[joints]
+        labels = [names[j] for j in joints]
+        for course in program.torque_courses():
+            steps = zip(pairwise(course.nodes), pairwise(course.torques), strict=True)
+            for (a, b), (one, two) in steps:
+                step, most = (two - one)[joints], course.T.apply(np.ones((len(joints), 1))) * (rate * (b - a))
+                place = course.place_at((a + b) / 2)
+                place = replace(place, name=f"{place.name}, from {100 * a:.1f} %")
+                for way, sign in (("rising", 1.0), ("falling", -1.0)):
+                    program.rows.add(
+                        term=self.name,
+                        place=place,
+                        components=[f"{label} {way}" for label in labels],
+                        affine=step * sign - most,
+                        upper=0,
+                        measure=[Measure("%", 100 / r, "over its limit", course.T * (b - a)) for r in rate],
+                    )

@@ -1,0 +1,21 @@
+"""Headroom of the joints' velocities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from impactopt.problem.terms.base import Term
+from impactopt.contact.fields import about
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityLimit(Term):
+    """|joint velocity| is at most a fraction of each joint's limit.
+
+    Everywhere: it holds on the spline's velocity control points; for the legs at the nodes.
+    """
+
+    name: ClassVar[str] = "velocity limit"
+    unit: ClassVar[str] = "of limit"
+    fraction: float = field(default=0.95, metadata=about("of the limit", above=0, most=1))

@@ -1,0 +1,79 @@
+"""How a row that is not met is told to a reader: its place in the motion, and how far it is off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Expression(Protocol):
+    """An expression in a program's variables: `impactopt.transcription.layout.Affine`."""
+
+    def evaluate(self, x: Array) -> Array:
+        """Its values for solver variables (n,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where in the motion a row holds.
+
+    name : in the program, where no other place has it: "swing, 93 %".
+    text : to a reader; ``{s}`` and ``{ms}`` stand for the time [s] and [ms].
+    time : [s], an expression in the program's variables; None if the text has none.
+    """
+
+    name: str
+    text: str
+    time: Expression | None = None
+
+    @classmethod
+    def plain(cls, name: str) -> Place:
+        """A place without a time."""
+        return cls(name, name.replace("{", "{{").replace("}", "}}"))
+
+    def told(self, x: Array) -> str:
+        """The text, with the time that solver variables (n,) say."""
+        t = float(self.time.evaluate(x)[0]) if self.time is not None else np.nan
+        return self.text.format(s=f"{t:.2f} s", ms=f"{1e3 * t:.0f} ms")
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """How far a violation goes, in words: the amount x ``factor`` in ``unit``, and a ``phrase``.
+
+    over : what the amount is divided by first, such as a sole's normal force; at least ``least``.
+    """
+
+    unit: str
+    factor: float
+    phrase: str
+    over: Expression | None = None
+    least: float = 1e-3
+
+    def told(self, x: Array, amount: float) -> str:
+        """The amount in words, for solver variables (n,)."""
+        by = max(float(self.over.evaluate(x)[0]), self.least) if self.over is not None else 1.0
+        value = abs(amount * self.factor / by)
+        number = f"{value:.0f}" if 9.5 <= value < np.inf else f"{value:.2g}"
+        return f"{number} {self.unit} {self.phrase}"
+
+
+def millimetres(phrase: str, *, scale: float = 1.0) -> Measure:
+    """Of rows in ``scale`` [m]."""
+    return Measure("mm", 1e3 * scale, phrase)
+
+
+def degrees(phrase: str) -> Measure:
+    """Of rows in [rad]."""
+    return Measure("deg", float(np.degrees(1)), phrase)
+
+
+def percent(phrase: str, *, of: float = 1.0) -> Measure:
+    """Of rows whose ``of`` is the whole."""
+    return Measure("%", 100 / of if of > 0 else 100.0, phrase)

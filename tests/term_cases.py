@@ -1,0 +1,145 @@
+"""A case of each term that only some problems have, on the small arm: what tests of all of them go through.
+
+A new term adds its case to CASES.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.problem.terms import (
+    Gaze,
+    HandOrientation,
+    HitCone,
+    HitRegion,
+    JointAcceleration,
+    Term,
+    TorqueRate,
+)
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.transcription import Transcription
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Solved:
+    """A plan of the arm, measured by Pinocchio and not by its program."""
+
+    transcription: Transcription
+    result: SolverResult
+    plan: Plan
+
+    def posture(self, s: float, phase: str = "swing") -> Array:
+        """q (nq,) at a fraction of a phase of the arm's plan."""
+        spline = getattr(self.plan, phase)
+        return np.asarray(self.plan.coordinates.join(spline.sample(s * spline.duration)[0][0], np.zeros(0)))
+
+    def frame(self, name: str, q: Array) -> Any:
+        model = self.plan.problem.robot.model
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, q)
+        return data.oMf[model.getFrameId(name)]
+
+    @property
+    def hit(self) -> Array:
+        return np.array(self.frame(f"striker:{self.plan.problem.striker}", self.posture(1.0)).translation)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A term that binds on the arm, the same loosened, and one that it can go on with beside others.
+
+    reaches : of a plan with the tight one, how much of what it may it does: 1 where it binds. None: a test of
+        its own says more.
+    """
+
+    tight: Term
+    loose: Term
+    mild: Term
+    reaches: Callable[[Solved, Any], float] | None = None
+
+
+def torque_rate(plan: Solved, term: TorqueRate) -> float:
+    """By inverse dynamics at the nodes."""
+    t, model, fastest = plan.transcription, plan.plan.problem.robot.model, 0.0
+    of_all = not isinstance(term.limit, dict)
+    limit = np.array([term.limit if of_all else term.limit.get(j, np.inf) for j in t.robot.joint_names])
+    for spline, nodes in ((plan.plan.swing, [0, *t.swing_nodes]), (plan.plan.follow, t.follow_nodes)):
+        times, torque = np.array(nodes) * spline.duration, []
+        for y, v, a in zip(*spline.sample(times), strict=True):
+            q = t.coordinates.join(y, np.zeros(0))
+            torque.append(pin.rnea(model, model.createData(), q, v, a).copy())
+        rate = np.abs(np.diff(torque, axis=0)) / np.diff(times)[:, None]
+        fastest = max(fastest, float((rate / limit).max()))
+    return fastest
+
+
+def hand_orientation(plan: Solved, term: HandOrientation) -> float:
+    axis = plan.frame("striker:hand", plan.posture(1.0)).rotation @ np.array(term.axis)
+    return float(np.arccos(axis @ plan.plan.problem.normal)) / term.angle
+
+
+def hit_cone(plan: Solved, term: HitCone) -> float:
+    normal, model = plan.plan.problem.normal, plan.plan.problem.robot.model
+    data = model.createData()
+    v = plan.plan.swing.sample(plan.plan.swing.duration)[1][0]
+    pin.forwardKinematics(model, data, plan.posture(1.0), v)
+    frame = model.getFrameId("striker:hand")
+    velocity = pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED).linear
+    return float(np.arccos(normal @ velocity / np.linalg.norm(velocity))) / term.angle
+
+
+def joint_acceleration(plan: Solved, term: JointAcceleration) -> float:
+    """Of the arm's joints, which are its spline: everywhere, not at the nodes alone."""
+    spline, of_all = plan.plan.swing, not isinstance(term.limit, dict)
+    joints = plan.transcription.robot.joint_names
+    limit = np.array([term.limit if of_all else term.limit.get(joint, np.inf) for joint in joints])
+    accelerations = spline.sample(np.linspace(0, spline.duration, 1001))[2]
+    return float((np.abs(accelerations) / limit).max())
+
+
+CASES: dict[str, Case] = {
+    "torque rate": Case(TorqueRate(limit=20.0), TorqueRate(limit=30.0), TorqueRate(limit=200.0), torque_rate),
+    "rate of some joints": Case(
+        TorqueRate(limit={"wrist": 5.0, "elbow": 20.0}),
+        TorqueRate(limit={"wrist": 8.0, "elbow": 30.0}),
+        TorqueRate(limit=200.0),
+        torque_rate,
+    ),
+    "hand orientation": Case(
+        HandOrientation(axis=(0, 0, 1), angle=1.15),
+        HandOrientation(axis=(0, 0, 1), angle=1.2),
+        HandOrientation(axis=(0, 0, 1), angle=1.3),
+        hand_orientation,
+    ),
+    "gaze": Case(
+        Gaze(frame="elbow", axis=(0, 0, 1), angle=0.05),
+        Gaze(frame="elbow", axis=(0, 0, 1), angle=0.1),
+        Gaze(frame="elbow", axis=(0, 0, 1), angle=0.5),
+    ),
+    "disc": Case(HitRegion(radius=0.02), HitRegion(radius=0.05), HitRegion(radius=0.02)),
+    "rectangle": Case(HitRegion(size=(0.1, 0.02)), HitRegion(size=(0.1, 0.05)), HitRegion(radius=0.02)),
+    "joint acceleration": Case(
+        JointAcceleration(limit=40.0),
+        JointAcceleration(limit=50.0),
+        JointAcceleration(limit=200.0),
+        joint_acceleration,
+    ),
+    "acceleration of a joint": Case(
+        JointAcceleration(limit={"wrist": 20.0}),
+        JointAcceleration(limit={"wrist": 30.0}),
+        JointAcceleration(limit=200.0),
+        joint_acceleration,
+    ),
+    "hit cone": Case(HitCone(angle=0.05), HitCone(angle=0.2), HitCone(angle=0.2), hit_cone),
+}
+# one of each kind, all of which a plan of the arm can have
+MILD: dict[type[Term], Term] = {type(case.mild): case.mild for case in CASES.values()}

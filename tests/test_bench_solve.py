@@ -55,9 +55,9 @@ def changed(**changes: Any) -> Attempt:
 
 # ---------------------------------------------------------------- rows
 def test_a_row_has_the_keys_that_are_promised() -> None:
-    (row,) = solve.summary("a", {"sqp:daqp": [GOOD, changed(seconds=4.0, objective=-9.95)]})
+    (row,) = solve.summary("a", {"sqp:osqp": [GOOD, changed(seconds=4.0, objective=-9.95)]})
     assert list(row) == KEYS
-    assert (row["solver"], row["qp"], row["starts"], row["success"]) == ("sqp", "daqp", 2, 1.0)
+    assert (row["solver"], row["qp"], row["starts"], row["success"]) == ("sqp", "osqp", 2, 1.0)
     assert row["median_seconds"] == pytest.approx(3.0)
     assert row["objective"] == row["best_known"] == -10.0
 

@@ -560,7 +560,7 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         ("[target]", "[solver]\nname = 'ipotp'\n[target]", ["ipotp", "did you mean 'ipopt'"]),
         ("[target]", "[solver.ipopt]\nmax_itr = 3\n[target]", ["[solver]", "max_itr"]),
         ("[target]", "[solver.sqp]\nradus = 3\n[target]", ["[solver.sqp]", "radus", "did you mean 'radius'"]),
-        ("[target]", "[solver.sqp]\nqp_solver = 'dqp'\n[target]", ["qp_solver", "did you mean 'daqp'"]),
+        ("[target]", "[solver.sqp]\nqp_solver = 'osq'\n[target]", ["qp_solver", "did you mean 'osqp'"]),
         ("[target]", "[solver]\ntime_limit_s = 0\n[target]", ["time_limit_s", "> 0"]),
     ],
 )

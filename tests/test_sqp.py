@@ -22,10 +22,12 @@ from impactopt.solvers.sqp.subproblem import normal_step
 
 WAYS = {
     "default": SQPOptions(),
+    "active_set": SQPOptions(qp_solver="active_set"),
+    "osqp": SQPOptions(qp_solver="osqp"),
     "daqp": SQPOptions(qp_solver="daqp"),
     "piqp": SQPOptions(qp_solver="piqp"),
-    "as if large": SQPOptions(qp_solver="piqp", dense_limit=0),
-    "bfgs": SQPOptions(qp_solver="daqp", hessian="bfgs"),
+    "as if large": SQPOptions(qp_solver="osqp", dense_limit=0),
+    "bfgs": SQPOptions(qp_solver="active_set", hessian="bfgs"),
 }
 
 
@@ -84,7 +86,7 @@ def test_arithmetic_errors_count_as_not_finite_and_others_surface():
 
 def test_second_order_correction_cures_the_maratos_effect():
     case = CASES["Maratos"]
-    options = SQPOptions(qp_solver="daqp", radius=0.5)
+    options = SQPOptions(qp_solver="active_set", radius=0.5)
     full = solve_sqp(case.build(), case.x0, options=options)
     without = solve_sqp(
         case.build(), case.x0, options=dataclasses.replace(options, second_order_correction=False)
@@ -102,7 +104,7 @@ def test_rows_come_in_only_when_they_are_needed():
         lambda x, y: -x - 0.3 * y + 1e-3 * (x**2 + y**2),
         lambda x, y: [(-INF, np.cos(a) * x + np.sin(a) * y, 1) for a in angles],
     )
-    result = solve_sqp(program, [0.1, 0.2], options=SQPOptions(qp_solver="daqp"))
+    result = solve_sqp(program, [0.1, 0.2], options=SQPOptions(qp_solver="active_set"))
     assert result.status is Status.SOLVED
     assert_optimal(program, result)
     assert all(int(record.note.split("rows ")[1].split()[0]) < 100 for record in result.history[1:])

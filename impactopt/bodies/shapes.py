@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
-from impactopt.storage.fields import Described, about
+from impactopt.contact.fields import Described, about
 
 Vector = tuple[float, float, float]
 

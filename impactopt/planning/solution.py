@@ -259,5 +259,5 @@ def blow_numbers(hit: Plan | PlannedStrike) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions of what made the numbers."""
-    names = ("casadi", "pin", "numpy", "scipy")
+    names = ("casadi", "pin", "numpy", "scipy", "osqp")
     return {"impactopt": __version__, "python": platform.python_version(), **{n: version(n) for n in names}}

@@ -1,4 +1,4 @@
-"""Sections of classes whose fields say what they are (`impactopt.storage.fields`): keys, ranges, comments."""
+"""Sections of classes whose fields say what they are (`impactopt.contact.fields`): keys, ranges, comments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, PlainValidator, create_model
 
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import any_margin, per_joint, unit_vector
-from impactopt.storage.fields import About, abouts
+from impactopt.contact.fields import About, abouts
 
 __all__ = ["one_of", "section_of", "sections_of"]
 

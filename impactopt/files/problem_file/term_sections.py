@@ -5,7 +5,7 @@ from __future__ import annotations
 from impactopt.files.problem_file.described import sections_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import DEFAULT_TERMS, TERMS
-from impactopt.storage.fields import snake_case
+from impactopt.contact.fields import snake_case
 
 __all__ = ["Objectives", "Terms"]
 

@@ -30,12 +30,12 @@ class SQPOptions:
         start and at most. It rises above the multipliers; too low a start costs iterations, too low a maximum
         may end in an infeasible point.
     levenberg : multiple of the identity always added to the Hessian. It rises by itself where the QP solver
-        struggles: that takes fewer iterations, the SQP more.
+        struggles: OSQP takes fewer iterations, the SQP more.
     augmentation : weight of the active rows (in multiples of the Hessian's norm) in making the Hessian
         convex.
     curvature_floor : least eigenvalue, in multiples of the Hessian's norm, after making it convex.
     dense_limit : most variables for which matrices are treated as dense: the Hessian made convex by its
-        eigenvalues rather than by a shift.
+        eigenvalues rather than by a shift, QPs solved by the dense active-set method.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
     barrier, barrier_warm : with "interior", of the first QP's barrier, without and with multipliers given.
     push : with "interior", how far the start is moved inside its bounds.
@@ -80,7 +80,7 @@ class SQPOptions:
         if self.qp_solver == "interior" and self.hessian != "exact":
             raise InputError(
                 'hessian: with qp_solver "interior" it is "exact"; for "bfgs" give another qp_solver, '
-                'such as "daqp"'
+                'such as "active_set"'
             )
         may_be_zero = {"levenberg", "augmentation", "max_iterations", "dense_limit"}
         for option in fields(self):

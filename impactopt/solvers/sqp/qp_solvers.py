@@ -8,10 +8,22 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.solvers.sqp.qp import QPSolver
 
 
+def _active_set(_tolerance: float) -> QPSolver:
+    from impactopt.solvers.sqp.active_set import ActiveSetSolver
+
+    return ActiveSetSolver()
+
+
 def _daqp(tolerance: float) -> QPSolver:
     from impactopt.solvers.sqp.daqp_solver import DaqpSolver
 
     return DaqpSolver(tolerance=tolerance)
+
+
+def _osqp(tolerance: float) -> QPSolver:
+    from impactopt.solvers.sqp.osqp_solver import OsqpSolver
+
+    return OsqpSolver(tolerance=tolerance)
 
 
 def _piqp(tolerance: float) -> QPSolver:
@@ -21,13 +33,15 @@ def _piqp(tolerance: float) -> QPSolver:
 
 
 QP_SOLVERS: dict[str, Callable[[float], QPSolver]] = {
+    "active_set": _active_set,
     "daqp": _daqp,
+    "osqp": _osqp,
     "piqp": _piqp,
 }
 """Name of a QP solver -> what makes one, given the tolerance of its residuals. Add your own here.
 
-`impactopt[qp]` brings them: DAQP (MIT, 4 MB, needs NumPy), exact, and the quickest up to some hundred
-variables; PIQP (BSD, 5 MB, NumPy and SciPy), the quickest beyond.
+Ours, and OSQP, are always there. `impactopt[qp]` brings DAQP (MIT, 4 MB, needs NumPy), the quickest up to
+some hundred variables, and PIQP (BSD, 5 MB, NumPy and SciPy), the quickest beyond.
 """
 
 

@@ -11,7 +11,9 @@ import contextlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
@@ -28,16 +30,25 @@ if TYPE_CHECKING:
 # of the shortest compression that each of the two may last which an event makes of it, and the first of them
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
+OF_NATURAL, LEAST = 0.2, 2e-3  # of a phase without a shortest time: share of the natural one, and [s] at most
+USUAL = 0.01  # [s] scale of phases, or less where contact is stiff
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
-def shortest_phases(problem: ImpactProblem) -> list[float]:
-    """How long [s] each phase of the contact lasts at least."""
-    shortest, target = problem.contact_duration[0], problem.target
+def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
+    """How long [s] each phase of the contact lasts at least; ``natural``: its last one, of a point mass."""
+    target, shortest = problem.target, problem.contact_duration[0]
+    if not shortest:  # no bound: far below what a blow takes, as rows are over these times
+        shortest = min(OF_NATURAL * natural, LEAST)
     shares = [SHARE if target.events else 1.0] * (len(target.phases) - 1) + [1.0]
     if target.at_once:
         shares[0] = AT_ONCE
     return [share * shortest for share in shares]
+
+
+def _ends(target: Target) -> tuple[NDArray[np.intp], Array]:
+    """Where the phases of a contact end: which phase, and where in it."""
+    return np.arange(len(target.phases)), np.ones(len(target.phases))
 
 
 class Collision:
@@ -66,10 +77,12 @@ class Collision:
         def add(name: str, size: int, **options: Any) -> Group:
             return t.layout.add(named + name, n, size, **options)
 
-        shortest, longest = shortest_phases(p), p.contact_duration[1]
+        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
+        natural = float(blow(law, target, t.mass_at_contact, 1.0, *_ends(p.target)).durations[-1])
+        self.shortest, longest = shortest_phases(p, natural), p.contact_duration[1]
         self.T = [
             t.duration(f"{named}{name} duration", (least, longest), 0.01)
-            for name, least in zip(p.target.phases, shortest, strict=True)
+            for name, least in zip(p.target.phases, self.shortest, strict=True)
         ]
         self.coast_legs = add("coasting legs", t.nl, labels=c.leg_labels)
         self.coast_rates = add("coasting leg rates", t.nl, labels=c.leg_labels)
@@ -114,7 +127,7 @@ class Collision:
         t, p, r = self.t, self.t.problem, self.t.robot
         y, u0, ff = t.contact_state[0], t.u0[0], t.feedforward[0]
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
-        phases = np.column_stack([np.eye(len(self.end)), shortest_phases(p)])
+        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
         within = phases if p.target.events else phases[:, :0]
         gains = np.concatenate([r.kp, r.kd, r.torque_limit, t.units])
         coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []

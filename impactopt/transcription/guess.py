@@ -19,7 +19,9 @@ from impactopt.transcription.layout import Array
 
 LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
 AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as long
-FASTER, TRIES = 1.3, 12  # the blow is made harder until a board breaks, or a nail moves
+# the blow is made harder until a board breaks, or a nail moves; and softer, where contact is so stiff that
+# a harder one has hammer and nail part before the nail stands
+FASTER, TRIES = 1.3, 12
 # a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
 # robot's; and the shortest blow [s] that it stands for
 PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
@@ -62,35 +64,34 @@ def effective_mass(
 def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:
     """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
 
-    A target with events is met as fast as it takes for all of them to happen.
+    A target with events is met as fast, or as slowly, as it takes for all of them to happen.
     """
-    ends: Array | None = None
-    for _ in range(TRIES if target.events else 1):
-        time, rows = _histories(law, target, mass, speed)
+    for k in range(2 * TRIES if target.events else 1):
+        at = speed * FASTER ** ((k + 1) // 2 * (1 if k % 2 else -1))
+        time, rows = _histories(law, target, mass, at)
         ends = _phases(time, rows, target)
         if ends is not None:
             break
-        speed *= FASTER
     if ends is None:  # somewhere, where the solver has to mend it
         ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.events else [0.0, 0.5, 1.0])
-    at = ends[phase] + place * np.diff(ends)[phase]
+    times = ends[phase] + place * np.diff(ends)[phase]
 
     def sample(values: Array) -> Array:
-        return np.stack([np.interp(at, time, row) for row in values], axis=1)
+        return np.stack([np.interp(times, time, row) for row in values], axis=1)
 
     def since(values: Array) -> Array:
-        return np.interp(at, time, values) - np.interp(ends[phase], time, values)
+        return np.interp(times, time, values) - np.interp(ends[phase], time, values)
 
     x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
-    state = sample(rows[3:-1]) if target.n_states else np.zeros((len(at), 0))
+    state = sample(rows[3:-1]) if target.n_states else np.zeros((len(times), 0))
     if isinstance(target, FreeMass) and ends[-1] > SOFT:
         return push(target.mass, phase, place)
     return Blow(
         durations=np.diff(ends),
-        speed=np.interp(at, time, v) / v[0],
+        speed=np.interp(times, time, v) / v[0],
         way=since(x) / v[0],
-        force=np.interp(at, time, force),
-        impulse=mass * (v[0] - np.interp(at, time, v)),
+        force=np.interp(times, time, force),
+        impulse=mass * (v[0] - np.interp(times, time, v)),
         state=state,
         travel=since(travel),
     )

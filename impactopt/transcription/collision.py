@@ -11,9 +11,7 @@ import contextlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
 OF_NATURAL, LEAST = 0.2, 2e-3  # of a phase without a shortest time: share of the natural one, and [s] at most
-USUAL = 0.01  # [s] scale of phases, or less where contact is stiff
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
@@ -44,11 +41,6 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     if target.at_once:
         shares[0] = AT_ONCE
     return [share * shortest for share in shares]
-
-
-def _ends(target: Target) -> tuple[NDArray[np.intp], Array]:
-    """Where the phases of a contact end: which phase, and where in it."""
-    return np.arange(len(target.phases)), np.ones(len(target.phases))
 
 
 class Collision:
@@ -78,8 +70,10 @@ class Collision:
             return t.layout.add(named + name, n, size, **options)
 
         law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        natural = float(blow(law, target, t.mass_at_contact, 1.0, *_ends(p.target)).durations[-1])
-        self.shortest, longest = shortest_phases(p, natural), p.contact_duration[1]
+        ends = np.arange(len(p.target.phases)), np.ones(len(p.target.phases))
+        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
+        self.natural = float(blow(law, target, t.mass_at_contact, 1.0, *ends).durations[-1])
+        self.shortest, longest = shortest_phases(p, self.natural), p.contact_duration[1]
         self.T = [
             t.duration(f"{named}{name} duration", (least, longest), 0.01)
             for name, least in zip(p.target.phases, self.shortest, strict=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.nail import Nail
@@ -22,6 +23,7 @@ AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as 
 # the blow is made harder until a board breaks, or a nail moves; and softer, where contact is so stiff that
 # a harder one has hammer and nail part before the nail stands
 FASTER, TRIES = 1.3, 12
+DECADES = range(1, 5)  # of stiffness that are tried where bodies part too early
 # a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
 # robot's; and the shortest blow [s] that it stands for
 PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
@@ -49,16 +51,72 @@ def effective_mass(
 ) -> tuple[float, float]:
     """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s]."""
     model, data = c.model, c.model.createData()
-    q, still = c.join(y, legs), np.zeros(c.ny)
-    ways = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
-    inertia = np.array(pin.crba(model, data, q))
+    ways, row = _ways(c, striker, normal, y, legs)
+    inertia = np.array(pin.crba(model, data, c.join(y, legs)))
     inertia = np.triu(inertia) + np.triu(inertia, 1).T
-    pin.computeJointJacobians(model, data, q)
-    frame = model.getFrameId(f"striker:{striker}")
-    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
-    row = normal @ jacobian @ ways
     mass = 1 / float(row @ np.linalg.solve(ways.T @ inertia @ ways, row))
     return mass, max(float(row @ rates), 0.1)
+
+
+def _ways(
+    c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array
+) -> tuple[Array, Array]:
+    """Rates of all joints (nv, ny), and the striker's speed (ny,) along the normal, for rates ydot of 1."""
+    model, data = c.model, c.model.createData()
+    still = np.zeros(c.ny)
+    ways = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    pin.computeJointJacobians(model, data, c.join(y, legs))
+    frame = model.getFrameId(f"striker:{striker}")
+    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
+    return ways, normal @ jacobian @ ways
+
+
+def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, limit: Array) -> float:
+    """How fast [m/s] the striker is along the normal in a posture (nq,), at most; ``limit`` (n,) [rad/s]."""
+    ways, row = _ways(c, striker, normal, *c.split(posture))
+    joints = ways[c.base :]
+    bounds = np.concatenate([limit, limit])
+    found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
+    return float(-found.fun) if found.status == 0 else np.inf
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Point masses that part before the last of a target's events, ``event``: when [s].
+
+    needed : speed [m/s] at which they do not; stiffness: the nearest, by factors of 10, with which they do not
+        at the speed that they have. None where none is known.
+    """
+
+    event: str
+    time: float
+    needed: float | None
+    stiffness: float | None
+
+
+def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
+    """Whether a point mass [kg] and a target part before its events, at all speeds up to the fastest [m/s].
+
+    None: at one of them, they do not.
+    """
+
+    def whole(law: ContactLaw, speed: float) -> bool:
+        return _phases(*_histories(law, target, mass, speed), target) is not None
+
+    if not np.isfinite(fastest) or any(whole(law, fastest * FASTER ** (1 - k)) for k in range(2 * TRIES)):
+        return None
+    time, _ = _histories(law, target, mass, fastest)
+    if time[-1] >= LONGEST:
+        return None
+    faster = (fastest * FASTER**k for k in range(2, 2 * TRIES))
+    numbers = law.parameters
+    others = [numbers["stiffness"] * 10.0**n for k in DECADES for n in (-k, k)] if "stiffness" in numbers else []
+    return Parting(
+        event=target.events[-1],
+        time=float(time[-1]),
+        needed=next((v for v in faster if whole(law, v)), None),
+        stiffness=next((s for s in others if whole(type(law)(**{**numbers, "stiffness": s}), fastest)), None),
+    )
 
 
 def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:

@@ -34,6 +34,7 @@ from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
 from impactopt.transcription.mesh import Elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.transcription.rattle import rattle
 from impactopt.transcription.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -125,6 +126,7 @@ def solve(
         nodes=t.nodes,
         elements=t.elements if t.guarded else (),
         contact_error=refining.error(t, result.x) if result.status.usable else None,
+        rattle=rattle(t, result.x) if result.status.usable else None,
         apart=t.apart_rows,
         **fields,
     )

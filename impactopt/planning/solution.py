@@ -24,6 +24,7 @@ from impactopt.transcription.mesh import Elements, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.rattle import Rattle
 
 Array = NDArray[np.float64]
 
@@ -80,6 +81,8 @@ class Solution(Solved):
         () where not.
     contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
         without duration, and where nothing usable was found.
+    rattle : what a plan leaves out that holds a nail and a striker together which rattle; None where they do
+        not.
     apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
     """
 
@@ -88,6 +91,7 @@ class Solution(Solved):
     apart: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
     contact_error: ContactError | None = None
+    rattle: Rattle | None = None
 
     @property
     def impulse(self) -> float:
@@ -222,6 +226,8 @@ class Solution(Solved):
             **self.clearance(),
             "versions": versions(),
         }
+        if self.rattle is not None:
+            out["caution"] = str(self.rattle)
         known: dict[str, Any] = {
             "torque_limit": self.problem.robot.torque_limit,
             "polygon": plan.polygon,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impactopt.errors import InputError
+from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.transcription.blocks import FORCE_SCALE, typical_state
@@ -86,6 +87,11 @@ class Collision:
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
         least = 0.0 if p.target.events or t.law_pulls or t.guarded else np.where(last, 0.0, -np.inf)
+        # what is driven and rattles is held on to meanwhile: see `rattle`; of no use where forces are wanted
+        self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
+        if self.holds:
+            driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
+            least = np.where(driven, -np.inf, 0.0)[:, None]
         most = np.where(last, 0.0, np.inf)
         self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))

@@ -71,8 +71,8 @@ class Collision:
             return t.layout.add(named + name, n, size, **options)
 
         law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        ends = np.arange(len(p.target.phases)), np.ones(len(p.target.phases))
         # how long the last phase [s] is of a point mass's blow: the unit of what is too short
+        ends = np.arange(len(p.target.phases), dtype=np.intp), np.ones(len(p.target.phases))
         self.natural = float(blow(law, target, t.mass_at_contact, 1.0, *ends).durations[-1])
         self.shortest, longest = shortest_phases(p, self.natural), p.contact_duration[1]
         self.T = [

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
@@ -58,9 +59,7 @@ def effective_mass(
     return mass, max(float(row @ rates), 0.1)
 
 
-def _ways(
-    c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array
-) -> tuple[Array, Array]:
+def _ways(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array) -> tuple[Array, Array]:
     """Rates of all joints (nv, ny), and the striker's speed (ny,) along the normal, for rates ydot of 1."""
     model, data = c.model, c.model.createData()
     still = np.zeros(c.ny)
@@ -84,8 +83,8 @@ def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, l
 class Parting:
     """Point masses that part before the last of a target's events, ``event``: when [s].
 
-    needed : speed [m/s] at which they do not; stiffness: the nearest, by factors of 10, with which they do not
-        at the speed that they have. None where none is known.
+    needed : speed [m/s] at which they do not; stiffness: the nearest, by factors of 10, with which they do
+        not at the speed that they have. None where none is known.
     """
 
     event: str
@@ -110,16 +109,19 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
         return None
     faster = (fastest * FASTER**k for k in range(2, 2 * TRIES))
     numbers = law.parameters
-    others = [numbers["stiffness"] * 10.0**n for k in DECADES for n in (-k, k)] if "stiffness" in numbers else []
+    factors = [10.0**n for k in DECADES for n in (-k, k)] if "stiffness" in numbers else []
+    other = (numbers["stiffness"] * factor for factor in factors)
     return Parting(
         event=target.events[-1],
         time=float(time[-1]),
         needed=next((v for v in faster if whole(law, v)), None),
-        stiffness=next((s for s in others if whole(type(law)(**{**numbers, "stiffness": s}), fastest)), None),
+        stiffness=next((k for k in other if whole(type(law)(**{**numbers, "stiffness": k}), fastest)), None),
     )
 
 
-def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:
+def blow(
+    law: ContactLaw, target: Target, mass: float, speed: float, phase: NDArray[np.intp], place: Array
+) -> Blow:
     """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
 
     A target with events is met as fast, or as slowly, as it takes for all of them to happen.
@@ -155,7 +157,7 @@ def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Arra
     )
 
 
-def push(mass: float, phase: Array, place: Array) -> Blow:
+def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
     """A uniform force on a free mass [kg].
 
     Where a contact with one is soft, plans with much else to meet converge more surely from here than from

@@ -1,14 +1,15 @@
 """Whether striker and nail rattle: part, and meet again, within a blow that is planned as one contact.
 
-Where contact is much stiffer than what holds a nail, the nail jumps ahead of the hammer, is caught up with and
-jumps again. What the wood gets does not depend on that: it is decided by momentum and by the wood. So a plan
-holds the two together while the nail is driven, by the same law, which then may pull for an instant. Here is
-what that leaves out, by point masses of the same speed: the law with its gaps, and the law that holds.
+Where contact is much stiffer than what holds a nail, the nail jumps ahead of the hammer, is caught up with
+and jumps again. What the wood gets hardly depends on that: momentum and the wood decide it. So a plan holds
+the two together while the nail is driven, by the same law, which then may pull for an instant. Here is what
+that leaves out, by point masses of the same speed: the law with its gaps, and the law that holds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -40,9 +41,9 @@ class Rattle:
     def __str__(self) -> str:
         times = "once" if self.partings == 1 else f"{self.partings} times"
         return (
-            f"striker and target part and meet again {times} within the blow, which is planned as one contact: "
-            f"between point masses that makes {self.impulse_pct:+.2f} % of impulse, and a largest force of "
-            f"{self.peak:.3g} N, which the planned one is not"
+            f"striker and target part and meet again {times} within the blow, which is planned as one "
+            f"contact: by point masses its impulse is {self.impulse_pct:+.2f} % off, and the largest force "
+            f"is {self.peak:.0f} N, whatever is planned"
         )
 
 
@@ -60,7 +61,7 @@ def rattle_of(law: ContactLaw, target: Target, mass: float, speed: float, durati
     """Of a point mass [kg] that hits at a speed [m/s], in a contact of about a duration [s]."""
     time, force, impulse = _blow(law, target, mass, speed, duration, holds=False)
     on = np.flatnonzero(force > 0)
-    gaps = [time[b] - time[a] for a, b in zip(on[:-1], on[1:], strict=True) if b > a + 1]
+    gaps = [time[b] - time[a] for a, b in pairwise(on) if b > a + 1]
     partings = sum(gap > _WORTH * duration for gap in gaps)
     if not partings:
         return None

@@ -84,7 +84,7 @@ def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
 
 
 def test_a_stiff_nail_rattles_with_the_force_of_the_first_impact() -> None:
-    """Without damping: the spring takes the energy of the approach, v sqrt(k mu), about what wood asks of it."""
+    """Without damping: the spring takes the energy of the approach, v sqrt(k mu), and what wood holds."""
     weak = dataclasses.replace(NAIL, resistance=60.0, hardening=0.0)
     found = rattle_of(KelvinVoigt(stiffness=1e8, damping=0.0), weak, 1.0, 2.0, 5e-3)
     assert found is not None

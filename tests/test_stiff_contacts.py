@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from impactopt import solve
+from impactopt import optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.multistart import Budget
@@ -78,6 +78,14 @@ def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
     assert "one contact is not enough" in solution.result.message
     assert "'break'" in solution.result.message
     assert "contact stiffness of 1e+05 would do" in solution.result.message
+
+
+def test_a_strike_tells_it_too() -> None:
+    strike = optimize_strike(with_stiffness("arm_planar", 1e8, ratio=False))
+    assert strike.status is Status.SOLVED
+    assert strike.rattle is not None
+    assert strike.rattle.peak > 2 * strike.strike.collision.force.max()
+    assert strike.summary()["caution"] == str(strike.rattle)
 
 
 # ---- what is told

@@ -39,6 +39,7 @@ class Solved:
     violations : what is not met, worst first.
     objectives : what each of the problem's objectives comes to, by name, in its own unit.
     attempts : what came of each start.
+    rattle : what is left out, as a nail and a striker that rattle are held together; None where they do not.
     """
 
     problem: ImpactProblem
@@ -49,6 +50,7 @@ class Solved:
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
+    rattle: Rattle | None = None
 
     @property
     def status(self) -> Status:
@@ -67,6 +69,7 @@ class Solved:
             "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
             "starts": [attempt.summary() for attempt in self.attempts],
             "problem": self.problem.describe(),
+            **({} if self.rattle is None else {"caution": str(self.rattle)}),
         }
 
 
@@ -81,8 +84,6 @@ class Solution(Solved):
         () where not.
     contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
         without duration, and where nothing usable was found.
-    rattle : what a plan leaves out that holds a nail and a striker together which rattle; None where they do
-        not.
     apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
     """
 
@@ -91,7 +92,6 @@ class Solution(Solved):
     apart: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
     contact_error: ContactError | None = None
-    rattle: Rattle | None = None
 
     @property
     def impulse(self) -> float:
@@ -226,8 +226,6 @@ class Solution(Solved):
             **self.clearance(),
             "versions": versions(),
         }
-        if self.rattle is not None:
-            out["caution"] = str(self.rattle)
         known: dict[str, Any] = {
             "torque_limit": self.problem.robot.torque_limit,
             "polygon": plan.polygon,

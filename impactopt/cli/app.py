@@ -143,6 +143,8 @@ def solve(
                 **chosen,
             )
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
+            if solution.rattle is not None:
+                progress.say(str(solution.rattle))
             record = _record(solution, read, validate, progress)
             record.summary["command"] = command_line(context)
             if baseline:

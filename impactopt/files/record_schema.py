@@ -55,7 +55,7 @@ _KEYS: Mapping[str, tuple[type, ...]] = {
 _TYPES: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(("target", "objectives", "torque_ratio", "versions", "simulated", "replayed"), (dict,)),
     **dict.fromkeys(("contacts_besides", "collision_elements"), (list, type(None))),
-    **dict.fromkeys(("note", "command"), (str,)),
+    **dict.fromkeys(("note", "caution", "command"), (str,)),
     **dict.fromkeys(("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "duration_s"), _NONE),
     **dict.fromkeys(("clearance_mm", "collision_error_pct", "nodes_added"), _NONE),
 }

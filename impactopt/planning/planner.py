@@ -27,12 +27,14 @@ from impactopt.planning.multistart import (
 )
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
+from impactopt.planning.verdict import second_look, with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
 from impactopt.transcription.mesh import Elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
+from impactopt.transcription.rattle import rattle
 from impactopt.transcription.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -118,12 +120,13 @@ def solve(
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and between and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
-    result = fields["result"]
+    result = fields["result"] = with_reason(t, fields["result"])
     return Solution(
         plan=t.decode(result.x),
         nodes=t.nodes,
         elements=t.elements if t.guarded else (),
         contact_error=refining.error(t, result.x) if result.status.usable else None,
+        rattle=rattle(t, result.x) if result.status.usable else None,
         apart=t.apart_rows,
         **fields,
     )
@@ -200,7 +203,15 @@ class _Refining:
             t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
         if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
             start = start.x  # of a program with other rows
-        return t, self.budget.run(t.program, start)
+        result = self.budget.run(t.program, start)
+        if self.margins is None:
+            result = self._looked_at(t, result, start.x if isinstance(start, SolverResult) else start)
+        return t, result
+
+    def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
+        """A result without a verdict with that of another solver, from the same start."""
+        new = second_look(self.budget, t.program, x0, result, self.report)
+        return result if new is result else _one_after_the_other(result, new)
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
@@ -208,8 +219,14 @@ class _Refining:
         free = t
         t, result = self.first(free, start)
         if result.status in _STUCK and t.apart_rows and self.budget.left != 0:
-            return self._led_out(free, t, result, x0)
-        t, result, _ = self.rounds(t, result, x0)
+            t, result = self._led_out(free, t, result, x0)
+        else:
+            t, result, _ = self.rounds(t, result, x0)
+            result = self._judged(t, result)
+        looked = self._looked_at(t, result, x0)
+        if looked is result or not looked.status.usable:
+            return t, looked
+        t, result, _ = self.rounds(t, looked, x0)
         return t, self._judged(t, result)
 
     def _led_out(

@@ -24,6 +24,7 @@ from impactopt.transcription.mesh import Elements, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.rattle import Rattle
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,7 @@ class Solved:
     violations : what is not met, worst first.
     objectives : what each of the problem's objectives comes to, by name, in its own unit.
     attempts : what came of each start.
+    rattle : what is left out, as a nail and a striker that rattle are held together; None where they do not.
     """
 
     problem: ImpactProblem
@@ -48,6 +50,7 @@ class Solved:
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
+    rattle: Rattle | None = None
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -74,6 +77,7 @@ class Solved:
             "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
             "starts": [attempt.summary() for attempt in self.attempts],
             "problem": self.problem.describe(),
+            **({} if self.rattle is None else {"caution": str(self.rattle)}),
         }
 
 

@@ -15,9 +15,11 @@ from impactopt.errors import InputError, check_array
 from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near
 from impactopt.planning.multistart import Budget, Starts, check_starts, drawn, solve_from
 from impactopt.planning.solution import Solved, blow_numbers, versions
+from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult
 from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.rattle import rattle
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
@@ -101,7 +103,9 @@ def optimize_strike(
     t, fields = solve_from(
         t, _starts(t, given, starts, seed), budget, began, partial(clear_strike, budget, margins)
     )
-    return StrikeSolution(strike=t.decode(fields["result"].x), **fields)
+    result = fields["result"] = with_reason(t, fields["result"])
+    held = rattle(t, result.x) if result.status.usable else None
+    return StrikeSolution(strike=t.decode(result.x), rattle=held, **fields)
 
 
 def clear_strike(

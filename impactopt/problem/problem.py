@@ -111,7 +111,7 @@ class ImpactProblem:
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
     contact_duration : bounds [s] of each of compression (until a nail stands) and restitution; what a break
-        or a start makes two of may each be shorter.
+        or a start makes two of may each be shorter. A shortest of 0: as short as law and masses make it.
     collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
         sum to 1; those of compression before and after a break or a start. They are halved for a nail and a
         board.
@@ -145,7 +145,7 @@ class ImpactProblem:
     start: str | Array = "half_sitting"
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
     follow: Phase = field(default_factory=lambda: Phase(duration=(1.0, 1.0)))
-    contact_duration: tuple[float, float] = (0.002, 0.2)
+    contact_duration: tuple[float, float] = (0.0, 0.2)
     collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
     collision_stages: int = 3
     collision: str = "dynamics"
@@ -209,7 +209,7 @@ class ImpactProblem:
                     f"{shortened(str(lengths))}"
                 )
         lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,), most=LONGEST_CONTACT)
-        if not 0 < lo <= hi:
+        if not (0 <= lo <= hi and hi > 0):
             raise InputError(
                 f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
             )

@@ -48,7 +48,8 @@ def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:
     yield f'<header><h1>{escape(title)}</h1><span class="sub">{escape(about)}</span>'
     yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
     yield '<div id="trouble"></div>'
-    notes = (s.get("note"), s.get("simulated", {}).get("error"), s.get("baseline", {}).get("error"))
+    errors = (s.get(name, {}).get("error") for name in ("simulated", "baseline"))
+    notes = (s.get("note"), s.get("caution"), *errors)
     for note in filter(None, notes):
         yield f'<p class="note">{escape(str(note))}</p>'
     yield _cards(s)

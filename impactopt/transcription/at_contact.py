@@ -17,6 +17,7 @@ from impactopt.transcription.apart import ApartRow, Held, add_apart_rows
 from impactopt.transcription.blocks import DEPTH_SCALE
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
+from impactopt.transcription.guess import effective_mass
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh
@@ -90,6 +91,13 @@ class ContactProgram(Builder):
         else:
             self.expected = InstantImpact(self)
         self.collisions = [self.expected, *self.scenarios]
+
+    @cached_property
+    def mass_at_contact(self) -> float:
+        """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+        c, p = self.coordinates, self.problem
+        y, legs = c.split(p.contact_posture)
+        return effective_mass(c, p.striker, p.normal, y, legs, np.zeros(c.ny))[0]
 
     def _feedforward_rows(self, torque: Index) -> None:
         """The feed-forward is the torque at the node at contact, whose outputs are given."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impactopt.errors import InputError
+from impactopt.problem.objectives import PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.transcription.blocks import FORCE_SCALE, typical_state
@@ -28,12 +29,15 @@ if TYPE_CHECKING:
 # of the shortest compression that each of the two may last which an event makes of it, and the first of them
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
+OF_NATURAL, LEAST = 0.2, 2e-3  # of a phase without a shortest time: share of the natural one, and [s] at most
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
-def shortest_phases(problem: ImpactProblem) -> list[float]:
-    """How long [s] each phase of the contact lasts at least."""
-    shortest, target = problem.contact_duration[0], problem.target
+def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
+    """How long [s] each phase of the contact lasts at least; ``natural``: its last one, of a point mass."""
+    target, shortest = problem.target, problem.contact_duration[0]
+    if not shortest:  # no bound: far below what a blow takes, as rows are over these times
+        shortest = min(OF_NATURAL * natural, LEAST)
     shares = [SHARE if target.events else 1.0] * (len(target.phases) - 1) + [1.0]
     if target.at_once:
         shares[0] = AT_ONCE
@@ -66,10 +70,14 @@ class Collision:
         def add(name: str, size: int, **options: Any) -> Group:
             return t.layout.add(named + name, n, size, **options)
 
-        shortest, longest = shortest_phases(p), p.contact_duration[1]
+        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
+        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
+        ends = np.arange(len(p.target.phases), dtype=np.intp), np.ones(len(p.target.phases))
+        self.natural = float(blow(law, target, t.mass_at_contact, 1.0, *ends).durations[-1])
+        self.shortest, longest = shortest_phases(p, self.natural), p.contact_duration[1]
         self.T = [
             t.duration(f"{named}{name} duration", (least, longest), 0.01)
-            for name, least in zip(p.target.phases, shortest, strict=True)
+            for name, least in zip(p.target.phases, self.shortest, strict=True)
         ]
         self.coast_legs = add("coasting legs", t.nl, labels=c.leg_labels)
         self.coast_rates = add("coasting leg rates", t.nl, labels=c.leg_labels)
@@ -79,6 +87,11 @@ class Collision:
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
         least = 0.0 if p.target.events or t.law_pulls or t.guarded else np.where(last, 0.0, -np.inf)
+        # what is driven and rattles is held on to meanwhile: see `rattle`; of no use where forces are wanted
+        self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
+        if self.holds:
+            driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
+            least = np.where(driven, -np.inf, 0.0)[:, None]
         most = np.where(last, 0.0, np.inf)
         self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
@@ -114,7 +127,7 @@ class Collision:
         t, p, r = self.t, self.t.problem, self.t.robot
         y, u0, ff = t.contact_state[0], t.u0[0], t.feedforward[0]
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
-        phases = np.column_stack([np.eye(len(self.end)), shortest_phases(p)])
+        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
         within = phases if p.target.events else phases[:, :0]
         gains = np.concatenate([r.kp, r.kd, r.torque_limit, t.units])
         coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []

@@ -221,7 +221,7 @@ def _off(new: Collision, old: Collision, z: Array, x: Array) -> float:
     # it falls to zero a little earlier or later than planned
     places = duration * np.array([new.stages[k].place for k in last])
     slope = float(np.polyval(np.polyder(np.polyfit(places, force[last], len(last) - 1)), places[-1]))
-    apart = force[: last[0]].min(initial=0.0) < -_MISSED * peak
+    apart = not new.holds and force[: last[0]].min(initial=0.0) < -_MISSED * peak
     if apart or (slope >= 0 and force[-1] > _MISSED * peak):
         return float(np.inf)
     left = 0.5 * float(force[-1]) ** 2 / -slope if slope < 0 else 0.0

@@ -8,7 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+from scipy.optimize import linprog
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
@@ -18,7 +21,10 @@ from impactopt.transcription.layout import Array
 
 LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
 AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as long
-FASTER, TRIES = 1.3, 12  # the blow is made harder until a board breaks, or a nail moves
+# the blow is made harder until a board breaks, or a nail moves; and softer, where contact is so stiff that
+# a harder one has hammer and nail part before the nail stands
+FASTER, TRIES = 1.3, 12
+DECADES = range(1, 5)  # of stiffness that are tried where bodies part too early
 # a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
 # robot's; and the shortest blow [s] that it stands for
 PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
@@ -52,44 +58,105 @@ def effective_mass(
     return mass, max(float(normal @ body.hand @ v), 0.1)
 
 
-def blow(law: ContactLaw, target: Target, mass: float, speed: float, phase: Array, place: Array) -> Blow:
+def _ways(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array) -> tuple[Array, Array]:
+    """Rates of all joints (nv, ny), and the striker's speed (ny,) along the normal, for rates ydot of 1."""
+    model, data = c.model, c.model.createData()
+    still = np.zeros(c.ny)
+    ways = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    pin.computeJointJacobians(model, data, c.join(y, legs))
+    frame = model.getFrameId(f"striker:{striker}")
+    jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
+    return ways, normal @ jacobian @ ways
+
+
+def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, limit: Array) -> float:
+    """How fast [m/s] the striker is along the normal in a posture (nq,), at most; ``limit`` (n,) [rad/s]."""
+    ways, row = _ways(c, striker, normal, *c.split(posture))
+    joints = ways[c.base :]
+    bounds = np.concatenate([limit, limit])
+    found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
+    return float(-found.fun) if found.status == 0 else np.inf
+
+
+@dataclass(frozen=True)
+class Parting:
+    """Point masses that part before the last of a target's events, ``event``: when [s].
+
+    needed : speed [m/s] at which they do not; stiffness: the nearest, by factors of 10, with which they do
+        not at the speed that they have. None where none is known.
+    """
+
+    event: str
+    time: float
+    needed: float | None
+    stiffness: float | None
+
+
+def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Parting | None:
+    """Whether a point mass [kg] and a target part before its events, at all speeds up to the fastest [m/s].
+
+    None: at one of them, they do not.
+    """
+
+    def whole(law: ContactLaw, speed: float) -> bool:
+        return _phases(*_histories(law, target, mass, speed), target) is not None
+
+    if not np.isfinite(fastest) or any(whole(law, fastest * FASTER ** (1 - k)) for k in range(2 * TRIES)):
+        return None
+    time, _ = _histories(law, target, mass, fastest)
+    if time[-1] >= LONGEST:
+        return None
+    faster = (fastest * FASTER**k for k in range(2, 2 * TRIES))
+    numbers = law.parameters
+    factors = [10.0**n for k in DECADES for n in (-k, k)] if "stiffness" in numbers else []
+    other = (numbers["stiffness"] * factor for factor in factors)
+    return Parting(
+        event=target.events[-1],
+        time=float(time[-1]),
+        needed=next((v for v in faster if whole(law, v)), None),
+        stiffness=next((k for k in other if whole(type(law)(**{**numbers, "stiffness": k}), fastest)), None),
+    )
+
+
+def blow(
+    law: ContactLaw, target: Target, mass: float, speed: float, phase: NDArray[np.intp], place: Array
+) -> Blow:
     """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
 
-    A target with events is met as fast as it takes for all of them to happen.
+    A target with events is met as fast, or as slowly, as it takes for all of them to happen.
     """
-    ends: Array | None = None
-    for _ in range(TRIES if target.events else 1):
-        time, rows = _histories(law, target, mass, speed)
+    for k in range(2 * TRIES if target.events else 1):
+        at = speed * FASTER ** ((k + 1) // 2 * (1 if k % 2 else -1))
+        time, rows = _histories(law, target, mass, at)
         ends = _phases(time, rows, target)
         if ends is not None:
             break
-        speed *= FASTER
     if ends is None:  # somewhere, where the solver has to mend it
         ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.events else [0.0, 0.5, 1.0])
-    at = ends[phase] + place * np.diff(ends)[phase]
+    times = ends[phase] + place * np.diff(ends)[phase]
 
     def sample(values: Array) -> Array:
-        return np.stack([np.interp(at, time, row) for row in values], axis=1)
+        return np.stack([np.interp(times, time, row) for row in values], axis=1)
 
     def since(values: Array) -> Array:
-        return np.interp(at, time, values) - np.interp(ends[phase], time, values)
+        return np.interp(times, time, values) - np.interp(ends[phase], time, values)
 
     x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
-    state = sample(rows[3:-1]) if target.n_states else np.zeros((len(at), 0))
+    state = sample(rows[3:-1]) if target.n_states else np.zeros((len(times), 0))
     if isinstance(target, FreeMass) and ends[-1] > SOFT:
         return push(target.mass, phase, place)
     return Blow(
         durations=np.diff(ends),
-        speed=np.interp(at, time, v) / v[0],
+        speed=np.interp(times, time, v) / v[0],
         way=since(x) / v[0],
-        force=np.interp(at, time, force),
-        impulse=mass * (v[0] - np.interp(at, time, v)),
+        force=np.interp(times, time, force),
+        impulse=mass * (v[0] - np.interp(times, time, v)),
         state=state,
         travel=since(travel),
     )
 
 
-def push(mass: float, phase: Array, place: Array) -> Blow:
+def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
     """A uniform force on a free mass [kg].
 
     Where a contact with one is soft, plans with much else to meet converge more surely from here than from

@@ -26,6 +26,7 @@ from impactopt.files.problem_file.solver_sections import Solver
 from impactopt.files.problem_file.term_sections import Objectives, Terms
 from impactopt.files.problem_file.values import (
     AtLeastOne,
+    ContactDuration,
     Duration,
     Fractions,
     NotNegative,
@@ -102,8 +103,9 @@ class Collision(Section):
         '"dynamics": the whole equation of motion; or an impact without duration, to compare with', "model"
     )
     coefficient_of_restitution: Restitution = optional('of the model "rigid"')
-    contact_duration: Duration = optional(
-        "[shortest, longest] of each of compression and restitution [s]", "duration_s"
+    contact_duration: ContactDuration = optional(
+        "[shortest, longest] of each of compression and restitution [s]; a shortest of 0 is no bound",
+        "duration_s",
     )
     collision_stages: Literal[2, 3] = optional("Radau IIA stages of an element", "stages")
     compression: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")

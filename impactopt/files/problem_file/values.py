@@ -36,6 +36,13 @@ def _duration(value: Any) -> list[float]:
     return _ascending([float(x) for x in pair])
 
 
+def _contact_duration(value: Any) -> list[float]:
+    """A number > 0, or [shortest, longest], of which the shortest may be 0."""
+    if isinstance(value, list) and len(value) == 2 and _is_number(value[0]) and value[0] == 0:
+        return [0.0, _duration([value[1], value[1]])[1]]
+    return _duration(value)
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
@@ -159,6 +166,7 @@ Posture = Annotated[Any, PlainValidator(_posture)]
 Rotation = Annotated[Any, PlainValidator(_rotation)]
 Inertia = Annotated[Any, PlainValidator(_inertia)]
 Duration = Annotated[Any, PlainValidator(_duration)]
+ContactDuration = Annotated[Any, PlainValidator(_contact_duration)]
 Fractions = Annotated[list[Positive], AfterValidator(_fractions)]
 PerJoint = Annotated[Any, PlainValidator(per_joint)]
 Preset = Annotated[str, AfterValidator(_known_robot)]

@@ -102,7 +102,7 @@ def wrong_with_problem(problem: ImpactProblem) -> str:
             return f"{name} of {phase}"
     if abs(np.linalg.norm(parts["normal"]) - 1) > 1e-5:
         return f"the normal is {parts['normal']}"
-    if not np.all(np.asarray(problem.contact_duration) > 0):
+    if not 0 <= problem.contact_duration[0] <= problem.contact_duration[1] > 0:
         return f"contact lasts {problem.contact_duration}"
     return _out_of_reach(problem)
 

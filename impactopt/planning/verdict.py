@@ -1,0 +1,96 @@
+"""What a solve that ended without a verdict is worth: another solver's word, and what point masses say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.planning.multistart import VIOLATED, Budget
+from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
+from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.guess import Parting, fastest, parting
+
+Array = NDArray[np.float64]
+
+
+def second_look(
+    budget: Budget,
+    program: NonlinearProgram,
+    start: Array,
+    old: SolverResult,
+    report: Callable[[str], None] | None = None,
+) -> SolverResult:
+    """The result that IPOPT comes to from the same start, where the SQP gave up, if it says more.
+
+    It scales rows, and restores them by another way, so it rarely fails on the same programs. A limit that
+    the caller has set is an answer, and stays one.
+    """
+    open_end = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
+    if budget.solver != "sqp" or not open_end or budget.left == 0:
+        return old
+    if old.status is Status.FAILED and max_violation(program, old.x, program.constraints(old.x)) <= VIOLATED:
+        return old  # it has been refused for what is no row
+    if report is not None:
+        report("the SQP ends without a verdict: IPOPT looks once, from the same start")
+    new = replace(budget, solver="ipopt", options=None).run(program, start)
+    if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
+        return new
+    return old
+
+
+def _rank(result: SolverResult) -> tuple[bool, bool, float]:
+    """Solutions first, then what has a verdict, then what is least violated."""
+    return not result.status.usable, result.status is not Status.INFEASIBLE, result.max_violation
+
+
+def with_reason(t: ContactProgram, result: SolverResult) -> SolverResult:
+    """A result without a solution, and why there is none, where a blow of point masses says so.
+
+    Such a program is infeasible, whatever its solver ended with.
+    """
+    rows = max_violation(t.program, result.x, t.program.constraints(result.x))
+    if result.status not in (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT) or rows <= VIOLATED:
+        return result
+    why = _too_stiff(t) or _too_long(t)
+    if not why:
+        return result
+    rest = result.message.partition(". ")[2] or result.message
+    return replace(result, status=Status.INFEASIBLE, message=f"Infeasible: {why}. {rest}")
+
+
+def _too_stiff(t: ContactProgram) -> str:
+    """The target's last event does not happen in one contact, however fast the robot is."""
+    p = t.problem
+    if not isinstance(t.expected, Collision) or not p.target.events:
+        return ""
+    limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.rate_limit)
+    found = parting(p.law, p.target, t.mass_at_contact, limit)
+    return "" if found is None else _told(found, limit)
+
+
+def _told(found: Parting, limit: float) -> str:
+    words = (
+        f"one contact is not enough: at {limit:.2g} m/s, as fast as the joints can be, bodies as heavy as "
+        f"striker and target part {1e3 * found.time:.2g} ms after they touch, before the target's "
+        f"{found.event!r}"
+    )
+    if found.needed is not None:
+        words += f", which takes {found.needed:.2g} m/s"
+    if found.stiffness is not None:
+        words += f"; a contact stiffness of {found.stiffness:.1g} would do"
+    return words
+
+
+def _too_long(t: ContactProgram) -> str:
+    """A blow of point masses takes longer than the contact may last."""
+    longest = t.problem.contact_duration[1]
+    if not isinstance(t.expected, Collision) or t.expected.natural <= longest:
+        return ""
+    return (
+        f"this contact is soft: between bodies as heavy as striker and target one phase of it takes "
+        f"{1e3 * t.expected.natural:.2g} ms, and `[collision] duration_s` has {1e3 * longest:.2g} ms at most"
+    )

@@ -1,0 +1,194 @@
+"""Contacts from soft to steel on steel: what is planned is replayed, and what is not has a reason."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from impactopt import optimize_strike, solve
+from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail
+from impactopt.files.problem_file import load_problem
+from impactopt.planning.multistart import Budget
+from impactopt.planning.verdict import second_look
+from impactopt.problem.objectives import Impulse, PeakForce
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Status
+from impactopt.transcription.collision import Collision, shortest_phases
+from impactopt.transcription.contact_error import ASKED
+from impactopt.transcription.guess import fastest, parting
+from impactopt.transcription.rattle import rattle_of
+from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import block_functions
+
+NAIL = Nail(mass=0.05, resistance=600.0, hardening=1e4)
+PUSH = (Impulse(),)
+BOARD = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
+
+
+def with_stiffness(name: str, stiffness: float, *, ratio: bool = True) -> ImpactProblem:
+    """A problem with another contact stiffness [N/m]; its damping ratio stays, or else its damping."""
+    problem = load_problem(name)
+    k, d = problem.law.parameters["stiffness"], problem.law.parameters["damping"]
+    law = KelvinVoigt(stiffness=stiffness, damping=d * np.sqrt(stiffness / k) if ratio else d)
+    return dataclasses.replace(problem, law=law)
+
+
+def contact_of(problem: ImpactProblem) -> StrikeTranscription:
+    """The program of its strike."""
+    functions = block_functions(problem, problem.coordinates)
+    return StrikeTranscription(problem, problem.coordinates, functions)
+
+
+# ---- plans
+
+
+@pytest.mark.parametrize("ratio", [True, False])
+@pytest.mark.parametrize("stiffness", [1e6, 1e7, 1e8])
+def test_a_stiff_contact_is_planned_as_it_is_replayed(stiffness: float, ratio: bool) -> None:
+    """However stiff hammer and nail are, momentum and wood decide: the blow stays about as hard."""
+    solution = solve(with_stiffness("arm_planar", stiffness, ratio=ratio))
+    assert solution.status is Status.SOLVED
+    assert solution.impulse == pytest.approx(3.9, rel=0.06)
+    assert abs(solution.contact_error_pct or 0.0) < ASKED
+    replay = solution.validate()
+    assert replay.impulse == pytest.approx(solution.impulse, rel=2e-3)
+    if solution.rattle is None:
+        assert replay.peak_force == pytest.approx(solution.plan.collision.force.max(), rel=0.1)
+        assert "caution" not in solution.summary()
+    else:
+        assert replay.peak_force == pytest.approx(solution.rattle.peak, rel=0.02)
+        assert solution.summary()["caution"] == str(solution.rattle)
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e4])
+def test_a_contact_too_soft_for_its_time_is_named(stiffness: float) -> None:
+    """Its phases may last 15 ms: `hit point, 48 mm away` alone would not say so."""
+    solution = solve(with_stiffness("arm_planar", stiffness, ratio=False))
+    assert solution.status is Status.INFEASIBLE
+    assert "contact is soft" in solution.result.message
+    assert "15 ms at most" in solution.result.message
+    assert "Rows that cannot be met: " in solution.result.message
+
+
+def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
+    """The hammer is off again long before the board has bent as far as it takes to break."""
+    solution = solve(with_stiffness("chop_arm", 1e7, ratio=False))
+    assert solution.status is Status.INFEASIBLE
+    assert "one contact is not enough" in solution.result.message
+    assert "'break'" in solution.result.message
+    assert "contact stiffness of 1e+05 would do" in solution.result.message
+
+
+def test_a_strike_tells_it_too() -> None:
+    strike = optimize_strike(with_stiffness("arm_planar", 1e8, ratio=False))
+    assert strike.status is Status.SOLVED
+    assert strike.rattle is not None
+    assert strike.rattle.peak > 2 * strike.strike.collision.force.max()
+    assert strike.summary()["caution"] == str(strike.rattle)
+
+
+# ---- what is told
+
+
+def test_a_stiff_nail_rattles_with_the_force_of_the_first_impact() -> None:
+    """Without damping: the spring takes the energy of the approach, v sqrt(k mu), and what wood holds."""
+    weak = dataclasses.replace(NAIL, resistance=60.0, hardening=0.0)
+    found = rattle_of(KelvinVoigt(stiffness=1e8, damping=0.0), weak, 1.0, 2.0, 5e-3)
+    assert found is not None
+    reduced = 1 / (1 / 1.0 + 1 / weak.mass)
+    held = weak.resistance * reduced / weak.mass
+    assert found.peak == pytest.approx(held + np.sqrt(held**2 + 2.0**2 * 1e8 * reduced), rel=2e-3)
+    assert found.partings >= 1
+
+
+def test_a_damped_nail_does_not_rattle() -> None:
+    law = KelvinVoigt(stiffness=5e5, damping=200.0)
+    assert rattle_of(law, NAIL, 0.9, 3.3, 7e-3) is None
+
+
+def test_what_a_contact_that_holds_leaves_out_is_little() -> None:
+    """Hammer and nail end at rest in the wood in either case."""
+    law = KelvinVoigt(stiffness=1e8, damping=200.0)
+    found = rattle_of(law, NAIL, 0.9, 3.9, 6e-3)
+    assert found is not None
+    assert found.partings > 5
+    assert abs(found.impulse_pct) < 1.0
+
+
+def test_forces_that_are_asked_for_never_pull() -> None:
+    """An objective on the largest force makes no use of a contact that holds."""
+    problem = with_stiffness("arm_planar", 1e7)
+    held = contact_of(problem).expected
+    asked = contact_of(dataclasses.replace(problem, objectives=(PeakForce(),)))
+    assert isinstance(held, Collision)
+    assert isinstance(asked.expected, Collision)
+    assert held.holds
+    assert not asked.expected.holds
+    force = asked.expected.f
+    assert (asked.layout.lower[force.offset : force.offset + force.count] == 0).all()
+
+
+# ---- how short
+
+
+def test_a_shortest_duration_is_kept_and_none_follows_the_contact() -> None:
+    """As sqrt(1/k), where it is short; where it is long, 2 ms as ever."""
+    given = dataclasses.replace(with_stiffness("arm_planar", 1e8), contact_duration=(5e-4, 0.015))
+    assert shortest_phases(given, 1e-4)[-1] == 5e-4
+    free = [contact_of(with_stiffness("arm_planar", k)).expected for k in (1e6, 1e8)]
+    stiff = [hit.shortest[-1] for hit in free if isinstance(hit, Collision)]
+    assert stiff[0] / stiff[1] == pytest.approx(10.0, rel=0.1)
+    soft = dataclasses.replace(given, contact_duration=(0.0, 0.2))
+    assert shortest_phases(soft, 1.0)[-1] == 2e-3
+
+
+# ---- verdicts
+
+
+def test_a_board_parts_early_only_where_contact_is_stiff() -> None:
+    assert parting(KelvinVoigt(stiffness=1e5, damping=50.0), BOARD, 0.9, 8.0) is None
+    found = parting(KelvinVoigt(stiffness=1e7, damping=50.0), BOARD, 0.9, 8.0)
+    assert found is not None
+    assert found.event == "break"
+    assert 1e-4 < found.time < 1e-3
+    assert found.needed is not None
+    assert found.needed > 50.0
+    assert found.stiffness == pytest.approx(1e5)
+
+
+def test_the_fastest_is_where_all_joints_are() -> None:
+    """On a fixed base rates are free of each other: the sum of what each of them gives."""
+    problem = load_problem("arm_planar")
+    t, c = contact_of(problem), problem.coordinates
+    y, legs = c.split(problem.contact_posture)
+
+    def along(rates: np.ndarray) -> float:
+        import pinocchio as pin
+
+        model, data = c.model, c.model.createData()
+        pin.computeJointJacobians(model, data, c.join(y, legs))
+        frame = model.getFrameId(f"striker:{problem.striker}")
+        jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+        return float(problem.normal @ jacobian @ rates)
+
+    expected = sum(abs(along(e)) * limit for e, limit in zip(np.eye(c.ny), t.rate_limit, strict=True))
+    found = fastest(c, problem.striker, problem.normal, problem.contact_posture, t.rate_limit)
+    assert found == pytest.approx(expected)
+
+
+def test_a_solve_without_a_verdict_gets_another_solvers() -> None:
+    problem = dataclasses.replace(load_problem("arm_planar"), target=FreeMass(mass=1.0), objectives=PUSH)
+    t = contact_of(problem)
+    start = strike_iterate(t)
+    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    stopped = Budget(solver="sqp", options={"max_iterations": 1}, time_limit=None, callback=None)
+    old = stopped.run(t.program, start)
+    assert old.status is Status.ITERATION_LIMIT
+    assert second_look(stopped, t.program, start, old) is old  # a limit that was asked for is an answer
+    given_up = dataclasses.replace(old, status=Status.FAILED)
+    assert second_look(budget, t.program, start, given_up).status is Status.SOLVED
+    solved = budget.run(t.program, start)
+    assert second_look(budget, t.program, start, solved) is solved
+    refused = dataclasses.replace(solved, status=Status.FAILED)
+    assert second_look(budget, t.program, start, refused) is refused  # its rows are met: no row's fault

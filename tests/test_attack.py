@@ -24,7 +24,7 @@ from impactopt import (
     draw_conditions,
     load_robot,
 )
-from impactopt.cli.app import app
+from impactopt.cli.app import app, program
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.studies.bench import attack
 from impactopt.studies.bench.attack_calls import CALLS, attack_call
@@ -62,7 +62,7 @@ def test_urdfs_with_something_wrong(tmp_path: Path) -> None:
 
 def test_commands_with_something_wrong(tmp_path: Path) -> None:
     result = make_result(tmp_path)
-    found = [attack.case("command", SEED, k, folder=tmp_path, result=result) for k in range(16)]
+    found = [attack.case("command", SEED, k, folder=tmp_path, result=result, program=program) for k in range(16)]
     assert not faults(found)
 
 

@@ -11,12 +11,14 @@ import signal
 import tempfile
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 
+from impactopt.errors import InputError
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.attack_calls import attack_call
 from impactopt.studies.bench.attack_cases import FINE, LATE, REFUSED, TRACEBACK, UNSOUND, Found, pick
@@ -26,7 +28,10 @@ from impactopt.studies.bench.attack_files import attack_file, texts
 from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
 from impactopt.studies.bench.report import Report, Say, make_table
 
-__all__ = ["COUNTS", "case", "run"]
+__all__ = ["COUNTS", "Program", "case", "run"]
+
+# gives the program that has the commands: it is above this room, and so is handed in
+Program = Callable[[], typer.Typer]
 
 # files, URDFs, command lines, calls, collisions a robot
 COUNTS = {"file": 20_000, "urdf": 2500, "command": 1000, "call": 5000, "collision": 1000}
@@ -38,10 +43,19 @@ HUNG = 60.0  # [s] after which a case is given up, and its process with it
 _SHOWN = 50
 
 
-def case(kind: str, seed: int, number: int, *, folder: Path, result: Path | None = None) -> Found:
+def case(
+    kind: str,
+    seed: int,
+    number: int,
+    *,
+    folder: Path,
+    result: Path | None = None,
+    program: Program | None = None,
+) -> Found:
     """One case: "file", "urdf", "command" or "call" of a seed and a number.
 
-    folder : to work in.  result : a saved one, for command lines; None: none of them has one.
+    folder : to work in.  result : a saved one, for command lines; None: none of them has one.  program : as
+    of `run`, for command lines.
     """
     rng = np.random.default_rng([seed, _KINDS.index(kind), number])
     with warnings.catch_warnings():
@@ -51,7 +65,9 @@ def case(kind: str, seed: int, number: int, *, folder: Path, result: Path | None
         if kind == "urdf":
             return attack_urdf(pick(rng, URDFS), folder, rng)
         if kind == "command":
-            return attack_command(folder / "none" if result is None else result, folder, rng)
+            if program is None:
+                raise InputError("program: a command line needs the program that has the commands")
+            return attack_command(program, folder / "none" if result is None else result, folder, rng)
         return attack_call(rng)
 
 
@@ -62,12 +78,16 @@ def run(
     seed: int = 0,
     workers: int = 2,
     counts: dict[str, int] | None = None,
+    program: Program | None = None,
 ) -> Report:
     """How many cases there were, and how many of them ended as none may.
 
-    counts : of cases by kind, and of collisions a robot, in place of the usual ones.
+    counts : of cases by kind, and of collisions a robot, in place of the usual ones.  program : a function
+    of a module that gives the program with the commands; None: no command lines are attacked.
     """
     many = {**(QUICK if quick else COUNTS), **(counts or {})}
+    if program is None:
+        many["command"] = 0
     with tempfile.TemporaryDirectory(prefix="impactopt-attack-") as scratch:
         folder = Path(scratch)
         result = None
@@ -79,7 +99,7 @@ def run(
             for kind in _KINDS
             for first in range(0, many[kind], _CHUNK[kind])
         ]
-        found = _all(jobs, (folder, result), workers, say)
+        found = _all(jobs, (folder, result, program), workers, say)
     struck = _collisions(many["collision"], seed, workers, say)
     return report(found, struck)
 
@@ -107,14 +127,14 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
 
 
 def _job(shared: Any, job: tuple[str, int, int, int]) -> list[Found] | None:
-    folder, result, alarm = shared
+    folder, result, program, alarm = shared
     kind, seed, first, count = job
     found = []
     with tempfile.TemporaryDirectory(dir=folder) as own:
         for number in range(first, first + count):
             if alarm:  # the kernel's: nothing else stops compiled code
                 signal.setitimer(signal.ITIMER_REAL, HUNG)
-            one = case(kind, seed, number, folder=Path(own), result=result)
+            one = case(kind, seed, number, folder=Path(own), result=result, program=program)
             found.append(_placed(one, (kind, seed, number, 1)))
     if alarm:
         signal.setitimer(signal.ITIMER_REAL, 0.0)

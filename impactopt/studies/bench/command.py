@@ -141,6 +141,7 @@ def stability(
 
 @app.command()
 def attack(
+    context: typer.Context,
     seed: Seed = 0,
     workers: Annotated[
         int, typer.Option(min=1, help="Processes; with 1 a case that hangs is not given up.")
@@ -151,7 +152,8 @@ def attack(
     quiet: Quiet = False,
 ) -> None:
     """Files, URDFs, commands and calls with something wrong; collisions by an equation of their own."""
-    _run(["attack"], {"attack": {"quick": few, "seed": seed, "workers": workers}}, as_json, out, quiet)
+    options = {"quick": few, "seed": seed, "workers": workers, "program": context.obj}
+    _run(["attack"], {"attack": options}, as_json, out, quiet)
 
 
 @app.command()
@@ -240,6 +242,7 @@ def zoo(
 
 @app.command("all")
 def run_all(
+    context: typer.Context,
     draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
     seed: Seed = 0,
     workers: Workers = 2,
@@ -260,7 +263,7 @@ def run_all(
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},
-        "attack": {"quick": True, **drawn},
+        "attack": {"quick": True, "program": context.obj, **drawn},
         "solve": {"quick": True, "seed": seed},
         "zoo": {"random": FEW_PROBLEMS, "seed": seed},
     }

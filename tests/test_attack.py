@@ -62,7 +62,9 @@ def test_urdfs_with_something_wrong(tmp_path: Path) -> None:
 
 def test_commands_with_something_wrong(tmp_path: Path) -> None:
     result = make_result(tmp_path)
-    found = [attack.case("command", SEED, k, folder=tmp_path, result=result, program=program) for k in range(16)]
+    found = [
+        attack.case("command", SEED, k, folder=tmp_path, result=result, program=program) for k in range(16)
+    ]
     assert not faults(found)
 
 

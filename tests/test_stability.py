@@ -126,7 +126,13 @@ def test_the_command_counts_cases(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_row_of_a_batch_is_stable_or_has_no_numbers(method: str, place: int) -> None:
     # a wrist whose servo is too fast for the step moves the hand by nothing: the impulse would not tell
     sdc = SDC(
-        robot=small_robots.arm(), striker="hand", normal=X, law=LAW, target=TARGET, method=method, accuracy=None
+        robot=small_robots.arm(),
+        striker="hand",
+        normal=X,
+        law=LAW,
+        target=TARGET,
+        method=method,
+        accuracy=None,
     )
     n = sdc.robot.n
     q, kd = np.tile(sdc.robot.posture("start"), (3, 1)), np.tile(sdc.robot.kd, (3, 1))

@@ -29,8 +29,9 @@ from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.studies.bench import attack
 from impactopt.studies.bench.attack_calls import CALLS, attack_call
 from impactopt.studies.bench.attack_cases import FINE, REFUSED, Found, attempt
-from impactopt.studies.bench.attack_collisions import strike, truth
+from impactopt.studies.bench.attack_collisions import strike
 from impactopt.studies.bench.attack_commands import make_result
+from impactopt.studies.bench.attack_equation import truth
 from impactopt.studies.bench.attack_files import attack_file, texts
 from impactopt.studies.bench.attack_sound import wrong_with_problem, wrong_with_robot
 from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf

@@ -460,7 +460,7 @@ class SymbolicModel(CollisionModel):
         return self._longest(self._frozen_at(self.robot.check_configuration(q), values), values)
 
     def unstable_rows(self, given: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
-        """(N) rows of a batch that explicit steps are unstable of, or that rounding spoils; its inputs by name
+        """(N) rows of a batch that explicit steps are unstable of, or that rounding spoils; inputs by name
         have a first axis of N or 1."""
         count, function = len(given["q"]), self._stability[0]
         inputs = (given["q"], np.zeros((1, self.robot.nv)), given["normal"], np.zeros((1, 1)))

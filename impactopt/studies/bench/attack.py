@@ -22,7 +22,7 @@ from impactopt.errors import InputError
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.attack_calls import attack_call
 from impactopt.studies.bench.attack_cases import FINE, LATE, REFUSED, TRACEBACK, UNSOUND, Found, pick
-from impactopt.studies.bench.attack_collisions import LAWS, ROBOTS, TARGETS, Struck, strike
+from impactopt.studies.bench.attack_collisions import FLOATING, ROBOTS, Struck, pairs_of, strike
 from impactopt.studies.bench.attack_commands import attack_command, make_result
 from impactopt.studies.bench.attack_files import attack_file, texts
 from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
@@ -100,7 +100,8 @@ def run(
             for first in range(0, many[kind], _CHUNK[kind])
         ]
         found = _all(jobs, (folder, result, program), workers, say)
-    struck = _collisions(many["collision"], seed, workers, say)
+    robots = [name for name in ROBOTS if not (quick and name in FLOATING)]
+    struck = _collisions(robots, many["collision"], seed, workers, say)
     return report(found, struck)
 
 
@@ -160,12 +161,13 @@ def _dead(code: int) -> Found:
     return Found(kind="", verdict=TRACEBACK, reason=f"the process died ({code})")
 
 
-def _collisions(count: int, seed: int, workers: int, say: Say) -> list[Struck]:
+def _collisions(robots: Sequence[str], count: int, seed: int, workers: int, say: Say) -> list[Struck]:
     """So many a robot, shared by laws and targets."""
-    every = [(robot, law, target) for robot in ROBOTS for law in LAWS for target in TARGETS]
-    pairs = len(LAWS) * len(TARGETS)
-    shares = [count // pairs + (k % pairs < count % pairs) for k in range(len(every))]
-    jobs = [(*what, share, seed) for what, share in zip(every, shares, strict=True) if share]
+    jobs = []
+    for robot in robots:
+        pairs = pairs_of(robot)
+        shares = [count // len(pairs) + (k < count % len(pairs)) for k in range(len(pairs))]
+        jobs += [(robot, *pair, share, seed) for pair, share in zip(pairs, shares, strict=True) if share]
     return map_on_workers(
         _strike,
         None,

@@ -126,10 +126,19 @@ def test_a_record_that_is_none_is_damaged_whatever_its_checksum(tmp_path: Path, 
     journal.close()
 
 
-def test_an_empty_or_foreign_file_has_no_units(tmp_path: Path) -> None:
-    (tmp_path / "j").write_bytes(b"something else entirely")
+@pytest.mark.parametrize("content", [b"something else entirely", b"x", b"\nnot a unit" + MARK])
+def test_a_file_of_others_is_refused_and_left_as_it_is(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "j").write_bytes(content)
+    with pytest.raises(InputError, match="no journal of a sweep"):
+        Journal(tmp_path / "j")
+    assert (tmp_path / "j").read_bytes() == content
+
+
+@pytest.mark.parametrize("length", range(len(MARK) + 1))
+def test_a_first_record_that_was_torn_has_no_units(tmp_path: Path, length: int) -> None:
+    (tmp_path / "j").write_bytes(MARK[:length])
     journal = Journal(tmp_path / "j")
-    assert journal.torn and not journal.units
+    assert journal.torn == (length > 0) and not journal.units
     journal.close()
 
 

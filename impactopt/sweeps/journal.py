@@ -56,6 +56,9 @@ class Journal:
         try:
             self._file = os.fdopen(open_own(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
             self._end = self._scan()
+            if not self._places and not self._begins_as_ours():
+                self._file.close()
+                raise InputError(f"{path} is no journal of a sweep; move it away, or give another --out")
             self._file.truncate(self._end)
         except OSError as error:
             raise InputError(f"cannot open {path}: {error.strerror}") from error
@@ -96,6 +99,11 @@ class Journal:
         """All finished units in their order, one by one."""
         for unit in sorted(self._places):
             yield _unpack(self._record(self._places[unit]) or b"")
+
+    def _begins_as_ours(self) -> bool:
+        """Whether there is nothing, or the torn beginning of a record."""
+        self._file.seek(0)
+        return MARK.startswith(self._file.read(len(MARK)))
 
     def _scan(self) -> int:
         """Find the sound records; where the last one ends."""

@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ def _impulses(robot: str, law: str, target: str, blows: list[Blow]) -> Array:
     for k, b in enumerate(blows):
         with contextlib.suppress(InputError):
             out[0, k] = model.collide(b.q, b.v, b.torque, require_separation=False, **b.numbers).impulse
-        rows = {"q": b.q[None], "v": b.v[None], "torque": b.torque[None]}
+        rows: dict[str, Any] = {"q": b.q[None], "v": b.v[None], "torque": b.torque[None]}
         rows |= {name: np.asarray(x)[None] for name, x in b.numbers.items()}
         with contextlib.suppress(InputError):
             out[1, k] = model.batch(outputs=("impulse",), threads=1, **rows)["impulse"][0]

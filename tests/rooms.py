@@ -69,6 +69,8 @@ def imports(file: Path) -> Iterator[str]:
             yield from (
                 [f"{module}.{alias.name}" for alias in node.names] if module == "impactopt" else [module]
             )
+        elif isinstance(node, ast.Call) and "import_module" in ast.dump(node.func):
+            yield from (str(a.value) for a in node.args if isinstance(a, ast.Constant))
 
 
 def room(file: Path) -> str:

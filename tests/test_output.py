@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -14,6 +16,7 @@ from fake_solution import MissingSolution, simulation_of, still_problem, still_s
 
 from impactopt.errors import InputError
 from impactopt.files.output import FORMAT, Record, load_record, record_of, save_record, write_file
+from impactopt.files.record_schema import check_summary
 from impactopt.kinematics.support import margin
 from impactopt.pictures import PICTURES, save_pictures
 from impactopt.pictures.torque import _binned
@@ -201,6 +204,61 @@ def test_an_array_that_is_not_what_it_should_be_is_named(
     np.savez(numbers, **arrays, **({} if value is None else {name: value}))
     with pytest.raises(InputError, match="is damaged"):
         load_record(tmp_path)
+
+
+TOUCH = {"one": "a", "other": "b", "depth_mm": 1.0}
+START = {"start": "s", "status": "solved", "impulse_Ns": 1.0, "seconds": 1.0, "iterations": 1, "kept": True}
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        ("target.speed_m_s", "x"),
+        ("torque_ratio.swing", "x"),
+        ("torque_ratio", 1.0),
+        ("zmp_margin_m", 1.0),
+        ("objectives.impulse", []),
+        ("versions.numpy", 2.0),
+        ("problem.point_m", ["x"]),
+        ("problem.name", 3),
+        ("impulse_Ns", True),
+        ("violations", [{"row": "x"}]),
+        ("violations", [{"row": "x", "by": 3}]),
+        ("starts", [{**START, "kept": 1}]),
+        ("starts", [{k: v for k, v in START.items() if k != "seconds"}]),
+        ("contacts_besides", [{**TOUCH, "depth_mm": "1"}]),
+        ("contacts_besides", [[]]),
+        ("collision_elements", [0.5]),
+        ("scenarios", [{"impulse_Ns": 1.0}]),
+        ("simulated.torque_ratio", 0.5),
+        ("simulated.target", [1.0]),
+        ("simulated.standing", "yes"),
+        ("simulated.error", {}),
+        ("replayed.torque_ratio_by_phase", [1.0]),
+        ("replayed.zmp_margin_m", {"swing": 1.0}),
+        ("replayed.contacts_besides", [{**TOUCH, "one": None}]),
+    ],
+)
+def test_a_nested_value_of_a_wrong_kind_is_named(record: Record, at: str, value: Any) -> None:
+    check_summary(record.summary, whole=True)
+    summary = copy.deepcopy(record.summary)
+    *above, last = at.split(".")
+    table = summary
+    for name in above:
+        table = table[name]
+    table[last] = value
+    with pytest.raises(ValueError, match=re.escape(at)):
+        check_summary(summary, whole=True)
+
+
+def test_keys_of_a_newer_version_are_let_be(record: Record) -> None:
+    summary = {
+        **record.summary,
+        "later": [{"x": 1}],
+        "simulated": {**record.summary["simulated"], "later": {}},
+    }
+    summary |= {"contacts_besides": [TOUCH], "starts": [START]}
+    check_summary(summary, whole=True)
 
 
 def test_a_record_of_a_newer_version_is_refused(tmp_path: Path) -> None:

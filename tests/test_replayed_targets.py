@@ -36,6 +36,7 @@ from impactopt.simulation import (
     Conditions,
     Scene,
     Simulation,
+    robustness,
     simulate,
     simulate_mujoco,
     simulate_pinocchio,
@@ -187,6 +188,18 @@ def test_steps_that_leave_the_impulse_uncertain_are_found_out(engine: Engine) ->
     assert coarse.step_error > 1e-2
     with pytest.raises(InputError, match=r"steps of 0\.06 s leave .* % of its impulse, .* uncertain"):
         check_steps(coarse, 0.06)
+
+
+def test_draws_whose_steps_leave_the_impulse_uncertain_have_no_result() -> None:
+    """As in `validate`: a step of 60 ms goes over the whole blow, those of half a millisecond are halved."""
+    law, target = SpringDamper(stiffness=5e5, damping=20.0), FreeMass(mass=1e-3)
+    robot, motion, world = hammer(target, law)
+    shared = robustness.Shared(robot=robot, reference=motion, scene=world, step=robustness.STEP)
+    trusted = robustness.replay(shared, Conditions())
+    assert trusted.impulse == pytest.approx(integrated(law, target)[0], rel=1e-2)
+    doubtful = robustness.replay(dataclasses.replace(shared, step=0.06), Conditions())
+    assert not doubtful.standing and np.isnan(doubtful.impulse)
+    assert "not to be trusted: steps of 0.06 s" in doubtful.reason
 
 
 @ENGINES

@@ -15,6 +15,7 @@ from impactopt.cli.app import app
 from impactopt.collision import SDC
 from impactopt.contact import FreeMass, RigidWall, SpringDamper
 from impactopt.errors import InputError
+from impactopt.simulation.cases import striking_velocity
 from impactopt.studies.bench import stability
 from impactopt.studies.bench.stability import judge_rig
 from impactopt.studies.bench.stability_cases import RIGS, Rig
@@ -118,3 +119,40 @@ def test_the_command_counts_cases(monkeypatch: pytest.MonkeyPatch) -> None:
     assert numbers.keys() >= {"cases", "agree", "refused", "nan", "wrong", "seconds", "reasons"}
     assert numbers["cases"] == numbers["agree"] + numbers["refused"]
     assert sum(numbers["reasons"].values()) == numbers["cases"]
+
+
+@pytest.mark.parametrize("method", ["events", "rk4"])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_every_row_of_a_batch_is_stable_or_has_no_numbers(method: str, place: int) -> None:
+    # a wrist whose servo is too fast for the step moves the hand by nothing: the impulse would not tell
+    sdc = SDC(
+        robot=small_robots.arm(),
+        striker="hand",
+        normal=X,
+        law=LAW,
+        target=TARGET,
+        method=method,
+        accuracy=None,
+    )
+    n = sdc.robot.n
+    q, kd = np.tile(sdc.robot.posture("start"), (3, 1)), np.tile(sdc.robot.kd, (3, 1))
+    kd[place, -1] *= 1e5
+    assert sdc.stable_step(q[0], kd=kd[place]) < sdc.step_length < sdc.stable_step(q[0])
+    v = np.tile(striking_velocity(sdc.robot, q[0], "hand", X, 0.5), (3, 1))
+    found = sdc.batch(q, v, np.zeros(n), outputs=("impulse", "torque"), kd=kd)
+    kept = [k for k in range(3) if k != place]
+    assert np.isnan(found["impulse"][place]) and not found["separated"][place]
+    assert np.isnan(found["torque"][place]).all()
+    assert np.isfinite(found["impulse"][kept]).all() and found["separated"][kept].all()
+    with pytest.raises(InputError, match="unstable in every collision"):
+        sdc.batch(q, v, np.zeros(n), kd=kd[place])
+
+
+def test_a_bound_of_the_rates_only_spares_eigenvalues() -> None:
+    sdc = slider(method="rk4")
+    stiffness = 10 ** np.linspace(7.0, 11.0, 40)
+    given = {name: x.reshape(1, -1) for name, x in sdc.settings.items()}
+    given |= {"q": np.zeros((40, 1)), "contact_stiffness": stiffness[:, None]}
+    alone = [sdc.stable_step([0.0], contact_stiffness=k) <= sdc.step_length for k in stiffness]
+    assert sdc.unstable_rows(given).tolist() == alone
+    assert {*alone} == {True, False}

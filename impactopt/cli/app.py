@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
     from impactopt.report.console import Progress
 
-__all__ = ["app", "main"]
+__all__ = ["app", "main", "program"]
 
 WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
 
@@ -76,8 +76,17 @@ def main() -> None:
     app()
 
 
+def program() -> typer.Typer:
+    """What `main` runs, for those below that run it too; they get it as the context's `obj`."""
+    return app
+
+
 @app.callback(invoke_without_command=True)
-def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    context.obj = program
     if version:
         from impactopt import __version__
 

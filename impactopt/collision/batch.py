@@ -33,6 +33,7 @@ __all__ = ["Batch"]
 
 Array = NDArray[np.float64]
 _ALIGNED = 8  # doubles
+_TOGETHER = 256  # rows whose steps are looked at together
 
 
 class Batch:
@@ -74,8 +75,7 @@ class Batch:
         if not isinstance(cores, int) or cores < 1:
             raise InputError(f"threads: {threads!r}; give a whole number >= 1")
         given = _inputs(self.model, q, v, torque, settings)
-        if self.model.stepping != "implicit":
-            self._check_step(given)
+        unstable = None if self.model.stepping == "implicit" else self._unstable(given)
         count, function = given["q"].shape[0], self._function
         rows = [_by_columns(given[name]) for name in function.name_in()]
         shapes = [function.size_out(k) for k in range(function.n_out())]
@@ -88,6 +88,9 @@ class Batch:
         if "step_error" in names:
             # a contact that never was has left nothing out
             wrong = too_large(self.model.stepping, found[names.index("step_error")][:, 0])
+            if unstable is not None:
+                found[names.index("step_error")][unstable] = np.nan
+                wrong |= unstable
             for name, x in zip(names, found, strict=True):
                 if name != "step_error":
                     x[wrong] = np.nan
@@ -95,11 +98,25 @@ class Batch:
             name: self._shaped(name, x, shape) for name, x, shape in zip(names, found, shapes, strict=True)
         }
 
-    def _check_step(self, given: Mapping[str, Array]) -> None:
-        first = {name: given[name][0] for name in self.model.settings}
-        first = {name: x.reshape(self.model.settings[name].shape) for name, x in first.items()}
-        longest, step = self.model.stable_step(given["q"][0], **first), self.model.step_length
-        self.model.check_step(step, longest, "in the first collision")
+    def _unstable(self, given: Mapping[str, Array]) -> Any:
+        """(N) rows that the steps are unstable of, InputError where that is all; rows that are the same but
+        for their motion are looked at once."""
+        names = ("q", *self.model.settings)
+        own = {name: given[name] for name in names}
+        count = len(given["q"])
+        flat = [x.reshape(len(x), -1) for x in own.values()]
+        whole = np.concatenate([np.broadcast_to(x, (count, x.shape[1])) for x in flat], axis=1)
+        _, first, back = np.unique(whole, axis=0, return_index=True, return_inverse=True)
+        parts = [
+            self.model.unstable_rows({name: x if len(x) == 1 else x[some] for name, x in own.items()})
+            for some in np.split(first, range(_TOGETHER, len(first), _TOGETHER))
+        ]
+        unstable = np.concatenate(parts)[back.ravel()]
+        if unstable.all():
+            one = {name: given[name][0].reshape(x.shape) for name, x in self.model.settings.items()}
+            longest = self.model.stable_step(given["q"][0], **one)
+            self.model.check_step(self.model.step_length, longest, "in every collision, as in the first,")
+        return unstable
 
     def _shaped(self, name: str, flat: Array, shape: tuple[int, int]) -> Array:
         """Collisions first, then instants; matrices of CasADi's lie by columns."""

@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 if TYPE_CHECKING:
     from impactopt.collision.symbolic import SymbolicModel
 
-__all__ = ["ACCURACY", "check_course", "check_finite", "check_frozen", "too_large"]
+__all__ = ["ACCURACY", "check_course", "check_finite", "check_frozen", "spoiled", "too_large"]
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,15 @@ def check_frozen(frozen: dict[str, Array]) -> None:
     for name in {*frozen} - {"pivots", "freedom"}:
         if not np.isfinite(frozen[name]).all():
             raise InputError(f"q: the frozen dynamics have no finite {name} here; check the robot's inertias")
+
+
+def spoiled(frozen: dict[str, Array]) -> Any:
+    """(N) rows that `check_frozen` refuses; numbers (N, ...)."""
+    bad = ~(frozen["pivots"] > _LEAST_PIVOT).all(axis=1)
+    bad |= ~(frozen["freedom"][:, 0] > _LEAST_PIVOT) & (frozen["m"][:, 0] != 0)
+    for name in {*frozen} - {"pivots", "freedom"}:
+        bad |= ~np.isfinite(frozen[name]).all(axis=1)
+    return bad
 
 
 def check_finite(outputs: dict[str, Array], step: float) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.cache import cached
 from impactopt.codegen.hashing import model_hash
 from impactopt.collision.batch import Batch
-from impactopt.collision.checks import check_course, check_finite, check_frozen
+from impactopt.collision.checks import check_course, check_finite, check_frozen, spoiled
 from impactopt.collision.describe import Description, describe
 from impactopt.collision.exact import ExactCollision
 from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
@@ -33,7 +33,7 @@ from impactopt.collision.native import native_collision, native_gradient, native
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS, SCALARS, check_jacobian, check_outputs
 from impactopt.collision.result import Collision
 from impactopt.collision.settings import Settings
-from impactopt.collision.stability import longest_stable_step, slope_function
+from impactopt.collision.stability import longest_stable_step, slope_function, unstable_rows
 from impactopt.collision.terms import JointFriction, Terms
 from impactopt.errors import InputError, check_array, did_you_mean
 
@@ -301,12 +301,12 @@ class SymbolicModel(CollisionModel):
         frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool,
         False also where there came out no number. With explicit steps also `step_error` (N), what they left
         out of each impulse, as an estimate: collisions that it is too large of (more than 1e-5 of "events",
-        1e-2 of "rk4") have no numbers. That the step is stable for the servos is checked in the first
-        collision only. `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
+        1e-2 of "rk4") have no numbers, and neither have those that the step is unstable of.
+        `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 
         Raises
         ------
-        InputError : wrong shapes, NaN, or numbers out of their range; a step that is unstable.
+        InputError : wrong shapes, NaN, or numbers out of their range; a step that is unstable in every row.
         """
         own = tuple(name for name in outputs if name != FREEZE_ERROR)
         if len(own) < len(outputs):
@@ -459,6 +459,22 @@ class SymbolicModel(CollisionModel):
         """
         values = self.settings.override(overrides)
         return self._longest(self._frozen_at(self.robot.check_configuration(q), values), values)
+
+    def unstable_rows(self, given: Mapping[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
+        """(N) rows of a batch that explicit steps are unstable of, or that rounding spoils; inputs by name
+        have a first axis of N or 1."""
+        count, function = len(given["q"]), self._stability[0]
+        inputs = (given["q"], np.zeros((1, self.robot.nv)), given["normal"], np.zeros((1, 1)))
+        columns = [np.broadcast_to(x, (count, x.shape[1])).T for x in inputs]
+        found = function.map(count).call([ca.DM(x) for x in columns])
+        frozen = {name: np.array(x).T for name, x in zip(function.name_out(), found, strict=True)}
+        data: dict[str, Any] = frozen | {name: given[name] for name in self.settings}
+        if self.terms.bias or self.terms.jdot:
+            data |= {"d": np.zeros((1, self.robot.n)), "e": np.zeros((1, 1))}
+        model = joint_space_model(self)
+        own = {name: x for name, x in data.items() if name in model.data}
+        unstable = unstable_rows(model, self._stability[1], own, self.step_length)
+        return np.asarray(unstable | spoiled(frozen))
 
     def _longest(
         self, frozen: dict[str, NDArray[np.float64]], values: dict[str, NDArray[np.float64]]

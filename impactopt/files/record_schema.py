@@ -44,20 +44,91 @@ _TEXTS = ("joints", "replayed_soles")
 _ROBOT = ("n", "nq", "nv")
 # of the motion; what there is none of may be NaN
 _FINITE = ("time", "q", "posture", "velocity", "angle", "torque", "links", "path")
-_NUMBER, _NONE = (int, float), (int, float, type(None))
-_KEYS: Mapping[str, tuple[type, ...]] = {
-    **dict.fromkeys(("status", "message", "solver"), (str,)),
-    **dict.fromkeys(("violations", "starts"), (list,)),
-    **dict.fromkeys(("iterations",), (int,)),
-    **dict.fromkeys(("solve_seconds", "build_seconds", "max_violation"), _NONE),
-    "problem": (dict,),
+# What a value of the summary may be: one of these kinds. A table of kinds is of a table with these keys, a
+# key with a question mark may be left out, "*" is any other key; a list of one kind is of a list.
+_Kinds = tuple[Any, ...]
+_TEXT: _Kinds = (str,)
+_NUMBER: _Kinds = (int, float, type(None))  # what is not finite is null
+_YES: _Kinds = (bool, type(None))
+_NUMBERS: _Kinds = ({"*": _NUMBER},)
+_PHASES: _Kinds = ({"*": _NUMBER},)
+_TOUCHES: _Kinds = (
+    [
+        {
+            **dict.fromkeys(("one", "other"), _TEXT),
+            "depth_mm": (int, float),
+            **dict.fromkeys(("start_s?", "end_s?", "force_N?"), _NUMBER),
+            "missed?": _YES,
+        }
+    ],
+    type(None),
+)
+_BLOW: dict[str, _Kinds] = {
+    **dict.fromkeys(("impulse_Ns?", "peak_force_N?", "contact_ms?", "hand_speed_m_s?"), _NUMBER),
+    "target?": ({"*": (int, float, bool, type(None))}, type(None)),
 }
-_TYPES: Mapping[str, tuple[type, ...]] = {
-    **dict.fromkeys(("target", "objectives", "torque_ratio", "versions", "simulated", "replayed"), (dict,)),
-    **dict.fromkeys(("contacts_besides", "collision_elements"), (list, type(None))),
-    **dict.fromkeys(("note", "caution", "command"), (str,)),
-    **dict.fromkeys(("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "duration_s"), _NONE),
-    **dict.fromkeys(("clearance_mm", "collision_error_pct", "nodes_added"), _NONE),
+_BODIES: dict[str, _Kinds] = {
+    "clearance_mm?": _NUMBER,
+    "nearest?": (str, type(None)),
+    "contacts_besides?": _TOUCHES,
+}
+_REPLAYS_NUMBERS = (
+    *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
+    *("min_normal_force_N?", "sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
+)
+_ANY_REPLAY: dict[str, _Kinds] = {
+    **_BLOW,
+    **_BODIES,
+    **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
+    **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
+    "standing?": _YES,
+    "sole_cop_margin_m?": (*_PHASES, type(None)),
+}
+_SIMULATED = {**_ANY_REPLAY, "torque_ratio?": _PHASES, "zmp_margin_m?": _PHASES}
+_REPLAYED = {
+    **_ANY_REPLAY,
+    **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER),
+    **dict.fromkeys(("torque_ratio_by_phase?", "zmp_margin_by_phase_m?"), (*_PHASES, type(None))),
+}
+_START = {
+    **dict.fromkeys(("start", "status"), _TEXT),
+    **dict.fromkeys(("impulse_Ns", "seconds"), (int, float)),
+    "iterations": (int,),
+    "kept": (bool,),
+    **dict.fromkeys(("objective?", "max_violation?"), _NUMBER),
+}
+_PROBLEM = {
+    **dict.fromkeys(("name?", "robot?", "striker?", "target?", "law?", "hash?", "collision?"), _TEXT),
+    **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),
+    **dict.fromkeys(("scenarios?", "objectives?"), ([_TEXT],)),
+}
+_SCENARIO = {**_BLOW, "name": _TEXT, **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER)}
+# of a record with arrays, whole
+_KEYS: Mapping[str, _Kinds] = {
+    **dict.fromkeys(("status", "message", "solver"), _TEXT),
+    "violations": ([({"row": _TEXT, "by": _TEXT, "amount?": _NUMBER},)],),
+    "starts": ([(_START,)],),
+    "iterations": (int,),
+    **dict.fromkeys(("solve_seconds", "build_seconds", "max_violation"), _NUMBER),
+    "problem": (_PROBLEM,),
+}
+_OTHERS: Mapping[str, _Kinds] = {
+    **_BLOW,
+    **_BODIES,
+    **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
+    **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _PHASES),
+    **dict.fromkeys(
+        ("duration_s?", "collision_error_pct?", "nodes_added?", "motion_price_pct?", "capture_margin_m?"),
+        _NUMBER,
+    ),
+    "collision_elements?": ([(int,)], type(None)),
+    "scenarios?": ([(_SCENARIO,)],),
+    "simulated?": (_SIMULATED,),
+    "replayed?": (_REPLAYED,),
+    "versions?": ({"*": _TEXT},),
+    "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
+    "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
+    **dict.fromkeys(("note?", "caution?", "command?"), _TEXT),
 }
 _DEEPEST = 20
 
@@ -113,24 +184,44 @@ def check_summary(summary: Any, *, whole: bool) -> None:
     """
     if not isinstance(summary, dict):
         raise ValueError("its summary is no table")
-    for name, kinds in _KEYS.items():
-        if name in summary:
-            _check_kind(name, summary[name], kinds)
-        elif whole:
-            raise ValueError(f"its summary has no {name}")
-    for name in _TYPES.keys() & summary.keys():
-        _check_kind(name, summary[name], _TYPES[name])
-    for name in ("violations", "starts"):
-        for entry in summary.get(name, ()):
-            _check_kind(name, entry, (dict,))
+    needed = _KEYS if whole else {f"{name}?": kinds for name, kinds in _KEYS.items()}
+    _check_table("", summary, {**needed, **_OTHERS})
     for text in _texts(summary):
         if has_control(text):
             raise ValueError(f"its summary has text with control characters: {text[:40]!r}")
 
 
-def _check_kind(name: str, value: Any, kinds: tuple[type, ...]) -> None:
-    if not isinstance(value, kinds) or isinstance(value, bool):
-        raise ValueError(f"{name} in its summary is of the kind {type(value).__name__}")
+def _check_kind(name: str, value: Any, kinds: _Kinds) -> None:
+    """`name` : where the value is, as a reader of the file would write it."""
+    for kind in kinds:
+        if isinstance(kind, dict) and isinstance(value, dict):
+            return _check_table(f"{name}.", value, kind)
+        if isinstance(kind, list) and isinstance(value, list):
+            (of,) = kind
+            for i, entry in enumerate(value):
+                _check_kind(f"{name}[{i}]", entry, of if isinstance(of, tuple) else (of,))
+            return None
+        # true and false are whole numbers to Python
+        if (
+            isinstance(kind, type)
+            and isinstance(value, kind)
+            and (kind is bool or not isinstance(value, bool))
+        ):
+            return None
+    raise ValueError(f"{name} in its summary is of the kind {type(value).__name__}")
+
+
+def _check_table(above: str, table: Mapping[str, Any], kinds: Mapping[str, _Kinds]) -> None:
+    """Keys that are not known are let be: a newer version's."""
+    for key, of in kinds.items():
+        name = key.removesuffix("?")
+        if name != "*" and name in table:
+            _check_kind(f"{above}{name}", table[name], of)
+        elif name == key != "*":
+            raise ValueError(f"its summary has no {above}{name}")
+    if "*" in kinds:
+        for name, value in table.items():
+            _check_kind(f"{above}{name}", value, kinds["*"])
 
 
 def _texts(data: Any, depth: int = 0) -> Iterator[str]:

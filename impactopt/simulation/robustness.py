@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, check_array, check_whole, shortened
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
-from impactopt.simulation import Conditions, Scene, scene_of, simulate_mujoco
+from impactopt.simulation import Conditions, Scene, Simulation, scene_of, simulate_mujoco
+from impactopt.simulation.accuracy import check_steps, with_step_error
 from impactopt.simulation.mujoco_world import mujoco_module
 from impactopt.simulation.workers import map_on_workers
 
@@ -201,7 +202,7 @@ class Robustness:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Shared:
+class Shared:
     """What every replay needs."""
 
     robot: Robot
@@ -210,12 +211,19 @@ class _Shared:
     step: float
 
 
-def replay(shared: _Shared, conditions: Conditions) -> Row:
+def _simulate(
+    robot: Robot, reference: Any, scene: Scene, *, step: float = STEP, **options: Any
+) -> Simulation:
+    """As `simulate_mujoco`, with draws' own step, which their steps' error is measured from."""
+    return simulate_mujoco(robot, reference, scene, step=step, **options)
+
+
+def replay(shared: Shared, conditions: Conditions) -> Row:
     """One draw; what goes wrong is its reason."""
+    given = (shared.robot, shared.reference, shared.scene)
     try:
-        s = simulate_mujoco(
-            shared.robot, shared.reference, shared.scene, step=shared.step, conditions=conditions
-        )
+        s = with_step_error(_simulate, *given, step=shared.step, conditions=conditions)
+        check_steps(s, shared.step)
     except InputError as error:
         return Row(standing=False, reason=str(error))
     except Exception as error:  # whatever MuJoCo raises: other draws may still work
@@ -255,11 +263,12 @@ def robustness(
     reference : as of :class:`impactopt.transcription.plan.Trajectory`.  planned_impulse [N s].
     draws, seed, spread : as of :func:`draw_conditions`; a wall has no mass, so none is drawn.
     workers : processes. A script that asks for more than 1 needs `if __name__ == "__main__":`.
-    step [s] : of the simulation.
+    step [s] : of the simulation; shorter where the impulse needs it, as of `validate`.
     progress : called with how many replays are done, of how many.
 
-    A replay that diverges, or whose process dies, is a draw that does not stand, with its reason. Ctrl-C ends
-    the processes and is raised.
+    A replay that diverges, whose steps leave more than 1 % of its impulse uncertain though they were halved,
+    or whose process dies, is a draw that does not stand, with its reason. Ctrl-C ends the processes and is
+    raised.
 
     Raises
     ------
@@ -276,7 +285,7 @@ def robustness(
     mujoco_module()
     if workers > 1:
         _check_travels(scene)
-    shared = _Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
+    shared = Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
     rows = map_on_workers(replay, shared, conditions, workers=workers, crashed=_crashed, progress=progress)
     return Robustness(
         conditions=tuple(conditions),

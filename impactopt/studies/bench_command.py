@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from click import get_current_context
 
 from impactopt.studies.report import Report, Say
 from impactopt.studies.running import show_reports
@@ -236,6 +237,9 @@ def _run(
     together: bool = False,
 ) -> None:
     """Run benches by name, show each when it is done; ``options`` by bench."""
+    if "attack" in names:  # its command lines need the program, which is above this room and hands itself in
+        program = get_current_context().obj
+        options = {**options, "attack": {**options.get("attack", {}), "program": program}}
 
     def run(name: str, say: Say) -> Report:
         from impactopt.studies.registry import run_bench

@@ -32,7 +32,10 @@ Numbers = Mapping[Place, Array]  # columns of numbers, by their keys' places
 _ROWS, _WITH_HISTORIES = 8192, 512  # rows at a time: histories are large
 _TOLERANCE = 1e-4  # relative, of the full dynamics' impulse
 NOT_ENDED = "the contact has not ended at the horizon; raise at_contact.horizon_s"
-NO_NUMBER = "the collision has no finite numbers: its steps are unstable here"
+NO_NUMBER = (
+    "the collision has no finite numbers: its steps are unstable here, or what holds the robot cannot be "
+    "told apart"
+)
 TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the impulse would be left out"
 
 

@@ -8,12 +8,17 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, PlainValidator
 from pydantic.fields import FieldInfo
 
+from impactopt.errors import FARTHEST, MOST
+from impactopt.files.problem_file.changes import LONGEST_KEY
 from impactopt.files.problem_file.contacts import LAWS, TARGETS
 from impactopt.files.problem_file.describing import about_section
 from impactopt.files.problem_file.mistakes import range_of
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
-from impactopt.files.problem_file.toml import plain_value
+from impactopt.files.problem_file.toml import DEEPEST, LONGEST_TEXT, plain_value
+from impactopt.problem.checks import MANY
+from impactopt.problem.problem import FINEST, LONGEST, LONGEST_CONTACT, MOST_ELEMENTS, SHORTEST, STEEPEST
+from impactopt.robots.checks import HEAVIEST
 
 __all__ = ["reference"]
 
@@ -39,14 +44,48 @@ In Python: `impactopt.load_problem("my.toml")`, `impactopt.write_problem(problem
 and `problem.hash`, the same for the same problem, however it was written. A contact law, target, term or
 robot that is made of functions or models in Python is no data, and has no file.
 
+## Limits
+
+What is larger is a slip of a unit or of a key, or would keep a machine busy for hours: it is refused, with
+the limit, before work starts.
+
+| what | at most | why |
+|---|---|---|
+{limits}
+
 This page is made by `impactopt new --reference`.
 """
+# what, how much, and why
+_LIMITS = (
+    ("a file", f"{LONGEST_TEXT / 2**20:g} MiB", "400 times the longest of the package's; read in seconds"),
+    (
+        "tables and lists in each other",
+        f"{DEEPEST} deep",
+        "files are five deep; parsers end at some hundred",
+    ),
+    ("a key of `--set`", f"{LONGEST_KEY} characters", "the longest has 50"),
+    ("any number", f"{MOST:g}", "products of three such numbers are still numbers"),
+    ("numbers of law and target, where not 0", f"at least {1 / MOST:g}", "likewise, of quotients"),
+    ("a place or a length [m]", f"{FARTHEST:g}", "farther from the robot no rounding is small beside a gap"),
+    ("a mass [kg] or an inertia [kg m2] of the robot", f"{HEAVIEST:g}", "a ship"),
+    (
+        "a phase's duration [s]",
+        f"{SHORTEST:g} to {LONGEST:g}",
+        "no servo is faster, no blow takes longer",
+    ),
+    ("a phase's `intervals`", f"{FINEST}", "at 1 s as often as a servo of 4 kHz samples"),
+    ("a phase's `grading`", f"1 to {STEEPEST:g}", "steeper ones leave intervals of no length"),
+    ("`[collision] duration_s` [s]", f"{LONGEST_CONTACT:g}", "a blow takes some milliseconds"),
+    ("`[collision] elements`", f"{MOST_ELEMENTS} a phase", "two are within a few per mille"),
+    ("`[[scenarios]]`, and `[[obstacles]]`", f"{MANY} each", "each is part of the program"),
+)
 _TYPES = {float: "number", int: "whole number", bool: "true or false", str: "text"}
 
 
 def reference() -> str:
     """The page, in Markdown."""
-    parts = [_INTRODUCTION]
+    limits = "\n".join(f"| {' | '.join(row)} |" for row in _LIMITS)
+    parts = [_INTRODUCTION.replace("{limits}", limits)]
     several: dict[str, Mapping[str, type[Section]]] = {"target": TARGETS, "contact": LAWS}
     for name, info in File.model_fields.items():
         kinds = several.get(name, {})

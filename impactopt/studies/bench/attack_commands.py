@@ -6,17 +6,17 @@ No command here plans: what takes long by itself is not what is looked for.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import json
 import os
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 
 from impactopt.report.plain_errors import BUG
 from impactopt.studies.bench.attack_cases import Found, Generator, attempt, odd_number, pick
@@ -88,13 +88,14 @@ def make_result(folder: Path) -> Path:
     return folder / RESULT
 
 
-def attack_command(result: Path, folder: Path, rng: Generator) -> Found:
-    """One command line, run in a new folder in this process."""
+def attack_command(program: Callable[[], typer.Typer], result: Path, folder: Path, rng: Generator) -> Found:
+    """One command line, run in a new folder in this process.
+
+    program : gives the one that has the commands.
+    """
     from typer.testing import CliRunner
 
-    # by name, as a user's shell does it: the command line is above what it runs
-    app = importlib.import_module("impactopt.cli.app").app
-
+    app = program()
     with _inside(folder, rng) as here:
         words = str(pick(rng, _LINES)).split()
         told = []

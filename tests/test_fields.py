@@ -11,13 +11,13 @@ import pytest
 from pydantic import ValidationError
 
 import impactopt
+from impactopt.contact.fields import About, Described, about, abouts, snake_case
 from impactopt.contact.laws import LAWS
 from impactopt.contact.targets import TARGETS
 from impactopt.errors import InputError
 from impactopt.files.problem_file.described import section_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import TERMS
-from impactopt.contact.fields import About, Described, about, abouts, snake_case
 
 # package -> its classes, and what else has a file there
 FAMILIES: dict[str, tuple[tuple[type, ...], set[str]]] = {

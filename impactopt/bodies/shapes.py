@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
 from impactopt.contact.fields import Described, about
+from impactopt.errors import FARTHEST, InputError, check_array, check_name, did_you_mean, shortened
 
 Vector = tuple[float, float, float]
 

@@ -9,8 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.errors import MOST, InputError, check_array
 from impactopt.contact.fields import abouts
+from impactopt.errors import MOST, InputError, check_array
 
 Parameters = Mapping[str, Any]
 

@@ -135,7 +135,9 @@ class Plan:
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
-        return f"<Plan of {self.problem.name!r}: {self.impulse:.2f} N s, contact at {self.contact_start:.3g} s>"
+        return (
+            f"<Plan of {self.problem.name!r}: {self.impulse:.2f} N s, contact at {self.contact_start:.3g} s>"
+        )
 
     @property
     def coordinates(self) -> StanceCoordinates:

@@ -8,9 +8,9 @@ from math import sqrt
 from typing import Any, ClassVar
 
 from impactopt.contact._expressions import Parameters, choose, power
+from impactopt.contact.fields import about
 from impactopt.contact.laws.base import ContactLaw
 from impactopt.errors import InputError, check_array
-from impactopt.contact.fields import about
 
 __all__ = ["HertzDamped"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from impactopt.contact._expressions import Parameters, power
-from impactopt.contact.laws.base import ContactLaw
 from impactopt.contact.fields import about
+from impactopt.contact.laws.base import ContactLaw
 
 __all__ = ["HuntCrossley"]
 

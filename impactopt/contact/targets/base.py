@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import casadi as ca
 
 from impactopt.contact._expressions import Parameters, check_numbers, numbers_of, text_of
-from impactopt.errors import InputError
 from impactopt.contact.fields import Described
+from impactopt.errors import InputError
 
 __all__ = ["UNITS", "Target"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from impactopt.contact._expressions import Parameters, choose
-from impactopt.contact.targets.base import Target
 from impactopt.contact.fields import about
+from impactopt.contact.targets.base import Target
 
 __all__ = ["Board"]
 

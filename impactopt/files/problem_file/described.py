@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, g
 
 from pydantic import AfterValidator, Field, PlainValidator, create_model
 
+from impactopt.contact.fields import About, abouts
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import any_margin, per_joint, unit_vector
-from impactopt.contact.fields import About, abouts
 
 __all__ = ["one_of", "section_of", "sections_of"]
 

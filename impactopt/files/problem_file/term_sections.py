@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from impactopt.contact.fields import snake_case
 from impactopt.files.problem_file.described import sections_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import DEFAULT_TERMS, TERMS
-from impactopt.contact.fields import snake_case
 
 __all__ = ["Objectives", "Terms"]
 

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from impactopt.contact.fields import Described, about
 from impactopt.errors import MOST, InputError, check_array
 from impactopt.problem.terms.base import check_known, kind_of
-from impactopt.contact.fields import Described, about
 
 __all__ = ["WEIGHT", "Objective", "check_objectives"]
 

@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from impactopt.contact.fields import about
 from impactopt.errors import InputError
 from impactopt.problem.terms.base import Term
-from impactopt.contact.fields import about
 
 
 @dataclass(frozen=True, kw_only=True)

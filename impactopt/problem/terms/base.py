@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from impactopt.bodies.shapes import vector
-from impactopt.errors import MOST, InputError, check_number, shortened
 from impactopt.contact.fields import About, Described, abouts
+from impactopt.errors import MOST, InputError, check_number, shortened
 
 __all__ = ["Term", "check_known", "kind_of", "of_joints"]
 

@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 
 from impactopt.bodies.shapes import Vector
+from impactopt.contact.fields import about
 from impactopt.errors import InputError
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term
 from impactopt.problem.violation import degrees
-from impactopt.contact.fields import about
 
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from impactopt.contact.fields import about
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
-from impactopt.contact.fields import about
 
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates

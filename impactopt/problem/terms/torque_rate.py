@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from impactopt.contact.fields import about
 from impactopt.problem.terms.base import Term, of_joints
 from impactopt.problem.violation import Measure
-from impactopt.contact.fields import about
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from impactopt.problem.terms.base import Term
 from impactopt.contact.fields import about
+from impactopt.problem.terms.base import Term
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,10 +24,8 @@ from impactopt.collision.checks import ACCURACY, too_large
 from impactopt.collision.native import native_collision
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
+from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array, raw_array
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["Batch"]
 
@@ -42,13 +40,22 @@ class Batch:
     ----------
     model : of the collision.
     outputs : names out of `impactopt.collision.OUTPUTS` that the model has.
+    stable_step : the longest stable one [s] of a configuration and settings.
     every : keep every so many steps of the histories.
     """
 
-    def __init__(self, model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> None:
+    def __init__(
+        self,
+        model: SteppedModel,
+        outputs: tuple[str, ...],
+        stable_step: Callable[..., float],
+        *,
+        every: int = 1,
+    ) -> None:
         # these say which contacts have not ended, and which steps were too long
         judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
-        self.model, self.outputs = model, tuple(dict.fromkeys((*outputs, *judges)))
+        self.model, self._stable_step = model, stable_step
+        self.outputs = tuple(dict.fromkeys((*outputs, *judges)))
         recipe = (*model._recipe, *self.outputs, every)
 
         def build() -> list[Any]:
@@ -69,7 +76,7 @@ class Batch:
         *,
         threads: int | None = None,
     ) -> dict[str, Array]:
-        """As of `SymbolicModel.batch`."""
+        """As of `SteppedModel.batch`."""
         cores = os.cpu_count() or 1 if threads is None else threads
         if not isinstance(cores, int) or cores < 1:
             raise InputError(f"threads: {threads!r}; give a whole number >= 1")
@@ -98,7 +105,7 @@ class Batch:
     def _check_step(self, given: Mapping[str, Array]) -> None:
         first = {name: given[name][0] for name in self.model.settings}
         first = {name: x.reshape(self.model.settings[name].shape) for name, x in first.items()}
-        longest, step = self.model.stable_step(given["q"][0], **first), self.model.step_length
+        longest, step = self._stable_step(given["q"][0], **first), self.model.step_length
         self.model.check_step(step, longest, "in the first collision")
 
     def _shaped(self, name: str, flat: Array, shape: tuple[int, int]) -> Array:
@@ -169,7 +176,7 @@ def _by_columns(x: Array) -> Array:
 
 
 def _inputs(
-    model: SymbolicModel, q: ArrayLike, v: ArrayLike, torque: ArrayLike | None, settings: Mapping[str, Any]
+    model: SteppedModel, q: ArrayLike, v: ArrayLike, torque: ArrayLike | None, settings: Mapping[str, Any]
 ) -> dict[str, Array]:
     """Each input, (N, ...) or (1, ...)."""
     robot = model.robot
@@ -191,7 +198,7 @@ def _inputs(
     return given | _settings(model, settings, count)
 
 
-def _settings(model: SymbolicModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
+def _settings(model: SteppedModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
     """Of each setting its value for all, or one a collision, in its range."""
     alone = model.settings.override(
         {

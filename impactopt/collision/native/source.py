@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,20 +19,15 @@ from impactopt.collision.native.generated import (
 )
 from impactopt.collision.native.lanes import tree_in_lanes
 from impactopt.collision.native.sizes import names_table, shapes_out, shapes_table, sizes, with_jacobians
+from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["native_collision", "native_gradient", "native_jacobian"]
 
 # the kernel's files of the steps, and of the way back
-_STEPS = {"events": ("taylor.h", "steps.h"), "rk4": ("rk4.h", "steps.h"), "implicit": ("implicit.h",)}
-_BACK = {
-    "events": ("taylor_back.h", "steps_back.h"),
-    "rk4": ("rk4_back.h", "steps_back.h"),
-    "implicit": ("implicit_back.h",),
-}
+_IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "bend", "events", "run")))
+_STEPS = {"rk4": ("rk4.h", "steps.h"), "implicit": tuple(f"{name}.h" for name in _IMPLICIT)}
+_BACK = {"rk4": ("rk4_back.h", "steps_back.h"), "implicit": ("implicit_back.h",)}
 # the tree's code is long and straight: this makes it a sixth faster than -Og, for half a second more of the
 # compiler; -O2 takes as much again and gains no more. Its angles' sines and cosines are our own
 _TREE = (
@@ -49,7 +44,7 @@ _NEEDS_COMPILER = (
 _LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
 
-def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
+def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
     """C code of the function that `collision_graph` gives, with the same inputs and outputs.
 
     Its numbers agree with the graph's to rounding, but for implicit steps, which the graph has not. It has no
@@ -63,18 +58,18 @@ def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, ever
     )
 
 
-def native_gradient(collision: SymbolicModel, output: str) -> Any:
+def native_gradient(collision: SteppedModel, output: str) -> Any:
     """C code of the function that `gradient_graph` gives; with several freezes, that graph itself.
 
     Where there is no compiler, the graph takes its place, but not that of implicit steps: its own are
-    Taylor's, which a stiff contact or servo spoils without a word.
+    Runge-Kutta's, which a stiff contact or servo spoils without a word.
     """
     if collision.n_freezes:
         return gradient_graph(collision, output)
 
     def graph() -> Any:
         if collision.stepping == "implicit":
-            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'events'"))
+            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
         return _no_nan(gradient_graph(collision, output))
 
     return NativeCode(
@@ -84,8 +79,8 @@ def native_gradient(collision: SymbolicModel, output: str) -> Any:
     )
 
 
-def native_jacobian(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
-    """C code of what `SymbolicModel.jacobian_function` gives, for implicit steps and one freeze."""
+def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
+    """C code of what `SteppedModel.jacobian_function` gives, for implicit steps and one freeze."""
 
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("jacobian_function", ""))
@@ -104,7 +99,7 @@ def _no_nan(graph: ca.Function) -> ca.Function:
     return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 
-def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: int) -> str:
+def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: int) -> str:
     frozen, gradient = frozen_dynamics(collision), name == "collision_gradient"
     jacobian = name == "collision_jacobian"
     ground = bool({"ground_wrench", "zmp"} & {*outputs})

@@ -170,7 +170,7 @@ class Step:
 
     def _bend(self, rates: Array) -> tuple[Array, bool]:
         """(n as terms (9, inputs), whether it was found)."""
-        rows, inputs = self.rows, self._B.shape[1]
+        inputs, rest = self._B.shape[1], 0.0 * rates
         base = self._seen(self._series(self.y, self.h * rates, np.zeros((STAGES + 1, inputs))))
         seen = base.shape[1]
         answers = np.zeros((NODES, seen, NODES, inputs))
@@ -178,9 +178,7 @@ class Step:
             for a in range(inputs):
                 unit = np.zeros((STAGES + 1, inputs))
                 unit[:, a] = _FROM_NODES[:, i]
-                answers[:, :, i, a] = self._seen(
-                    self._series(np.zeros_like(self.y), 0 * rates, unit), offset=0.0
-                )
+                answers[:, :, i, a] = self._changes(self._series(rest, rest, unit))
                 if a == inputs - 1:
                     answers[i, 1, i, a] -= 1.0
         K, n = answers.reshape(NODES * seen, NODES * inputs), np.zeros(NODES * inputs)
@@ -195,17 +193,21 @@ class Step:
             n = n + change
             if (np.abs(change).reshape(NODES, inputs) <= _CONVERGED * sizes).all():
                 return _FROM_NODES @ n.reshape(NODES, inputs), True
-        del rows
         return _FROM_NODES @ n.reshape(NODES, inputs), False
 
-    def _seen(self, terms: Array, offset: float | None = None) -> Array:
-        """Penetration, rate and target at the nodes (7, 2 + k); the rate as it is, or a change of it."""
-        rows, _, at = self.rows, *self._slopes[1:]
+    def _changes(self, terms: Array) -> Array:
+        """Of penetration, rate and target at the nodes (7, 2 + k), by terms of a change of the state."""
+        rows, at = self.rows, self._slopes[2]
         places = self.at_nodes(terms)
         rate = places @ (rows.speeds[-1] - at @ rows.target)
-        if offset is None:
-            rate = rate + self._rate - self.y @ (rows.speeds[-1] - at @ rows.target)
         return np.column_stack([places @ rows.penetration, rate, places @ rows.target.T])
+
+    def _seen(self, terms: Array) -> Array:
+        """Likewise, themselves."""
+        found = self._changes(terms)
+        rows, at = self.rows, self._slopes[2]
+        found[:, 1] += self._rate - self.y @ (rows.speeds[-1] - at @ rows.target)
+        return found
 
     def _remainders(self, place: Array) -> tuple[Array, Array, Array]:
         """(R (inputs), its slopes by what is seen, the sizes of what it is a remainder of)."""

@@ -12,6 +12,15 @@ has order eight for every theta. Where 1/gamma is a root of L_8 the fastest mode
 theta < 1, let them grow by a third at most). What is left out, p_9(1) z^9, is smaller than what Taylor's
 polynomial of degree eight leaves out.
 
+Law and target need not be linear. J then has their slopes at the step's begin, and what they are beyond
+these, n(theta), acts on the linear rest as an input: with n = sum of n_j p_j and e what it acts on,
+
+    (I - gamma h J) w_(j+1) = h J w_j + h e (n_j + gamma n_(j+1)).
+
+n is a polynomial of degree seven that is right at the step's begin and at Lobatto's other seven places. It is
+a few scalars (force, target), so that Newton's method on them costs little beside the stages, of which there
+are three sets: without n, its answers, and with n. For what is linear n is zero, and nothing is different.
+
 Source: S. P. Norsett, "Restricted Pade approximations to the exponential function", SIAM J. Numer. Anal. 15
 (1978) 1008-1029; E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.6.
 """
@@ -56,8 +65,8 @@ def tables() -> dict[str, Array | float]:
     HULL (9, 16) : Bernstein coefficients of a sum of w_j p_j are w' HULL, and zeros.
     BOUND (9) : largest |p_j| on [0, 1].
     LEFT_OUT : |p_9(1)|, what a further term would be multiplied by.
-    AT_NODES (7, 9) : p_j at the nodes. FROM_NODES (9, 7) : coefficients of the p_j of a polynomial that is 0 at the
-        begin, from its values at the nodes.
+    AT_NODES (7, 9) : p_j at the nodes. FROM_NODES (9, 7) : coefficients of the p_j of a polynomial that is 0
+        at the begin, from its values at the nodes.
     ANSWERS (8, 7, 7) : of inputs with these values at the nodes, what the nodes see of (h J S)^k S h.
     """
     P, theta = polynomials(), np.linspace(0.0, 1.0, 2001)

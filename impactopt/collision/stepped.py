@@ -33,9 +33,9 @@ class SteppedModel(CollisionModel):
     terms : effects that are taken into account.
     method : how the frozen system is integrated. "implicit" (None): A-stable steps of order eight that end on
         events and find their own length. Without a C compiler they are done in NumPy: the same numbers, a
-        hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps, within 1e-2 of
-        the impulse, or of a plastic blow's where contact is broken off before; `collide` refuses a step that it
-        estimates not to hold this.
+        hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps, within 1e-2
+        of the impulse, or of a plastic blow's where contact is broken off before; `collide` refuses a step
+        that it estimates not to hold this.
     step : [s] of "rk4", its length, below `stable_step(q)`; None: the paper's 1e-4. Of "implicit", which any
         step suits, the histories' spacing; None: 1e-3.
     tolerance : of "implicit", what a step may leave out of the hand's speed and of the impulse, relative to
@@ -103,8 +103,8 @@ class SteppedModel(CollisionModel):
 
     @property
     def step_of_graph(self) -> float:
-        """[s] of the Runge-Kutta steps of `graph`: the model's, or the paper's, as a graph cannot find the lengths
-        of implicit ones on the way."""
+        """[s] of the Runge-Kutta steps of `graph`: the model's, or the paper's, as a graph cannot find the
+        lengths of implicit ones on the way."""
         return self.step_length if self.stepping == "rk4" else min(STEPS["rk4"], self.horizon)
 
     @cached_property

@@ -37,10 +37,15 @@ class SymbolicModel(SteppedModel):
     def graph(self, outputs: tuple[str, ...] = ("impulse",), *, every: int = 1) -> Any:
         """The collision as a differentiable ca.Function that is not compiled, to build larger graphs with.
 
-        Its steps are Runge-Kutta's, `step_of_graph` long, whatever the method: within 1e-2. Inputs as of
-        `function` with all settings; see there.
+        Its steps are Runge-Kutta's, `step_of_graph` long, whatever the method: within 1e-2. Only without
+        further freezes: else InputError. Inputs as of `function` with all settings; see there.
         """
         self._check_outputs(outputs, every)
+        if self.n_freezes:
+            raise InputError(
+                "graph: its Runge-Kutta steps say nothing of how the contact's duration changes, which freezes "
+                "on the way go by; give freezes=0, or take `function` and `gradient_function`"
+            )
         return collision_graph(self, tuple(outputs), every=every)
 
     def function(
@@ -72,6 +77,7 @@ class SymbolicModel(SteppedModel):
         """A compiled ca.Function with the inputs of `function`, to a scalar output and its gradients.
 
         Returns (value, d/dq (nv), d/dv (nv)): q's gradient is in the basis of v, as `pin.integrate` moves q.
+        With freezes on the way it comes from differences, 4 nv collisions.
         """
         self._check_outputs((output,), 1)
         numbers = [name for name in SCALARS if name != "step_error"]
@@ -146,9 +152,10 @@ class SymbolicModel(SteppedModel):
         -------
         Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
         frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool,
-        False also where there came out no number. With "rk4" also `step_error` (N), what its steps left out of
-        each impulse, as an estimate: collisions that it is too large of, more than 1e-2, have no numbers. That the step is stable for the servos is checked in the first
-        collision only. `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
+        False also where there came out no number. With "rk4" also `step_error` (N), what its steps left out
+        of each impulse, as an estimate: collisions that it is too large of, more than 1e-2, have no numbers.
+        That the step is stable for the servos is checked in the first collision only.
+        `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 
         Raises
         ------
@@ -276,7 +283,7 @@ class SymbolicModel(SteppedModel):
         return result
 
     def stable_step(self, q: ArrayLike, **overrides: ArrayLike) -> float:
-        """[s] that steps of "rk4" have to stay below at q: 2.6 over the fastest rate, with no joint saturated.
+        """[s] that steps of "rk4" have to stay below at q: 2.6 over the fastest rate, no joint saturated.
 
         InputError where what holds the robot cannot be told apart.
         """

@@ -116,7 +116,7 @@ def _number(expression: Any) -> Any:
 
 
 # of each function, the inputs that it is differentiated by
-_BACK = {"contact_force": (0, 1), "target_rates": (0, 1)}
+_BACK: dict[str, tuple[int, ...]] = {"contact_force": (0, 1), "target_rates": (0, 1)}
 _BACK |= {"target_velocity": (0,), "target_energy": (0,), "tree": (0, 1), "drift": (0, 1)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
@@ -36,8 +37,9 @@ _TREE = (
     + files(__package__).joinpath("angles.h").read_text(encoding="utf-8"),
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
+_OF_DIFFERENCES = 1e-11
 _NEEDS_COMPILER = (
-    "{}: derivatives of implicit steps need a C compiler that works: install gcc or clang, or name one in "
+    "{}: derivatives need a C compiler that works: install gcc or clang, or name one in "
     "the environment variable CC{}"
 )
 # with a direction a lane, without anything but sums and products: there only the time to compile it counts
@@ -58,17 +60,16 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
     )
 
 
-def native_gradient(collision: SteppedModel, output: str) -> Any:
-    """C code of the function that `gradient_graph` gives; with several freezes, that graph itself.
+def native_gradient(collision: SteppedModel, output: str) -> NativeCode:
+    """C code of the function that `gradient_graph` gives.
 
-    Where there is no compiler, the graph takes its place, but not that of implicit steps: its own are
-    Runge-Kutta's, which a stiff contact or servo spoils without a word.
+    Where there is no compiler, the graph takes its place, but not that of implicit steps or several freezes:
+    its own steps are Runge-Kutta's, which a stiff contact or servo spoils without a word, and which say
+    nothing of how the contact's duration changes.
     """
-    if collision.n_freezes:
-        return gradient_graph(collision, output)
 
     def graph() -> Any:
-        if collision.stepping == "implicit":
+        if collision.stepping == "implicit" or collision.n_freezes:
             raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
         return _no_nan(gradient_graph(collision, output))
 
@@ -108,6 +109,12 @@ def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: i
     scalars = scalar_functions(model, method=collision.stepping)
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
     if gradient:
+        # several freezes have differences of collisions with steps that do not count beside them
+        collision = (
+            replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
+            if collision.n_freezes
+            else collision
+        )
         of_tree = [*of_tree, *backwards(of_tree), tangent_back(frozen)]
         scalars += backwards(scalars)
         by = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
@@ -130,7 +137,7 @@ def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: i
         c_code("tree", of_tree),
         _TREE[1],
         c_code("scalars", scalars),
-        f"#define GRADIENT {int(gradient or jacobian)}",
+        f"#define GRADIENT {int((gradient and not collision.n_freezes) or jacobian)}",
         f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",
         *text("vectors.h"),
         *lanes,
@@ -142,7 +149,8 @@ def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: i
     method = collision.stepping
     files_used = ["freeze.h", "instant.h", "outputs.h", *_STEPS[method], "course.h"]
     if gradient:
-        files_used += ["back.h", *_BACK[method], "freeze_back.h", "gradient.c"]
+        files_used += ["results.h"] if collision.n_freezes else ["back.h", *_BACK[method], "freeze_back.h"]
+        files_used += ["gradient.c"]
     elif jacobian:
         parts_of_way = ("freeze", "outputs", "implicit", "course")
         forward = ["forward.h", *(f"{name}_forward.h" for name in parts_of_way)]

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,14 +26,7 @@ class ContactLaw(ABC):
     To write one, make a frozen dataclass whose fields are its numbers, and give `branch`. The branches have
     to agree where the rate is zero; contact ends when, in restitution, the branch's force has fallen to
     zero.
-
-    Attributes
-    ----------
-    analytic : whether the branches have derivatives of all orders at and around x = 0, as Taylor steps need
-        them; a law that has only the first, as x^1.5, says False and is integrated by Runge-Kutta steps.
     """
-
-    analytic: ClassVar[bool] = True
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any, ClassVar
+from typing import Any
 
 from impactopt.contact._expressions import Parameters, choose, positive, power
 from impactopt.contact.laws import ContactLaw
@@ -40,8 +40,6 @@ class HuntCrossley(ContactLaw):
     stiffness: float
     dissipation: float
     exponent: float = 1.5
-
-    analytic: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         positive("HuntCrossley: stiffness [N/m^p]", self.stiffness)
@@ -83,8 +81,6 @@ class HertzDamped(ContactLaw):
 
     stiffness: float
     damping: float
-
-    analytic: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         positive("HertzDamped: stiffness [N/m^1.5]", self.stiffness)

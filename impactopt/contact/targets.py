@@ -27,7 +27,6 @@ class Target(ABC):
     ----------
     n_states : size of the state.
     results : names of what `result` gives.
-    analytic : whether there are derivatives of all orders between switches, as Taylor steps need them.
     typical : sizes of the state's numbers, for scaling; ones if not given.
     events : what a plan has in the place of switches: what happens to it in a blow, in this order, each of
         which ends a phase of the contact; see `smooth`.
@@ -39,7 +38,6 @@ class Target(ABC):
 
     n_states: int
     results: ClassVar[tuple[str, ...]] = ()
-    analytic: ClassVar[bool] = True
     typical: ClassVar[tuple[float, ...]] = ()
     events: ClassVar[tuple[str, ...]] = ()
     phases: ClassVar[tuple[str, ...]] = ("compression", "restitution")

@@ -79,7 +79,8 @@ def freezes_of(counts: tuple[int, ...]) -> list[Found]:
             if count <= COMPILED:
                 impulse = model.collide(q, v, torque).impulse
             else:
-                impulse = float(model.graph()(q, v, torque, *model.settings.values()))
+                graph = collision_graph(model, ("impulse",), as_compiled=True)
+                impulse = float(graph(q, v, torque, *model.settings.values()))
         except InputError as refusal:
             found.append(("refused", str(refusal)[:60], 0.0, what))
             continue

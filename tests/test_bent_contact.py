@@ -1,4 +1,4 @@
-"""Implicit steps where law or target bend, and with gains that are matrices: against SciPy and differences."""
+"""Implicit steps where law or target bend, and with matrices of gains: against SciPy and differences."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_collisions_are_scipys(name: str) -> None:
 
 def test_the_error_falls_with_the_tolerance() -> None:
     """Of several speeds together; its order in the step's length is that of the tolerance's ninth root."""
-    (model, values), _ = case("Hunt-Crossley"), None
+    model, values = case("Hunt-Crossley")
     speeds, tolerances, errors = np.linspace(0.5, 1.5, 6), np.logspace(-3, -8, 4), []
 
     def impulses(tolerance: float) -> Any:

@@ -75,9 +75,10 @@ def test_a_contact_too_fast_for_the_step_is_refused_with_one_that_will_do() -> N
         slider(method="rk4").collide([0.0], [1.0], [0.0], **stiff)
     step = float(str(refusal.value).rsplit(maxsplit=1)[-1])
     # two free masses part elastically
-    for model in (slider(method="rk4", step=0.95 * step, horizon=0.01), slider()):
+    fixed = slider(method="rk4", step=0.95 * step, horizon=0.01)
+    for model, accuracy in ((fixed, 1e-2), (slider(), 1e-5)):
         result = model.collide([0.0], [1.0], [0.0], **stiff)
-        assert result.impulse == pytest.approx(2.0 / (1 / 2.0 + 1 / 5.0), rel=1e-5)
+        assert result.impulse == pytest.approx(2.0 / (1 / 2.0 + 1 / 5.0), rel=accuracy)
 
 
 def test_too_many_steps_are_refused_with_their_number() -> None:

@@ -119,7 +119,6 @@ def test_targets_are_at_rest_at_first_and_have_brought_nothing(name):
     assert target.velocity(rest) == 0.0 and target.energy(rest) == 0.0
     assert [float(x) for x in target.result(rest)] == [0.0] * len(target.results)
     assert target.derivative(rest, 0.0) == rest
-    assert target.analytic
 
 
 def test_formulas_tell_targets_apart_but_not_their_numbers():

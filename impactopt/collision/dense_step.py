@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 _TABLES = tables()
 _AT_NODES, _FROM_NODES = np.asarray(_TABLES["AT_NODES"]), np.asarray(_TABLES["FROM_NODES"])
 # as in native/implicit_bend.h
-_MOST_ITERATIONS, _CONVERGED = 12, 1e-9
+_MOST_ITERATIONS, _CONVERGED = 12, 1e-6
 
 
 class Contact:

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 _JUST_BEYOND, _AT_ONCE, _FIRST_STEP, _WORTH_LONGER, _AIMED_AT = 1e-9, 1e-5, 0.5, 2e-3, 0.2
 _OF_LIMIT, _MOST_TRIES, _TERMS = 1e-2, 200, STAGES + 1
 _BENT_WORTH_LONGER, _LITTLE, _SHORTER = 0.1, 0.1, 0.3
+_LITTLE_OF_FLAT, _NEAR_SEPARATION = 3e-4, 0.6
 
 _TABLES = tables()
 _POWERS, _AT_ONE = np.asarray(_TABLES["POWERS"]), np.asarray(_TABLES["AT_ONE"])
@@ -225,9 +226,10 @@ class _Run:
             rate = max(d * mobility, sqrt(max(k * mobility, 0.0)))
             return _FIRST_STEP / rate if rate * left > _FIRST_STEP else left
         h, depth = left, self.number(y, "penetration")
+        little = _LITTLE_OF_FLAT if k == 0.0 and d == 0.0 else _LITTLE
         for _ in range(60):
             then = self.law.force(depth + abs(now.rate) * h, now.rate, now.compressing)[0]
-            if abs(then - force) * mobility * h <= _LITTLE * abs(now.rate):
+            if abs(then - force) * mobility * h <= little * abs(now.rate):
                 break
             h /= 2
         return h
@@ -300,7 +302,7 @@ class _Run:
     def states(self, y: Array) -> Array:
         """(columns + 1, n_states), the last at the end."""
         columns, spacing, kept = self.loop.columns, self.loop.spacing, [y]
-        scale = h = 0.0
+        scale = h = first = 0.0
         repeated = 0
         for _ in range(self.loop.most_steps):
             now = self.look(y)
@@ -310,6 +312,9 @@ class _Run:
             left = self.until - time
             scale = max(scale, abs(now.rate))
             h = self.first_step(y, now, left) if h == 0.0 else h
+            if self.loop.contact.law_bends and not now.compressing:
+                to_separation = self.number(y, "penetration") / -now.rate if now.rate else np.inf
+                h = min(h, _NEAR_SEPARATION * to_separation) if to_separation > 2.0 * first else h
             mobility = self.mobility(y, now)[0]
             for _ in range(_MOST_TRIES):
                 s = self.step(y, now, h)
@@ -320,6 +325,7 @@ class _Run:
             if not np.isfinite(error):
                 y = np.full_like(y, np.nan)
                 break
+            first = first or h
             end = min(1.0, left / h)
             at = self.event(y, now, s, end)
             repeated = repeated + 1 if at is not None and at < _AT_ONCE and repeated < 8 else 0

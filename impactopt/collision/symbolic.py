@@ -43,8 +43,8 @@ class SymbolicModel(SteppedModel):
         self._check_outputs(outputs, every)
         if self.n_freezes:
             raise InputError(
-                "graph: its Runge-Kutta steps say nothing of how the contact's duration changes, which freezes "
-                "on the way go by; give freezes=0, or take `function` and `gradient_function`"
+                "graph: its Runge-Kutta steps say nothing of how the contact's duration changes, which "
+                "freezes on the way go by; give freezes=0, or take `function` and `gradient_function`"
             )
         return collision_graph(self, tuple(outputs), every=every)
 

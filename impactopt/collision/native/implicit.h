@@ -22,6 +22,10 @@
 #define BENT_WORTH_LONGER 0.1
 #define LITTLE 0.1
 #define SHORTER 0.3
+/* of a force that begins without a slope, as x^1.5, the first step's change of speed; and of the time that is left to
+   separation, a step that comes near it: a force that ends so is followed by ever shorter ones, down to the first's */
+#define LITTLE_OF_FLAT 3e-4
+#define NEAR_SEPARATION 0.6
 #define OF_LIMIT 1e-2
 #define MOST_TRIES 200
 

@@ -9,7 +9,7 @@
 #define UNKNOWNS (NODES * INPUTS)
 /* iterations, and of its size the last one's change */
 #define MOST_ITERATIONS 12
-#define CONVERGED 1e-9
+#define CONVERGED (0.03 * sqrt(TOLERANCE)) /* its error is the square of that */
 
 typedef struct {
   Inputs n;

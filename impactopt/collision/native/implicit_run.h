@@ -40,10 +40,11 @@ static int sample(const Data *d, const State *y, const Instant *now, const Serie
 static double first_step(const Data *d, const State *y, const Instant *now, const Contact *c, double left) {
 #if LAW_BENDS
   /* one in which the force, which may begin without a slope, changes the speed by little */
+  const double little = c->k == 0.0 && c->d == 0.0 ? LITTLE_OF_FLAT : LITTLE;
   double h = left, law[3];
   FOR(tries, 60) {
     law_here(d, y->penetration + fabs(now->rate) * h, now->rate, now->compressing, law);
-    if (fabs(law[0] - c->force) * c->mobility * h <= LITTLE * fabs(now->rate)) break;
+    if (fabs(law[0] - c->force) * c->mobility * h <= little * fabs(now->rate)) break;
     h /= 2;
   }
   return h;
@@ -60,7 +61,7 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
   Bend bend;
   Event e;
   int made = 0, column = 0, repeated = 0;
-  double scale = 0.0, h = 0.0;
+  double scale = 0.0, h = 0.0, first = 0.0;
   for (;; made++) {
     look(d, y, &now);
     judge(d, y, &now);
@@ -72,6 +73,10 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
       contact_here(d, y, &now, 0.0, ((double *)d->frozen->Q[N])[N], &r.contact);
       h = first_step(d, y, &now, &r.contact, left);
     }
+#if LAW_BENDS
+    const double to_separation = -y->penetration / now.rate;
+    if (!now.compressing && to_separation > 2.0 * first) h = fmin(h, NEAR_SEPARATION * to_separation);
+#endif
     double error = 0.0;
     FOR(tries, MOST_TRIES) {
       prepare(d, y, &now, h, &r);
@@ -89,6 +94,7 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
       look(d, y, &now);
       break;
     }
+    if (first == 0.0) first = h;
     const double end = fmin(1.0, left / h);
     find_event(d, y, &now, &s, end, &e);
     /* events that follow each other at once, because rounding hides that they are over: farther each time */

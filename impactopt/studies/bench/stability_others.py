@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.collision import SDC, effective_mass
+from impactopt.collision.graph import collision_graph
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import BothSoles

@@ -22,6 +22,7 @@ from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall, Spr
 from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.presets import standin, talos
 from impactopt.robots.robot import Robot
+from impactopt.studies.exact import ExactCollision
 
 TOLERANCES = {"rtol": 1e-13, "atol": 1e-16}
 LONGEST = 1e-4  # [s] of a step
@@ -268,10 +269,12 @@ class Case:
     def reference(self) -> dict[str, Any]:
         return Reference(self.sdc, self.q, self.v, self.torque, self.gains).run(self.sdc.horizon)
 
-    def collide(self, **options: Any) -> Any:
-        sdc = dataclasses.replace(self.sdc, **options)
-        gains = self.gains if sdc.terms.stiffness else {"kd": self.gains["kd"]}
-        torque = self.torque if sdc.terms.feedforward else None
+    def collide(self, spacing: float | None = None, **options: Any) -> Any:
+        """Exact, or by steps where options of the model are given."""
+        exact = ExactCollision(self.sdc, spacing=spacing)
+        sdc = dataclasses.replace(self.sdc, **options) if options else exact
+        gains = self.gains if self.sdc.terms.stiffness else {"kd": self.gains["kd"]}
+        torque = self.torque if self.sdc.terms.feedforward else None
         return sdc.collide(self.q, self.v, torque, require_separation=False, **gains)
 
 
@@ -315,7 +318,6 @@ def random_case(seed: int, name: str) -> Case:
         friction=friction if terms.friction else None,
         stance=BothSoles(base_mass=1e4, base_inertia=1e3) if heavy else None,
         horizon=0.2,
-        method="exact",
     )
     q = pin.integrate(model, q, dq)
     frozen = frozen_numbers(sdc, q, np.zeros(robot.nv), 1.0)

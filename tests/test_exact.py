@@ -16,6 +16,7 @@ from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
 from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
 from impactopt.contact import FreeMass, HuntCrossley, KelvinVoigt, SpringDamper
 from impactopt.errors import InputError
+from impactopt.studies.exact import ExactCollision
 
 X = np.array([1.0, 0.0, 0.0])
 LAW, TARGET = SpringDamper(stiffness=1e4, damping=300.0), FreeMass(mass=2.0)
@@ -70,14 +71,14 @@ def test_two_masses_in_closed_form(mass: float, target: float, ratio: float) -> 
     w, phi = np.sqrt(k / mu), np.arccos(ratio)
     law = KelvinVoigt(stiffness=k, damping=2.0 * ratio * w * mu)
     given: dict[str, Any] = {"striker": "tip", "normal": X, "law": law, "target": FreeMass(mass=target)}
-    sdc = SDC(robot=slider(mass), **given, method="exact", horizon=0.5)
+    sdc = SDC(robot=slider(mass), **given, horizon=0.5)
     duration = 2.0 * phi / (w * np.sin(phi))
     restitution = np.exp(-ratio * w * duration)
     highest = max(0.0, 3.0 * phi - np.pi)  # r w t there
     decay = np.exp(-highest / np.tan(phi))
     peak = speed * np.sqrt(k * mu) / np.sin(phi) * decay * np.sin(2.0 * phi - highest)
-    for model in (sdc, VirtualMass(robot=slider(mass), **given, method="exact", horizon=0.5)):
-        result = model.collide([0.0], [speed], [0.0])
+    for model in (sdc, VirtualMass(robot=slider(mass), **given, horizon=0.5)):
+        result = ExactCollision(model).collide([0.0], [speed], [0.0])
         assert result.separated and result.force[-1] == 0.0
         assert result.duration == pytest.approx(duration, rel=1e-12)
         assert result.impulse == pytest.approx(mu * speed * (1.0 + restitution), rel=1e-12)
@@ -104,7 +105,7 @@ def test_random_collisions_against_an_independent_integration(name: str, seeds: 
 
 def test_histories_are_at_phases_ends_and_on_a_grid() -> None:
     case = smooth_case("arm", Terms(friction=True))
-    coarse, fine = case.collide(step=1e-3), case.collide(step=2.5e-4)
+    coarse, fine = case.collide(spacing=1e-3), case.collide(spacing=2.5e-4)
     assert coarse.impulse == fine.impulse and coarse.peak_force == fine.peak_force
     grid = np.arange(0.0, fine.duration, 2.5e-4)
     near = np.abs(fine.time[:, None] - grid).min(axis=0)
@@ -126,36 +127,31 @@ def smooth_case(name: str, terms: Terms) -> Case:
         target=TARGET,
         terms=terms,
         friction=friction,
-        method="exact",
     )
     return dataclasses.replace(case, sdc=sdc, gains={"kd": robot.kd, "kp": robot.kp})
 
 
-def deepening(case: Case, time: float, step: float, **options: Any) -> float:
+def deepening(case: Case, time: float, **options: Any) -> float:
     """Penetration [m] at a time that is a step's end."""
-    result = case.collide(step=step, **options)
+    result = case.collide(**options)
     at = int(np.abs(result.time - time).argmin())
     assert result.time[at] == pytest.approx(time, rel=1e-9)
     return float(result.penetration[at])
 
 
-@pytest.mark.parametrize(
-    "method, order, steps", [("rk4", 4, (2.5e-4, 6.25e-5)), ("events", 6, (5e-4, 2.5e-4))]
-)
-def test_order_without_events(method: str, order: int, steps: tuple[float, float]) -> None:
+def test_order_of_runge_kutta_without_events() -> None:
+    method, order, steps = "rk4", 4, (2.5e-4, 6.25e-5)
     case, time = smooth_case("arm", Terms(saturation=False)), 2e-3
-    exact = deepening(case, time, time)
-    errors = [abs(deepening(case, time, step, method=method) - exact) for step in steps]
+    exact = deepening(case, time, spacing=time)
+    errors = [abs(deepening(case, time, step=step, method=method) - exact) for step in steps]
     measured = np.log(errors[0] / errors[1]) / np.log(steps[0] / steps[1])
     assert errors[1] > 1e-13 * exact, "rounding is not what is measured"
     assert measured == pytest.approx(order, abs=0.5)
 
 
-@pytest.mark.parametrize(
-    "method, order, steps", [("rk4", 2, (2.5e-4, 3.125e-5)), ("events", 6, (5e-4, 2.5e-4))]
-)
-def test_order_with_events(method: str, order: int, steps: tuple[float, float]) -> None:
-    """Of the impulse, over several speeds, as where in its step an event falls is chance for "rk4"."""
+def test_order_of_runge_kutta_with_events() -> None:
+    """Of the impulse, over several speeds, as where in its step an event falls is chance."""
+    method, order, steps = "rk4", 2, (2.5e-4, 3.125e-5)
     case = smooth_case("arm", Terms(friction=True))
     cases = [dataclasses.replace(case, v=scale * case.v) for scale in np.linspace(0.8, 1.2, 8)]
     exact = [each.collide() for each in cases]
@@ -173,16 +169,13 @@ def test_order_with_events(method: str, order: int, steps: tuple[float, float]) 
 
 
 # ------------------------------------------------------------ what it is not for
-def test_what_is_not_linear_or_wants_a_graph_is_refused() -> None:
+def test_what_is_not_linear_or_frozen_again_is_refused() -> None:
     given: dict[str, Any] = {"robot": slider(4.0), "striker": "tip", "normal": X, "target": TARGET}
     with pytest.raises(InputError, match="HuntCrossley is not linear"):
-        SDC(**given, law=HuntCrossley(stiffness=1e6, dissipation=0.1), method="exact")
+        ExactCollision(SDC(**given, law=HuntCrossley(stiffness=1e6, dissipation=0.1)))
     with pytest.raises(InputError, match="freezes=0"):
-        SDC(**given, law=LAW, method="exact", freezes=2)
-    sdc = SDC(**given, law=LAW, method="exact", horizon=0.01)
-    for ask in (sdc.graph, sdc.function, sdc.gradient_function):
-        with pytest.raises(InputError, match="numbers only"):
-            ask()
+        ExactCollision(SDC(**given, law=LAW, freezes=2))
+    sdc = ExactCollision(SDC(**given, law=LAW, horizon=0.01))
     with pytest.raises(InputError, match="horizon"):
         sdc.collide([0.0], [1.0], [0.0])
     away = sdc.collide([0.0], [-1.0], [0.0])
@@ -196,4 +189,4 @@ def test_a_drag_that_grows_with_the_square_of_the_speed_is_refused() -> None:
             return [force / self.mass - 3.0 * state[0] * state[0]]
 
     with pytest.raises(InputError, match="Dragged is not linear"):
-        SDC(robot=slider(4.0), striker="tip", normal=X, law=LAW, target=Dragged(mass=1.0), method="exact")
+        ExactCollision(SDC(robot=slider(4.0), striker="tip", normal=X, law=LAW, target=Dragged(mass=1.0)))

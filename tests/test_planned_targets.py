@@ -81,8 +81,6 @@ def integrated(plan: Plan) -> Collision:
     """What a collision model says of a point mass at the plan's speed."""
     p = plan.problem
     given: dict[str, Any] = {"robot": p.robot, "striker": "tip", "normal": p.normal, "stance": FixedBase()}
-    if not p.law.analytic:
-        given["step"] = 2e-5
     sdc = SDC(**given, law=p.law, target=p.target)
     return sdc.collide(np.array([0.3, 0.0]), np.array([plan.hand_speed, 0.0]), np.zeros(2))
 
@@ -356,8 +354,6 @@ class Rubber(ContactLaw):
 
 class Rounded(Rubber):
     """The same, as it is to be written."""
-
-    analytic = False
 
     def branch(self, penetration: Any, rate: Any, compressing: bool, parameters: Any = None) -> Any:
         return 3e6 * power(penetration, 1.5) * (1 + 0.15 * rate)

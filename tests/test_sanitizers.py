@@ -65,22 +65,30 @@ def model(**options: Any) -> SDC:
     return SDC(**{**given, **options})
 
 
+GAINS = 0.5 * np.ones((4, 4)) + np.diag([20.0, 30.0, 20.0, 10.0])
+HUNT = HuntCrossley(stiffness=1e6, dissipation=0.3)
 BOARD = Board(mass=0.5, stiffness=2e4, breaking_force=60.0)
 PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
     "implicit steps": (
         {"target": Nail(mass=0.2, resistance=80.0)},
         lambda one: native_collision(one, ("impulse", "force", "torque", "configuration")),
     ),
-    "events and freezes": (
-        {"method": "events", "freezes": 2, "target": BOARD},
-        lambda one: native_collision(one, ("impulse", "velocity")),
+    "bent law, freezes": (
+        {"law": HUNT, "freezes": 2, "target": BOARD},
+        lambda one: native_collision(one, ("impulse", "velocity", "peak_force")),
     ),
     "Runge-Kutta": (
-        {"law": HuntCrossley(stiffness=1e6, dissipation=0.3)},
+        {"law": HUNT, "method": "rk4"},
         lambda one: native_collision(one, ("impulse", "force", "step_error")),
     ),
     "gradient": ({}, lambda one: native_gradient(one, "impulse")),
+    "gradient, bent law": ({"law": HUNT, "kd": GAINS}, lambda one: native_gradient(one, "impulse")),
+    "gradient, freezes": ({"freezes": 1}, lambda one: native_gradient(one, "impulse")),
     "Jacobian": ({}, lambda one: native_jacobian(one, ("impulse", "torque"))),
+    "Jacobian, bent law": (
+        {"law": HUNT, "kd": GAINS},
+        lambda one: native_jacobian(one, ("impulse", "torque")),
+    ),
 }
 
 

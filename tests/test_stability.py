@@ -36,8 +36,8 @@ def test_random_cases_on_a_slider_and_an_arm_are_right_or_refused() -> None:
     # nothing is proved by refusing everything
     assert [o for o in outcomes if o.verdict in ("nan", "wrong")] == []
     assert [o.verdict for o in outcomes].count("agree") >= 90
-    taylor = [o.verdict for o in judge_rig(Rig(robot="slider", method="events"), 48)]
-    assert {*taylor} == {"agree", "refused"} and min(map(taylor.count, {*taylor})) > 5
+    fixed = [o.verdict for o in judge_rig(Rig(robot="slider", method="rk4"), 48)]
+    assert {*fixed} == {"agree", "refused"} and min(map(fixed.count, {*fixed})) > 5
 
 
 def test_wrong_numbers_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,7 +63,7 @@ def test_a_contact_without_end_ends_at_the_horizon() -> None:
     # half a period of a mass on a spring against a wall is 0.044 s; at 0.0101 s, in no whole number of steps,
     # it has got 2 m v_c - (what is left of it): m v_c (1 - cos w t)
     law = SpringDamper(stiffness=1e4, damping=0.0)
-    for method in ("implicit", "events", "rk4"):
+    for method in ("implicit", "rk4"):
         sdc = slider(law=law, target=RigidWall(), horizon=0.0101, method=method)
         result = sdc.collide([0.0], [1.0], [0.0], require_separation=False)
         assert not result.separated and result.duration == pytest.approx(0.0101, rel=1e-12)
@@ -73,12 +73,13 @@ def test_a_contact_without_end_ends_at_the_horizon() -> None:
 def test_a_contact_too_fast_for_the_step_is_refused_with_one_that_will_do() -> None:
     stiff = {"contact_stiffness": 3e7, "contact_damping": 0.0}
     with pytest.raises(InputError, match="too long to follow this contact") as refusal:
-        slider(method="events").collide([0.0], [1.0], [0.0], **stiff)
+        slider(method="rk4").collide([0.0], [1.0], [0.0], **stiff)
     step = float(str(refusal.value).rsplit(maxsplit=1)[-1])
     # two free masses part elastically
-    for model in (slider(method="events", step=0.95 * step, horizon=0.01), slider()):
+    fixed = slider(method="rk4", step=0.95 * step, horizon=0.01)
+    for model, accuracy in ((fixed, 1e-2), (slider(), 1e-5)):
         result = model.collide([0.0], [1.0], [0.0], **stiff)
-        assert result.impulse == pytest.approx(2.0 / (1 / 2.0 + 1 / 5.0), rel=1e-5)
+        assert result.impulse == pytest.approx(2.0 / (1 / 2.0 + 1 / 5.0), rel=accuracy)
 
 
 def test_too_many_steps_are_refused_with_their_number() -> None:
@@ -154,5 +155,5 @@ def test_a_bound_of_the_rates_only_spares_eigenvalues() -> None:
     given = {name: x.reshape(1, -1) for name, x in sdc.settings.items()}
     given |= {"q": np.zeros((40, 1)), "contact_stiffness": stiffness[:, None]}
     alone = [sdc.stable_step([0.0], contact_stiffness=k) <= sdc.step_length for k in stiffness]
-    assert sdc.unstable_rows(given).tolist() == alone
+    assert sdc._stability.unstable(given, sdc.step_length).tolist() == alone
     assert {*alone} == {True, False}

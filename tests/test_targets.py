@@ -119,7 +119,6 @@ def test_targets_are_at_rest_at_first_and_have_brought_nothing(name):
     assert target.velocity(rest) == 0.0 and target.energy(rest) == 0.0
     assert [float(x) for x in target.result(rest)] == [0.0] * len(target.results)
     assert target.derivative(rest, 0.0) == rest
-    assert target.analytic
 
 
 def test_formulas_tell_targets_apart_but_not_their_numbers():
@@ -145,7 +144,7 @@ def test_a_target_without_switches_and_results_has_none():
 
 
 # ------------------------------------------------------------ wall
-@pytest.mark.parametrize("method", ["events", "rk4"])
+@pytest.mark.parametrize("method", ["implicit", "rk4"])
 def test_a_wall_gives_all_of_the_hammers_momentum_back_in_closed_form(method):
     """Half a period of a mass on a spring; and Kelvin-Voigt's restitution."""
     hammer, stiffness, speed = 2.0, 1e4, 0.8
@@ -273,8 +272,7 @@ def test_nails_against_an_independent_integration(blow):
     assert plain[3] == pytest.approx(coasting(nail, v, z), rel=2e-4, abs=1e-12)
 
 
-@pytest.mark.parametrize("method", [{"method": "events"}, {"method": "implicit", "tolerance": 1e-8}])
-def test_a_nail_that_never_stops_in_contact_in_closed_form(method):
+def test_a_nail_that_never_stops_in_contact_in_closed_form():
     """While both move: mu x'' = -k x + mu R / m, about a middle that the wood has moved."""
     M, m, k, R, speed = 2.0, 0.5, 1e5, 50.0, 1.0
     mu = M * m / (M + m)
@@ -294,7 +292,7 @@ def test_a_nail_that_never_stops_in_contact_in_closed_form(method):
     impulse_2 = M * (rate - (v + last))
     driven = (0.5 * M * speed**2 - 0.5 * M * (v + last) ** 2) / R
     law, nail = SpringDamper(stiffness=k, damping=0.0), Nail(mass=m, resistance=R)
-    found = outcome(made(law, nail, hammer=M, **method), speed)
+    found = outcome(made(law, nail, hammer=M, tolerance=1e-8), speed)
     assert v > 0
     assert found[0] == pytest.approx(impulse_1 + impulse_2, rel=1e-8)
     assert found[1] == pytest.approx(t1 + t2, rel=1e-6)

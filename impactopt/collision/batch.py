@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,10 +24,9 @@ from impactopt.collision.checks import ACCURACY, too_large
 from impactopt.collision.native import native_collision
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
+from impactopt.collision.stability import Stability
+from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array, raw_array
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["Batch"]
 
@@ -43,13 +42,22 @@ class Batch:
     ----------
     model : of the collision.
     outputs : names out of `impactopt.collision.OUTPUTS` that the model has.
+    stability : how long its steps may be.
     every : keep every so many steps of the histories.
     """
 
-    def __init__(self, model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> None:
+    def __init__(
+        self,
+        model: SteppedModel,
+        outputs: tuple[str, ...],
+        stability: Stability,
+        *,
+        every: int = 1,
+    ) -> None:
         # these say which contacts have not ended, and which steps were too long
         judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
-        self.model, self.outputs = model, tuple(dict.fromkeys((*outputs, *judges)))
+        self.model, self._stability = model, stability
+        self.outputs = tuple(dict.fromkeys((*outputs, *judges)))
         recipe = (*model._recipe, *self.outputs, every)
 
         def build() -> list[Any]:
@@ -70,7 +78,7 @@ class Batch:
         *,
         threads: int | None = None,
     ) -> dict[str, Array]:
-        """As of `SymbolicModel.batch`."""
+        """As of `SteppedModel.batch`."""
         cores = os.cpu_count() or 1 if threads is None else threads
         if not isinstance(cores, int) or cores < 1:
             raise InputError(f"threads: {threads!r}; give a whole number >= 1")
@@ -108,13 +116,15 @@ class Batch:
         whole = np.concatenate([np.broadcast_to(x, (count, x.shape[1])) for x in flat], axis=1)
         _, first, back = np.unique(whole, axis=0, return_index=True, return_inverse=True)
         parts = [
-            self.model.unstable_rows({name: x if len(x) == 1 else x[some] for name, x in own.items()})
+            self._stability.unstable(
+                {name: x if len(x) == 1 else x[some] for name, x in own.items()}, self.model.step_length
+            )
             for some in np.split(first, range(_TOGETHER, len(first), _TOGETHER))
         ]
         unstable = np.concatenate(parts)[back.ravel()]
         if unstable.all():
             one = {name: given[name][0].reshape(x.shape) for name, x in self.model.settings.items()}
-            longest = self.model.stable_step(given["q"][0], **one)
+            longest = self._stability.longest(self._stability.frozen(given["q"][0], one), one)
             self.model.check_step(self.model.step_length, longest, "in every collision, as in the first,")
         return unstable
 
@@ -186,7 +196,7 @@ def _by_columns(x: Array) -> Array:
 
 
 def _inputs(
-    model: SymbolicModel, q: ArrayLike, v: ArrayLike, torque: ArrayLike | None, settings: Mapping[str, Any]
+    model: SteppedModel, q: ArrayLike, v: ArrayLike, torque: ArrayLike | None, settings: Mapping[str, Any]
 ) -> dict[str, Array]:
     """Each input, (N, ...) or (1, ...)."""
     robot = model.robot
@@ -208,7 +218,7 @@ def _inputs(
     return given | _settings(model, settings, count)
 
 
-def _settings(model: SymbolicModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
+def _settings(model: SteppedModel, settings: Mapping[str, Any], count: int) -> dict[str, Array]:
     """Of each setting its value for all, or one a collision, in its range."""
     alone = model.settings.override(
         {

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.result import Collision
+from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["ACCURACY", "check_course", "check_finite", "check_frozen", "spoiled", "too_large"]
 
 Array = NDArray[np.float64]
 
-# error of the impulse beyond which the step is refused, relative (see `SymbolicModel`); and the power of the
+# error of the impulse beyond which the step is refused, relative (see `SteppedModel`); and the power of the
 # step that it goes with
-ACCURACY = {"events": 1e-5, "rk4": 1e-2}
-_ORDERS = {"events": 6, "rk4": 2}
+ACCURACY = {"rk4": 1e-2}
+_ORDERS = {"rk4": 2}
 # of a factorization's pivot, and of the hand's mobility, relative: with less, rounding reaches 1e-7
 _LEAST_PIVOT = 1e-9
 
@@ -64,14 +62,14 @@ def check_finite(outputs: dict[str, Array], step: float) -> None:
 
 
 def too_large(method: str, error: Array) -> Any:
-    """Whether what explicit steps are estimated to have left out of impulses is more than a method may."""
+    """Whether what Runge-Kutta steps are estimated to have left out of impulses is more than a method may."""
     return ~(error <= ACCURACY[method])
 
 
-def check_course(collision: SymbolicModel, result: Collision, error: float) -> None:
+def check_course(collision: SteppedModel, result: Collision, error: float) -> None:
     """InputError where the steps were too few, or too long for the contact's own modes.
 
-    error : what explicit steps left out of the impulse, relative, as an estimate.
+    error : what Runge-Kutta steps left out of the impulse, relative, as an estimate.
     """
     length, method = collision.step_length, collision.stepping
     if not result.separated and result.duration < collision.horizon * (1 - 1e-9):

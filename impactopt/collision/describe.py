@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model, number_of_steps
+from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
+from impactopt.collision.runge_kutta import rk4_step
+from impactopt.collision.stepped import SteppedModel, number_of_steps
 
 __all__ = ["Description", "describe", "independent_joints"]
 
@@ -51,9 +50,9 @@ class Description:
 
 
 def describe(
-    collision: SymbolicModel, outputs: tuple[str, ...], parameters: tuple[str, ...] = ()
+    collision: SteppedModel, outputs: tuple[str, ...], parameters: tuple[str, ...] = ()
 ) -> Description:
-    """What `SymbolicModel.function` is made of for these outputs; see `SymbolicModel.describe`."""
+    """What `SteppedModel.function` is made of for these outputs; see `SteppedModel.describe`."""
     robot, held_by, settings = collision.robot, collision.held_by, collision.settings
     by = f"{max(held_by.compliance):g} per kg" if any(held_by.compliance) else "exactly"
     terms = [name for name in _TERMS if getattr(collision.terms, name)] if collision.n_servos else []
@@ -79,28 +78,27 @@ def describe(
     return Description(contents=contents, left_out=_left_out(collision, outputs))
 
 
-def instructions(collision: SymbolicModel, outputs: tuple[str, ...]) -> dict[str, int]:
-    """Scalar instructions of one freeze and one step of the graph, as CasADi counts them.
+def instructions(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, int]:
+    """Scalar instructions of one freeze and one Runge-Kutta step of the graph, as CasADi counts them.
 
-    Implicit steps, in C alone, have the freeze of the graph, and in place of its step one that costs half
-    as much again.
+    Implicit steps, in C alone, have the freeze of the graph, and in place of its step one that costs twice as
+    much, or six times where law or target bend.
     """
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     whole = ("L_tau", "L_f", "L_0", "drift_velocity") if collision.n_freezes else ()
     names = tuple(dict.fromkeys((*model.frozen, *frozen_for(outputs), *whole)))
     freeze = frozen_dynamics(collision).function("frozen", names)
-    method, length = collision.of_graph
-    step = METHODS[method](model, length)
+    step = rk4_step(model, collision.step_of_graph)
     return {"freeze": int(freeze.expand().n_instructions()), "step": int(step.expand().n_instructions())}
 
 
-def _steps(collision: SymbolicModel) -> dict[str, float]:
+def _steps(collision: SteppedModel) -> dict[str, float]:
     if collision.stepping == "implicit":
         return {"tolerance": collision.tolerance, "histories_every_s": collision.step_length}
     return {"step_s": collision.step_length, "most_steps": number_of_steps(collision)}
 
 
-def independent_joints(collision: SymbolicModel) -> list[str]:
+def independent_joints(collision: SteppedModel) -> list[str]:
     """Joints that the blow cannot move, and that move nothing that is asked for: on a fixed base, those of
     limbs that share no joint with the striking point's. H has no entries between the two, nor have gains
     given one a joint. To lock them in the robot changes nothing of the collision."""
@@ -115,7 +113,7 @@ def independent_joints(collision: SymbolicModel) -> list[str]:
     return [str(model.names[j]) for j in apart]
 
 
-def _left_out(collision: SymbolicModel, outputs: tuple[str, ...]) -> dict[str, str]:
+def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, str]:
     robot, held_by = collision.robot, collision.held_by
     out: dict[str, str] = {}
     if not collision.n_servos:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import ceil
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 
@@ -15,32 +15,26 @@ from impactopt.collision.loop import run
 from impactopt.collision.model import JointSpaceModel, shape_of
 from impactopt.collision.outputs import HISTORIES, Outputs, frozen_for
 from impactopt.collision.runge_kutta import rk4_step
-from impactopt.collision.taylor import taylor_step
+from impactopt.collision.stepped import SteppedModel, number_of_steps
 from impactopt.contact import Target
 from impactopt.rigid_body import RigidBody
 
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
-
 __all__ = [
-    "METHODS",
     "MOST_STEPS",
     "collision_graph",
     "columns_of",
     "frozen_dynamics",
     "gradient_graph",
     "joint_space_model",
-    "number_of_steps",
     "target_yield",
 ]
 
-METHODS = {"events": taylor_step, "rk4": rk4_step}
 # where steps find their own length
 MOST_STEPS = 5000
 
 
 def joint_space_model(
-    collision: SymbolicModel, outputs: tuple[str, ...] = (), *, freezes: int = 0
+    collision: SteppedModel, outputs: tuple[str, ...] = (), *, freezes: int = 0
 ) -> JointSpaceModel:
     """What the time loop integrates for these outputs."""
     return JointSpaceModel(
@@ -58,19 +52,11 @@ def joint_space_model(
     )
 
 
-def frozen_dynamics(collision: SymbolicModel) -> FrozenDynamics:
+def frozen_dynamics(collision: SteppedModel) -> FrozenDynamics:
     """Steps 1b and 2b."""
     frame = collision.robot.striker(collision.striker).model_frame
     terms = collision.terms
     return FrozenDynamics(collision.robot, collision.held_by, frame, bias=terms.bias, jdot=terms.jdot)
-
-
-def number_of_steps(collision: SymbolicModel, fraction: float = 1.0) -> int:
-    """Steps that reach this fraction of the horizon; where they end on events, with two events a joint on the
-    way."""
-    method, length = collision.of_graph
-    steps = ceil(fraction * collision.horizon / length - 1e-9)
-    return steps + (2 * collision.n_servos + 4 if method == "events" else 0)
 
 
 def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
@@ -85,13 +71,13 @@ def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
     return function(ca.DM.zeros(target.n_states), 0.0, *numbers.values())
 
 
-def columns_of(collision: SymbolicModel, fraction: float, every: int) -> int:
+def columns_of(collision: SteppedModel, fraction: float, every: int) -> int:
     """Instants of the histories for a fraction of the horizon, where steps find their own length."""
     return ceil(fraction * collision.horizon / (every * collision.step_length) - 1e-9) + 1
 
 
 def collision_graph(
-    collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1, as_compiled: bool = False
+    collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1, as_compiled: bool = False
 ) -> Any:
     """ca.Function (q, v[, feedforward], *settings) -> outputs, differentiable, not compiled.
 
@@ -102,7 +88,7 @@ def collision_graph(
     return ca.Function("collision", list(inputs.values()), out, list(inputs), list(outputs))
 
 
-def gradient_graph(collision: SymbolicModel, output: str) -> Any:
+def gradient_graph(collision: SteppedModel, output: str) -> Any:
     """ca.Function (q, v[, feedforward], *settings) -> (output, d/dq (nv), d/dv (nv)), both in v's basis."""
     inputs, (value,) = _expressions(collision, (output,), 1)
     rb = RigidBody(collision.robot.model)
@@ -115,7 +101,7 @@ def gradient_graph(collision: SymbolicModel, output: str) -> Any:
 
 
 def _expressions(
-    collision: SymbolicModel, outputs: tuple[str, ...], every: int, *, implicit: bool = False
+    collision: SteppedModel, outputs: tuple[str, ...], every: int, *, implicit: bool = False
 ) -> tuple[dict[str, Any], list[Any]]:
     """Inputs by name, and the outputs, MX."""
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
@@ -136,16 +122,13 @@ def _expressions(
     )
     gives_way = target_yield(model.target, model.target_numbers(inputs))
     stretches = course.run(inputs, gives_way)
-    method, length = collision.of_graph
-    pulls = length if method == "events" else 0.0
-    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"], pulls)
+    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"])
     return inputs, [ca.densify(getattr(made, output)) for output in outputs]
 
 
-def _explicit(collision: SymbolicModel, model: JointSpaceModel, every: int) -> Loop:
+def _explicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
     """The time loop as a graph; `every`: keep every so many of the states, and the last; 0: none."""
-    method, length = collision.of_graph
-    step = METHODS[method](model, length)
+    step = rk4_step(model, collision.step_of_graph)
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:
         steps = number_of_steps(collision, fraction)
@@ -158,7 +141,7 @@ def _explicit(collision: SymbolicModel, model: JointSpaceModel, every: int) -> L
     return loop
 
 
-def _implicit(collision: SymbolicModel, model: JointSpaceModel, every: int) -> Loop:
+def _implicit(collision: SteppedModel, model: JointSpaceModel, every: int) -> Loop:
     """The time loop as a call of NumPy."""
 
     def loop(start: Any, fraction: float, data: Sequence[Any], record: bool) -> tuple[Any, Any]:

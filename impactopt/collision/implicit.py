@@ -12,27 +12,34 @@ has order eight for every theta. Where 1/gamma is a root of L_8 the fastest mode
 theta < 1, let them grow by a third at most). What is left out, p_9(1) z^9, is smaller than what Taylor's
 polynomial of degree eight leaves out.
 
+Law and target need not be linear. J then has their slopes at the step's begin, and what they are beyond
+these, n(theta), acts on the linear rest as an input: with n = sum of n_j p_j and e what it acts on,
+
+    (I - gamma h J) w_(j+1) = h J w_j + h e (n_j + gamma n_(j+1)).
+
+n is a polynomial of degree seven that is right at the step's begin and at Lobatto's other seven places. It is
+a few scalars (force, target), so that Newton's method on them costs little beside the stages, of which there
+are three sets: without n, its answers, and with n. For what is linear n is zero, and nothing is different.
+
 Source: S. P. Norsett, "Restricted Pade approximations to the exponential function", SIAM J. Numer. Anal. 15
 (1978) 1008-1029; E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.6.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_laguerre
 
 from impactopt.collision.bernstein import bernstein_matrix
-from impactopt.contact import ContactLaw, Target
 
-__all__ = ["STAGES", "gamma", "is_linear", "linear_contact", "tables"]
+__all__ = ["NODES", "STAGES", "gamma", "tables"]
 
 Array = NDArray[np.float64]
 
 STAGES = 8
+# places of a step, besides its begin, where what bends in law and target is right
+NODES = 7
 
 
 def gamma() -> float:
@@ -58,8 +65,12 @@ def tables() -> dict[str, Array | float]:
     HULL (9, 16) : Bernstein coefficients of a sum of w_j p_j are w' HULL, and zeros.
     BOUND (9) : largest |p_j| on [0, 1].
     LEFT_OUT : |p_9(1)|, what a further term would be multiplied by.
+    AT_NODES (7, 9) : p_j at the nodes. FROM_NODES (9, 7) : coefficients of the p_j of a polynomial that is 0
+        at the begin, from its values at the nodes.
+    ANSWERS (8, 7, 7) : of inputs with these values at the nodes, what the nodes see of (h J S)^k S h.
     """
     P, theta = polynomials(), np.linspace(0.0, 1.0, 2001)
+    at, back = node_tables()
     values = np.vander(theta, STAGES + 1, increasing=True) @ P.T
     return {
         "POWERS": P,
@@ -67,75 +78,30 @@ def tables() -> dict[str, Array | float]:
         "HULL": np.pad(P @ bernstein_matrix(STAGES).T, ((0, 0), (0, 16 - STAGES - 1))),
         "BOUND": np.abs(values).max(axis=0),
         "LEFT_OUT": float(abs(polynomials(STAGES + 1)[-1].sum())),
+        "AT_NODES": at,
+        "FROM_NODES": back,
+        "ANSWERS": _answers(at, back),
     }
 
 
-# ---------------------------------------------------------------- law and target
-def is_linear(law: ContactLaw, target: Target) -> bool:
-    """Whether both are linear between events, as implicit steps need them: their second derivatives are zero
-    in all of some hundred places."""
-    rng = np.random.default_rng(0)
-    of_law, branches = _law_parts(law)
-    of_target, whole = _target_part(target)
-    cases = [(of_law, law.parameters, f, x) for f, x in branches] + [(of_target, target.parameters, *whole)]
-    for numbers, values, f, x in cases:
-        bending = ca.jacobian(ca.vec(ca.jacobian(f, x)), x)
-        if bending.nnz():
-            function = ca.Function("bending", [numbers, x], [bending])
-            for size in np.repeat(np.logspace(-6, 4, 11), 12):
-                place = size * rng.uniform(-1.0, 1.0, x.size1())
-                if not (np.array(function(ca.DM(list(values.values())), place)) == 0).all():
-                    return False
-    return True
+def node_tables() -> tuple[Array, Array]:
+    """AT_NODES and FROM_NODES of `tables`: Lobatto's places, so that what a step ends with is right too."""
+    inner = np.polynomial.legendre.legroots(np.polynomial.legendre.Legendre.basis(NODES).deriv().coef)
+    places = np.array([0.0, *((np.sort(inner) + 1.0) / 2.0), 1.0])
+    values = np.vander(places, STAGES + 1, increasing=True) @ polynomials().T
+    back = np.zeros((STAGES + 1, NODES))
+    back[:STAGES] = np.linalg.inv(values[:, :STAGES])[:, 1:]
+    back[0] = 0.0
+    return values[1:], back
 
 
-def linear_contact(law: ContactLaw, target: Target) -> list[Any]:
-    """Law and target as coefficients, SX functions; law and target stand for the columns of their numbers.
-
-    law_slopes (law) -> f_0, k, d of f = f_0 + k x + d dx/dt (3, 2): in restitution, in compression
-    target_slopes (z, force, target) -> d(dz/dt)/dz, d(dz/dt)/df, d(velocity)/dz, of the piece that z is in
-    switch_slopes (z, force, target) -> switches, and their derivatives by z and force
-    """
-    numbers, branches = _law_parts(law)
-    columns = []
-    for f, x in branches:
-        at_rest = ca.substitute(f, x, ca.SX.zeros(2))
-        columns.append(ca.vertcat(at_rest, ca.jacobian(f, x).T))
-    of_target, z = ca.SX.sym("target", len(target.parameters)), ca.SX.sym("z", target.n_states)
-    force, p = ca.SX.sym("force"), dict(zip(target.parameters, ca.vertsplit(of_target), strict=True))
-    states = [z[i] for i in range(target.n_states)]
-    rates = ca.vertcat(ca.SX(0, 1), *target.derivative(states, force, p))
-    velocity = ca.SX(target.velocity(states, p))
-    switches = ca.vertcat(ca.SX(0, 1), *target.switches(states, force, p))
-    known = [z, force, of_target]
-
-    def dense(*parts: Any) -> list[Any]:
-        return [ca.densify(part) for part in parts]
-
-    return [
-        ca.Function("law_slopes", [numbers], dense(ca.horzcat(*columns))),
-        ca.Function(
-            "target_slopes",
-            known,
-            dense(ca.jacobian(rates, z), ca.jacobian(rates, force), ca.jacobian(velocity, z)),
-        ),
-        ca.Function(
-            "switch_slopes", known, dense(switches, ca.jacobian(switches, z), ca.jacobian(switches, force))
-        ),
-    ]
-
-
-def _law_parts(law: ContactLaw) -> tuple[Any, list[tuple[Any, Any]]]:
-    """(its numbers, [(force, (x, rate)) in restitution, and in compression])."""
-    numbers, x = ca.SX.sym("law", len(law.parameters)), ca.SX.sym("x", 2)
-    p = dict(zip(law.parameters, ca.vertsplit(numbers), strict=True))
-    return numbers, [(ca.SX(law.branch(x[0], x[1], c, p)), x) for c in (False, True)]
-
-
-def _target_part(target: Target) -> tuple[Any, tuple[Any, Any]]:
-    """(its numbers, (rates, velocity and switches, (state, force)))."""
-    numbers, x = ca.SX.sym("target", len(target.parameters)), ca.SX.sym("x", target.n_states + 1)
-    p = dict(zip(target.parameters, ca.vertsplit(numbers), strict=True))
-    *states, force = [x[i] for i in range(target.n_states + 1)]
-    moved = [*target.derivative(states, force, p), target.velocity(states, p)]
-    return numbers, (ca.SX(ca.vertcat(*moved, *target.switches(states, force, p))), x)
+def _answers(at: Array, back: Array) -> Array:
+    """A stage j takes n_j + gamma n_(j+1) in, but the first n_1, and hands it on by h J S."""
+    found = np.zeros((STAGES, NODES, NODES))
+    for k in range(STAGES):
+        for m in range(STAGES + 1):
+            taken = gamma() * at[:, m + k] if m >= 1 and m + k <= STAGES else np.zeros(NODES)
+            if m + k + 1 <= STAGES:
+                taken = taken + at[:, m + k + 1]
+            found[k] += np.outer(taken, back[m])
+    return found

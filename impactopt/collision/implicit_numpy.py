@@ -13,9 +13,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from impactopt.collision.bernstein import first_negative, largest
-from impactopt.collision.implicit import STAGES, gamma, linear_contact, tables
+from impactopt.collision.dense_step import Contact, Step, Watched
+from impactopt.collision.implicit import STAGES, tables
 from impactopt.collision.model import JointSpaceModel
 
 __all__ = ["implicit_loop"]
@@ -25,12 +27,13 @@ Array = NDArray[np.float64]
 # as in native/implicit.h, which says what they are
 _JUST_BEYOND, _AT_ONCE, _FIRST_STEP, _WORTH_LONGER, _AIMED_AT = 1e-9, 1e-5, 0.5, 2e-3, 0.2
 _OF_LIMIT, _MOST_TRIES, _TERMS = 1e-2, 200, STAGES + 1
+_BENT_WORTH_LONGER, _LITTLE, _SHORTER = 0.1, 0.1, 0.3
+_LITTLE_OF_FLAT, _NEAR_SEPARATION = 3e-4, 0.6
 
 _TABLES = tables()
 _POWERS, _AT_ONE = np.asarray(_TABLES["POWERS"]), np.asarray(_TABLES["AT_ONE"])
 _HULL = np.asarray(_TABLES["HULL"])[:, :_TERMS]
 _LEFT_OUT = float(np.asarray(_TABLES["LEFT_OUT"]))
-_GAMMA = gamma()
 
 # CasADi does not own callbacks: one that is gone while a function calls it would crash the process
 _ALIVE: list[ca.Callback] = []
@@ -56,7 +59,7 @@ class _Loop(ca.Callback):
         ca.Callback.__init__(self)
         self.model, self.tolerance, self.most_steps = model, tolerance, most_steps
         self.spacing, self.columns = spacing, columns
-        self.contact = linear_contact(model.law, model.target)
+        self.contact = Contact(model.law, model.target)
         self.construct("implicit_loop", {})
 
     def get_n_in(self) -> int:
@@ -96,34 +99,6 @@ class _Instant:
     contact: bool
 
 
-@dataclass
-class _Contact:
-    """Law and target in the piece where the step begins."""
-
-    f_0: float
-    k: float
-    d: float
-    rates: Array
-    at: Array
-    inverse: Array
-    moved: Array
-    mobility: float
-
-
-@dataclass
-class _Series:
-    """w_j of a step, and what depends on it; the first of each is the value at the begin.
-
-    states (9, n_states) of the model, without second integrals and peak; speeds, demand (9, n).
-    """
-
-    states: Array
-    speeds: Array
-    demand: Array
-    rate: Array
-    force: Array
-
-
 class _Run:
     """One collision, or one freeze of it."""
 
@@ -135,50 +110,57 @@ class _Run:
         def vector(name: str, default: float = 0.0) -> Array:
             return data[name].ravel() if name in data else np.full(n, default)
 
-        self.Q = np.zeros((n + 1, n + 1))
+        Q = np.zeros((n + 1, n + 1))
         if n:
             A = np.zeros((n, n))
             A[np.triu_indices(n)] = data["A"].ravel()  # its lower triangle by columns
-            self.Q[:n, :n] = A + np.triu(A, 1).T
-            self.Q[:n, n] = self.Q[n, :n] = data["s"].ravel()
-        self.Q[n, n] = data["m"].item()
-        self.drift = np.append(vector("d"), data["e"].item() if "e" in data else 0.0)
+            Q[:n, :n] = A + np.triu(A, 1).T
+            Q[:n, n] = Q[n, :n] = data["s"].ravel()
+        Q[n, n] = data["m"].item()
+        self.yields = float(Q[n, n])
         self.hand_speed = data["hand_speed"].item()
         self.until = data["until"].item() if model.refrozen else model.horizon
-        self.kd, self.kp = vector("kd"), vector("kp")
+        self.kd, self.kp = _matrix(data.get("kd"), n), _matrix(data.get("kp"), n)
         self.limit = vector("torque_limit", np.inf)
         self.viscous, self.coulomb = vector("viscous"), vector("coulomb")
         self.velocity, self.before = vector("joint_velocity"), vector("velocity_before")
         self.feedforward = vector("feedforward")
         self.saturates, self.slides = model.terms.saturation and n > 0, model.terms.friction and n > 0
-        self.law = {name: data[f"contact_{name}"].item() for name in model.law.parameters}
-        self.target = {name: data[f"target_{name}"].item() for name in model.target.parameters}
-        self.slopes = np.array(loop.contact[0](ca.DM(list(self.law.values()))))
-        self.of_target = ca.DM(list(self.target.values()))
-        self.kept: tuple[float, Array, Array] | None = None  # step, D and X of the last factorization
+        law = {name: data[f"contact_{name}"].item() for name in model.law.parameters}
+        target = {name: data[f"target_{name}"].item() for name in model.target.parameters}
+        self.law = loop.contact.of(law, target)
+        self.rows = self._watched(Q, np.append(vector("d"), data["e"].item() if "e" in data else 0.0))
+
+    def _watched(self, Q: Array, drift: Array) -> Watched:
+        unit, parts = np.eye(self.model.n_states), self.parts
+        speeds = Q @ np.vstack([unit[parts["torque"]], -unit[parts["impulse"]]])
+        speeds = speeds + np.outer(drift, unit[parts["time"]][0])
+        demand = -self.kd @ speeds[:-1]
+        if "deviation" in parts:
+            demand = demand + self.kp @ unit[parts["deviation"]]
+        return Watched(
+            speeds=speeds,
+            demand=demand,
+            penetration=unit[parts["penetration"]][0],
+            impulse=unit[parts["impulse"]][0],
+            target=unit[parts["target"]],
+        )
 
     # ------------------------------------------------------------ instants
-    def part(self, y: Array, name: str) -> Array:
-        place = self.parts.get(name)
-        return np.zeros(self.model.n) if place is None else y[place]
-
     def number(self, y: Array, name: str) -> float:
         return float(y[self.parts[name]][0])
 
     def look(self, y: Array) -> _Instant:
-        T = np.append(self.part(y, "torque"), -self.number(y, "impulse"))
-        speeds = self.Q @ T + self.drift * self.number(y, "time")
-        z = y[self.parts["target"]]
-        rate = speeds[-1] + self.hand_speed - float(self.model.target.velocity([*z], self.target))
+        speeds, depth = self.rows.speeds @ y, self.number(y, "penetration")
+        rate = float(speeds[-1]) + self.hand_speed - self.law.velocity(y[self.parts["target"]])
         u = speeds[:-1] + self.before
-        demand = self.kp * self.part(y, "deviation") - self.kd * u + self.feedforward
+        demand = self.rows.demand @ y - self.kd @ self.before + self.feedforward
         torque = np.clip(demand, -self.limit, self.limit)
         net = torque
         if self.slides:
             joint_rate = self.velocity + u
             sign = np.clip(joint_rate / self.model.transition, -1.0, 1.0)
             net = torque - (self.viscous * joint_rate + self.coulomb * sign)
-        left = float(self.model.law.branch(self.number(y, "penetration"), rate, False, self.law))
         return _Instant(
             u=u,
             demand=demand,
@@ -186,156 +168,141 @@ class _Run:
             net=net,
             rate=rate,
             compressing=rate > 0.0,
-            contact=rate > 0.0 or left > 0.0,
+            contact=rate > 0.0 or self.law.left(depth, rate) > 0.0,
         )
 
-    def contact_here(self, y: Array, now: _Instant, g: float, mobility: float) -> _Contact:
-        f_0, k, d = (float(x) for x in self.slopes[:, int(now.compressing)])
-        z, nz = y[self.parts["target"]], self.model.target.n_states
-        if not nz:
-            none = np.zeros(0)
-            return _Contact(f_0, k, d, none, none, np.zeros((0, 0)), none, mobility)
-        force = f_0 + k * self.number(y, "penetration") + d * now.rate
-        Z, G, at = (np.array(x) for x in self.loop.contact[1](z, force, self.of_target))
-        rates = np.array([float(x) for x in self.model.target.derivative([*z], force, self.target)])
-        inverse: Array = np.asarray(np.linalg.inv(np.eye(nz) - g * Z), dtype=float)
-        moved = inverse @ G.ravel()
-        return _Contact(f_0, k, d, rates, at.ravel(), inverse, moved, mobility + float(at.ravel() @ moved))
+    def mobility(self, y: Array, now: _Instant) -> tuple[float, float, float, float]:
+        """(of hand and target together [1/kg]; force and its slopes)."""
+        z = y[self.parts["target"]]
+        found = self.law.force(self.number(y, "penetration"), now.rate, now.compressing)
+        _, G, at = self.law.slopes(z, found[0])
+        return (self.yields + float(at @ G), *found)
 
     # ------------------------------------------------------------ one step
-    def series(self, y: Array, now: _Instant, h: float) -> tuple[_Series, _Contact]:
-        model, parts, n, g = self.model, self.parts, self.model.n, _GAMMA * h
-        kp = self.kp * now.free
-        D = (self.kd + g * self.kp) * now.free
+    def step(self, y: Array, now: _Instant, h: float) -> Step:
+        parts, rows = self.parts, self.rows
+        slope = now.free[:, None] * rows.demand
         if self.slides:
-            band = np.abs(self.velocity + now.u) <= model.transition
-            D = D + self.viscous + band * self.coulomb / model.transition
-        if self.kept is None or self.kept[0] != h or not np.array_equal(self.kept[1], D):
-            damped = np.eye(n + 1)
-            damped[:, :n] += g * self.Q[:, :n] * D
-            self.kept = (h, D, np.asarray(np.linalg.solve(damped, self.Q), dtype=float))
-        X = self.kept[2]
-        c = self.contact_here(y, now, g, float(X[n, n]))
-        slope = c.k * g + c.d
-        has_springs = "deviation" in parts
-        springs = parts["deviation"] if has_springs else slice(0, 0)
-        joints, hand, target = parts["torque"], parts["impulse"], parts["target"]
-        s = _Series(
-            np.zeros((_TERMS, model.n_states)),
-            np.zeros((_TERMS, n)),
-            np.zeros((_TERMS, n)),
-            np.zeros(_TERMS),
-            np.zeros(_TERMS),
-        )
-        s.states[0], s.speeds[0], s.demand[0], s.rate[0] = y, now.u, now.demand, now.rate
-        s.force[0] = c.f_0 + c.k * self.number(y, "penetration") + c.d * now.rate
-        b = np.zeros(model.n_states)  # the right-hand side
-        b[joints], b[hand], b[parts["penetration"]], b[target] = now.net, s.force[0], now.rate, c.rates
-        if has_springs:
-            b[springs] = -now.u
-        b, time = h * b, h
-        b[parts["time"]] = h
-        for j in range(STAGES):
-            # S b: speeds, force, rate and target of it
-            drift = self.drift * time
-            rho = np.append(b[joints] - g * D * drift[:n], -b[hand])
-            if has_springs:
-                rho[:n] += g * kp * b[springs]
-            speeds = drift + X @ rho
-            held = c.inverse @ b[target]
-            rate = speeds[n] - float(c.at @ held)
-            penetration = float(b[parts["penetration"]][0])
-            force = (c.k * penetration + slope * rate) / (1.0 + slope * g * c.mobility)
-            rate -= g * c.mobility * force
-            speeds = speeds - X[:, n] * (g * force)
-            z = held + g * c.moved * force
-            w = s.states[j + 1]
-            v = speeds[:n]
-            net = -D * v
-            if has_springs:
-                net = net + kp * b[springs]
-            if j == 0:
-                w[joints] = b[joints] + g * net
-                w[hand] = b[hand] + g * force
-                w[parts["penetration"]] = penetration + g * rate
-                w[target], w[parts["time"]] = z, h
-                if has_springs:
-                    w[springs] = b[springs] - g * v
-                s.speeds[1], s.rate[1], s.force[1] = v, rate, force
-            else:
-                w[joints], w[hand], w[parts["penetration"]] = h * net, h * force, h * rate
-                w[target] = (z - s.states[j][target]) / _GAMMA
-                if has_springs:
-                    w[springs] = -h * v
-                s.speeds[j + 1] = (v - s.speeds[j]) / _GAMMA
-                s.rate[j + 1] = (rate - s.rate[j]) / _GAMMA
-                s.force[j + 1] = (force - s.force[j]) / _GAMMA
-            s.demand[j + 1] = -self.kd * s.speeds[j + 1]
-            if has_springs:
-                s.demand[j + 1] += self.kp * w[springs]
-            b, time = w, h if j == 0 else 0.0
-        # time is linear, which the powers p_j of h J are not; `state_at` knows
-        return s, c
+            band = np.abs(self.velocity + now.u) <= self.model.transition
+            damping = self.viscous + band * self.coulomb / self.model.transition
+            slope = slope - damping[:, None] * rows.speeds[:-1]
+        J, rates = np.zeros((y.size, y.size)), np.zeros(y.size)
+        J[parts["torque"]], rates[parts["torque"]] = slope, now.net
+        if "deviation" in parts:
+            J[parts["deviation"]], rates[parts["deviation"]] = -rows.speeds[:-1], -now.u
+        rates[parts["time"]], rates[parts["penetration"]] = 1.0, now.rate
+        force = self.law.force(self.number(y, "penetration"), now.rate, now.compressing)[0]
+        rates[parts["impulse"]] = force
+        rates[parts["target"]] = self.law.rates(y[parts["target"]], force)
+        return Step(y, rates, J, rows, self.law, (now.rate, now.compressing), h)
 
-    def error_of(self, s: _Series, scale: float) -> float:
+    def terms_of(self, now: _Instant, s: Step) -> tuple[Array, Array]:
+        """Joint velocities and demands (9, n), their values first."""
+        speeds, demand = s.terms @ self.rows.speeds[:-1].T, s.terms @ self.rows.demand.T
+        speeds[0], demand[0] = now.u, now.demand
+        return speeds, demand
+
+    def error_of(self, now: _Instant, s: Step, scale: float, mobility: float) -> float:
         """What a further term would add, of what is allowed."""
-        impulse = s.states[:, self.parts["impulse"]].ravel()
+        if not s.found:
+            return float("nan")
+        impulse = s.terms[:, self.parts["impulse"]].ravel()
+        least = scale / mobility if self.bends else 1e-300
         error = abs(s.rate[STAGES]) / max(scale, abs(s.rate[1]))
-        error = max(error, abs(impulse[STAGES]) / max(impulse[0], abs(impulse[1]), 1e-300))
+        error = max(error, abs(impulse[STAGES]) / max(impulse[0], abs(impulse[1]), least))
         error *= _LEFT_OUT / self.loop.tolerance
         if self.saturates:
-            most = float(np.max(np.abs(s.demand[STAGES]) / self.limit))
+            most = float(np.max(np.abs(self.terms_of(now, s)[1][STAGES]) / self.limit))
             error = max(error, most * _LEFT_OUT / _OF_LIMIT)
         return float(error)
 
-    def state_at(self, y: Array, s: _Series, h: float, theta: float) -> Array:
+    @property
+    def bends(self) -> bool:
+        return self.loop.contact.law_bends or self.loop.contact.target_bends
+
+    def first_step(self, y: Array, now: _Instant, left: float) -> float:
+        mobility, force, k, d = self.mobility(y, now)
+        if not self.loop.contact.law_bends:
+            rate = max(d * mobility, sqrt(max(k * mobility, 0.0)))
+            return _FIRST_STEP / rate if rate * left > _FIRST_STEP else left
+        h, depth = left, self.number(y, "penetration")
+        little = _LITTLE_OF_FLAT if k == 0.0 and d == 0.0 else _LITTLE
+        for _ in range(60):
+            then = self.law.force(depth + abs(now.rate) * h, now.rate, now.compressing)[0]
+            if abs(then - force) * mobility * h <= little * abs(now.rate):
+                break
+            h /= 2
+        return h
+
+    def state_at(self, y: Array, s: Step, theta: float) -> Array:
         """The state at a part of the step, but for what only its end has."""
         p = _AT_ONE if theta == 1.0 else _powers(theta)
-        moved: Array = p @ s.states
-        moved[self.parts["time"]] = self.number(y, "time") + h * theta
+        moved: Array = p @ s.terms
         for name in ("peak", "torque2", "impulse2"):
             if name in self.parts:
                 moved[self.parts[name]] = y[self.parts[name]]
         return moved
 
-    def move(self, y: Array, s: _Series, h: float, theta: float) -> Array:
-        moved, parts = self.state_at(y, s, h, theta), self.parts
+    def move(self, y: Array, s: Step, theta: float) -> Array:
+        moved, parts = self.state_at(y, s, theta), self.parts
         if "torque2" in parts:
-            p = h * _integrals(theta)
-            moved[parts["torque2"]] += p @ s.states[:, parts["torque"]]
-            moved[parts["impulse2"]] += p @ s.states[:, parts["impulse"]]
+            p = s.h * _integrals(theta)
+            moved[parts["torque2"]] += p @ s.terms[:, parts["torque"]]
+            moved[parts["impulse2"]] += p @ s.terms[:, parts["impulse"]]
         if "peak" in parts:
             moved[parts["peak"]] = largest(s.force @ _HULL, theta, self.number(y, "peak"))
         return moved
 
     # ------------------------------------------------------------ events
-    def event(self, y: Array, now: _Instant, s: _Series, end: float) -> float | None:
+    def event(self, y: Array, now: _Instant, s: Step, end: float) -> float | None:
         """The part of the step after which the phase is another one; None: not before `end`."""
+        places = [None if now.compressing else self._separation(s)]
         falling = [(1.0 if now.compressing else -1.0) * (s.rate @ _HULL)]
-        if not now.compressing:
-            falling.append(s.force @ _HULL)
+        speeds, demand = self.terms_of(now, s)
         if self.saturates:
-            falling += _levels(s.demand, np.zeros(self.model.n), self.limit)
+            falling += _levels(demand, np.zeros(self.model.n), self.limit)
         if self.slides:
-            falling += _levels(s.speeds, self.velocity, np.full(self.model.n, self.model.transition))
-        if self.model.target.n_states:
-            z = y[self.parts["target"]]
-            values, by_z, by_force = (
-                np.array(x) for x in self.loop.contact[2](z, s.force[0], self.of_target)
-            )
-            terms = s.states[:, self.parts["target"]] @ by_z.T + np.outer(s.force, by_force.ravel())
-            terms[0] = values.ravel()
-            for b in terms.T @ _HULL if terms.size else ():
-                side = b[0] if b[0] != 0.0 else b[1]
-                falling.append(-b if side < 0.0 else b)
-        places = [place for b in falling if (place := first_negative(b)) is not None and place < end]
-        return min(places, default=None)
+            falling += _levels(speeds, self.velocity, np.full(self.model.n, self.model.transition))
+        z = s.terms[:, self.parts["target"]]
+        values, by_z, by_force = self.law.switches(z[0], s.force[0])
+        if values.size and self.loop.contact.target_bends:
+            at, forces = s.at_nodes(z), s.at_nodes(s.force)
+            terms = s.through_nodes(values, lambda i: self.law.switches(at[i], float(forces[i]))[0])
+        else:
+            terms = z @ by_z.T + np.outer(s.force, by_force)
+            terms[0] = values
+        for b in terms.T @ _HULL if values.size else ():
+            side = b[0] if b[0] != 0.0 else b[1]
+            falling.append(-b if side < 0.0 else b)
+        places += [first_negative(b) for b in falling]
+        return min((place for place in places if place is not None and place < end), default=None)
+
+    def _separation(self, s: Step) -> float | None:
+        """Where contact ends: by a polynomial, and where the law bends then by the law itself."""
+        if not self.loop.contact.law_bends:
+            return first_negative(s.force @ _HULL)
+        depth, depths = s.terms @ self.rows.penetration, s.at_nodes(s.terms @ self.rows.penetration)
+        rates = s.at_nodes(s.rate)
+
+        def left(theta: float) -> float:
+            p = _powers(theta)
+            return self.law.left(float(p @ depth), float(p @ s.rate))
+
+        start = left(0.0)
+        terms = s.through_nodes(start, lambda i: self.law.left(float(depths[i]), float(rates[i])))
+        place = first_negative(terms @ _HULL)
+        if place is None or not start > 0.0:
+            return place
+        beyond = next((t for t in np.linspace(place, 1.0, 21) if left(t) <= 0.0), None)
+        if beyond is None:
+            return place
+        return float(brentq(left, 0.0, beyond, xtol=1e-16, rtol=1e-14))
 
     # ------------------------------------------------------------ from y to separation, or the freeze's end
     def states(self, y: Array) -> Array:
         """(columns + 1, n_states), the last at the end."""
         columns, spacing, kept = self.loop.columns, self.loop.spacing, [y]
-        scale = h = 0.0
+        scale = h = first = 0.0
         repeated = 0
         for _ in range(self.loop.most_steps):
             now = self.look(y)
@@ -344,19 +311,21 @@ class _Run:
                 break
             left = self.until - time
             scale = max(scale, abs(now.rate))
-            if h == 0.0:
-                c = self.contact_here(y, now, 0.0, float(self.Q[-1, -1]))
-                rate = max(c.d * c.mobility, sqrt(max(c.k * c.mobility, 0.0)))
-                h = _FIRST_STEP / rate if rate * left > _FIRST_STEP else left
+            h = self.first_step(y, now, left) if h == 0.0 else h
+            if self.loop.contact.law_bends and not now.compressing:
+                to_separation = self.number(y, "penetration") / -now.rate if now.rate else np.inf
+                h = min(h, _NEAR_SEPARATION * to_separation) if to_separation > 2.0 * first else h
+            mobility = self.mobility(y, now)[0]
             for _ in range(_MOST_TRIES):
-                s, _contact = self.series(y, now, h)
-                error = self.error_of(s, scale)
-                if not error > 1.0:
+                s = self.step(y, now, h)
+                error = self.error_of(now, s, scale, mobility)
+                if error <= 1.0 or (s.found and np.isnan(error)):
                     break
-                h *= max(0.2, 0.9 * error ** (-1.0 / _TERMS))
+                h *= max(0.2, 0.9 * error ** (-1.0 / _TERMS)) if s.found else _SHORTER
             if not np.isfinite(error):
                 y = np.full_like(y, np.nan)
                 break
+            first = first or h
             end = min(1.0, left / h)
             at = self.event(y, now, s, end)
             repeated = repeated + 1 if at is not None and at < _AT_ONCE and repeated < 8 else 0
@@ -364,15 +333,23 @@ class _Run:
             if at is not None:
                 theta = min(end, at + _JUST_BEYOND * max(at, _AT_ONCE * (1 << 3 * repeated)))
             while len(kept) < columns - 1 and (part := (len(kept) * spacing - time) / h) < theta:
-                kept.append(self.state_at(y, s, h, part))
-            y = self.move(y, s, h, theta)
+                kept.append(self.state_at(y, s, part))
+            y = self.move(y, s, theta)
             if theta == end and end < 1.0:
                 y[self.parts["time"]] = self.until
-            if at is None and error < _WORTH_LONGER and left > 2.0 * h:
+            worth = _BENT_WORTH_LONGER if self.bends else _WORTH_LONGER
+            if at is None and error < worth and left > 2.0 * h:
                 h *= min((_AIMED_AT / error) ** (1.0 / _TERMS) if error > 0.0 else 4.0, 4.0)
         if np.isnan(self.look(y).rate):
             y = np.full_like(y, np.nan)
         return np.array([*kept[: max(columns - 1, 0)], *[y] * max(columns - len(kept), 1), y])
+
+
+def _matrix(gain: Array | None, n: int) -> Array:
+    """(n, n) of gains, which may be one number a joint."""
+    if gain is None:
+        return np.zeros((n, n))
+    return gain if n and gain.shape == (n, n) and n > 1 else np.diag(gain.ravel()[:n])
 
 
 def _levels(w: Array, offset: Array, level: Array) -> list[Array]:

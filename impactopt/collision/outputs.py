@@ -29,7 +29,7 @@ OUTPUTS = {
     "peak_force": "[N] largest contact force; of 'rk4' at the steps",
     "duration": "[s] from contact to separation",
     "energy": "[J] given to the target",
-    "step_error": "what the steps of 'events' and 'rk4' left out of the impulse, relative, as an estimate",
+    "step_error": "what the steps of 'rk4' left out of the impulse, relative, as an estimate",
     "separated": "1 where the contact ended within the horizon, else 0",
     "velocity": "(nv) after the collision, Pinocchio's v",
     "configuration": "(nq) after the collision, Pinocchio's q",
@@ -63,14 +63,12 @@ def check_outputs(names: tuple[str, ...]) -> None:
             )
 
 
-def check_jacobian(names: tuple[str, ...], method: str, freezes: int, why_not_implicit: str) -> None:
+def check_jacobian(names: tuple[str, ...], method: str, freezes: int) -> None:
     """InputError for outputs, or a model, without compiled Jacobians."""
     for name in names:
         if name not in (*SCALARS, *HISTORIES):
             raise InputError(f"Jacobian of {name!r}: only of {', '.join((*SCALARS, *HISTORIES))}")
     instead = "differentiate what `graph` gives by ca.jacobian instead"
-    if why_not_implicit:
-        raise InputError(f"jacobian_function: only of method 'implicit', and {why_not_implicit}; {instead}")
     if method != "implicit":
         raise InputError(f"jacobian_function: only of method 'implicit', not of {method!r}; or {instead}")
     if freezes:
@@ -98,7 +96,6 @@ class Outputs:
     stretches : what each freeze has led to.
     soles, held : number of held soles, and of all that is held, the soles first.
     v : velocity at contact (nv).
-    pulls : [s] how long a separation may stay unseen.
     """
 
     def __init__(
@@ -108,9 +105,8 @@ class Outputs:
         soles: int,
         held: int,
         v: Any,
-        pulls: float = 0.0,
     ) -> None:
-        self._model, self._stretches, self._last, self._pulls = model, stretches, stretches[-1], pulls
+        self._model, self._stretches, self._last = model, stretches, stretches[-1]
         self._instants = [Instants(model, stretch, soles, held, v) for stretch in stretches]
 
     def __getattr__(self, name: str) -> Any:
@@ -132,12 +128,7 @@ class Outputs:
 
     @cached_property
     def step_error(self) -> Any:
-        model, y, data = self._model, self._last.final, self._last.data
-        left_out = model.part(y, "left_out")
-        if self._pulls:
-            depth, rate = model.part(y, "penetration"), model.rate(y, data)
-            force = model.law.branch(depth, rate, False, model.law_numbers(data))
-            left_out += self._pulls * ca.fmax(0.0, -force) * (1 - model.phase(y, data)[1])
+        left_out = self._model.part(self._last.final, "left_out")
         return left_out / ca.fmax(self.impulse, 1e-300)
 
     @cached_property

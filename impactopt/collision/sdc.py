@@ -116,9 +116,7 @@ class SDC(SymbolicModel):
     def _more_often(self) -> SDC | None:
         if self.accuracy is None:
             return None
-        # the exact solution is of one freeze only, and its histories' spacing suits any other method
-        method = None if self.method == "exact" else self.method
-        return replace(self, freezes=more_often(self.freezes), method=method)
+        return replace(self, freezes=more_often(self.freezes))
 
     def _caution(self, error: float) -> str:
         return "" if self.accuracy is None else caution(error, self.accuracy, self.freezes)

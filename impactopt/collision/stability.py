@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collision.checks import check_frozen, spoiled
+from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.model import JointSpaceModel
 from impactopt.collision.runge_kutta import rate_of_change
+from impactopt.collision.stepped import SteppedModel
 
-__all__ = ["longest_stable_step", "slope_function", "unstable_rows"]
+__all__ = ["Stability", "longest_stable_step", "slope_function", "unstable_rows"]
 
 Array = NDArray[np.float64]
 
-# the classical Runge-Kutta method and Taylor's of order six are both stable for decaying modes with |rate|
-# h up to this
+# the classical Runge-Kutta method is stable for decaying modes with |rate| h up to this
 _LIMIT = 2.6
 _BALANCED = 4  # times, before a matrix has its norm taken
 
@@ -92,3 +95,49 @@ def _bound(matrices: Array) -> Array:
     scaled = a * scale[:, :, None] / scale[:, None, :]
     bound: Array = np.minimum(scaled.sum(axis=2).max(axis=1), scaled.sum(axis=1).max(axis=1))
     return bound
+
+
+class Stability:
+    """How long a model's steps may be, with what it takes to freeze it kept."""
+
+    def __init__(self, collision: SteppedModel) -> None:
+        self._collision, self._model = collision, joint_space_model(collision)
+
+    @cached_property
+    def _freeze(self) -> Any:
+        names = ("A", "s", "m") if self._collision.n_servos else ("m",)
+        return frozen_dynamics(self._collision).function("frozen", (*names, "pivots", "freedom"))
+
+    @cached_property
+    def _slope(self) -> Any:
+        return slope_function(self._model)
+
+    def frozen(self, q: Array, values: dict[str, Array]) -> dict[str, Array]:
+        """What is frozen at q (nq), by name; InputError where rounding spoils it."""
+        function = self._freeze
+        at_rest = np.zeros(self._collision.robot.nv)
+        found = function.call([ca.DM(x) for x in (q, at_rest, values["normal"], 0.0)])
+        frozen = {name: np.array(x) for name, x in zip(function.name_out(), found, strict=True)}
+        check_frozen(frozen)
+        return frozen
+
+    def longest(self, frozen: dict[str, Array], values: dict[str, Array]) -> float:
+        """[s], of what is frozen and the settings' values."""
+        data: dict[str, Any] = frozen | values
+        if self._collision.terms.bias or self._collision.terms.jdot:
+            data |= {"d": np.zeros(self._collision.robot.n), "e": 0.0}
+        return longest_stable_step(self._model, self._slope, data)
+
+    def unstable(self, given: Mapping[str, Array], step: float) -> NDArray[np.bool_]:
+        """(N) rows of a batch that explicit steps [s] are unstable of, or that rounding spoils; inputs by
+        name have a first axis of N or 1."""
+        collision, count = self._collision, len(given["q"])
+        inputs = (given["q"], np.zeros((1, collision.robot.nv)), given["normal"], np.zeros((1, 1)))
+        columns = [np.broadcast_to(x, (count, x.shape[1])).T for x in inputs]
+        found = self._freeze.map(count).call([ca.DM(x) for x in columns])
+        frozen = {name: np.array(x).T for name, x in zip(self._freeze.name_out(), found, strict=True)}
+        data: dict[str, Any] = frozen | {name: given[name] for name in collision.settings}
+        if collision.terms.bias or collision.terms.jdot:
+            data |= {"d": np.zeros((1, collision.robot.n)), "e": np.zeros((1, 1))}
+        own = {name: x for name, x in data.items() if name in self._model.data}
+        return np.asarray(unstable_rows(self._model, self._slope, own, step) | spoiled(frozen))

@@ -14,7 +14,6 @@ _LEAST = 1e-6  # [%] drawn for what is exact
 _MARKS = {
     "virtual": (ORANGE, "s"),
     "paper": (VERMILION, "v"),
-    "sdc, Taylor": (BLUE, "s"),
     "sdc, freezes": (BLUE, "*"),
     "sdc": (BLUE, "o"),
     "exact": (GREEN, "D"),
@@ -48,7 +47,7 @@ def pareto_picture(rows: Sequence[Row]) -> Picture:
         for method in dict.fromkeys(map(_kind, own)):
             mine = [r for r in own if _kind(r) == method]
             colour, mark = next(x for key, x in _MARKS.items() if method.startswith(key))
-            hollow = "CasADi's C" in method or "Taylor" in method
+            hollow = "CasADi's C" in method
             axes.loglog(
                 [r["time_us"] for r in mine],
                 [_size(r) for r in mine],

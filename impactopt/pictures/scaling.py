@@ -22,7 +22,6 @@ _PARTS = (
 _TITLES = ("freeze", "time loop, which finds its own steps", "a stage of the paper's scheme")
 _METHODS = (
     ("implicit", GREEN, "own steps, by tolerance"),
-    ("events", BLUE, "Taylor, by step [s]"),
     ("rk4", VERMILION, "the paper's Runge-Kutta, by step [s]"),
 )
 

@@ -8,8 +8,8 @@ typedef struct {
 } ForwardRoom;
 
 static void linear_of(const Data *d, const FrozenTangent *t, const State *y, const Instant *now, const Resolvent *r,
-                      const Series *s, Linear *l) {
-  l->d = d, l->frozen = t, l->begin = y, l->resolvent = r, l->series = s;
+                      const Series *s, const Bend *bend, Linear *l) {
+  l->d = d, l->frozen = t, l->begin = y, l->resolvent = r, l->series = s, l->bend = bend;
   double x[N + 1][STAGES];
   FOR(a, STAGES) {
     FOR(j, N) x[j][a] = ((const double *)s->torque[a + 1])[j];
@@ -17,14 +17,8 @@ static void linear_of(const Data *d, const FrozenTangent *t, const State *y, con
   }
   times_Q(t, (const double(*)[STAGES])x, l->dQ);
   FOR(i, V) {
-    const bits free_ = now->torque[i] == now->demand[i];
-    ((vec *)l->free)[i] = choose(free_, (vec){0} + 1.0, (vec){0});
-#if FRICTION
-    const bits sliding = magnitude(d->joint_velocity[i] + now->u[i]) > TRANSITION;
-    ((vec *)l->slide)[i] = d->viscous[i] + choose(sliding, (vec){0}, d->coulomb[i] / TRANSITION);
-#else
-    ((vec *)l->slide)[i] = (vec){0};
-#endif
+    ((vec *)l->free)[i] = choose(not_saturated(now, i), (vec){0} + 1.0, (vec){0});
+    ((vec *)l->slide)[i] = friction_slope(d, now, i);
   }
 }
 
@@ -37,6 +31,8 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
   Instant now, at;
   State then;
   Series s;
+  Bend bend;
+  Contact c;
   Linear *l = &w->linear;
   int column = 0, next = 0;
   /* time of the columns within steps stays */
@@ -49,8 +45,11 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
     look(d, y, &now);
     judge(d, y, &now);
     prepare(d, y, &now, h, &r);
-    make_series(d, y, &now, &r, &s);
-    linear_of(d, t, y, &now, &r, &s, l);
+    series_of(d, y, &now, &r, &bend, &s);
+#if BENDS
+    settle(d, y, &now, &r, &s, &bend);
+#endif
+    linear_of(d, t, y, &now, &r, &s, &bend, l);
     FOR(kind, 2) {
       StateTangent *dy = &w->states[kind];
       vec moved[VD], back[VD];
@@ -63,7 +62,8 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
         if (part >= theta) break;
         within(d, y, &now, &s, &r.contact, part, &then, &at);
         state_forward(l, part, back, &w->series, SPEEDS_OF_COLUMNS ? 0 : N, &w->column);
-        rates_forward(t, kind, &r.contact, &w->column);
+        contact_within(l, &then, &now, &at, &c);
+        rates_forward(t, kind, &c, &w->column);
         const double force = call(contact_force, &then.penetration, &at.rate, d->law);
         write_tangent(d, t, F, P, kind, &at, force, &w->column, record, next);
       }

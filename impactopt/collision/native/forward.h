@@ -43,10 +43,5 @@ INLINE void add_product(const vec (*A)[V], int count, const vec *x, int width, v
     }
 }
 
-INLINE vec either(int condition, vec yes, vec no) {
-  if (condition) return yes;
-  return no;
-}
-
 /* numbers, a direction each, from and to the lanes of a direction of v */
 INLINE double *lane(vec *x, int direction) { return (double *)x + direction; }

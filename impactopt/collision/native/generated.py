@@ -1,18 +1,18 @@
-"""What CasADi writes of the native collision: the robot's tree, and jets of law and target."""
+"""What CasADi writes of the native collision: the robot's tree, and law and target."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
 
+from impactopt.collision.contact_slopes import contact_functions
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.collision.graph import target_yield
-from impactopt.collision.implicit import linear_contact
-from impactopt.collision.jets import derivative
 from impactopt.collision.model import JointSpaceModel
-from impactopt.collision.taylor import ORDER
+from impactopt.contact import ContactLaw
 from impactopt.kinematics.stance import Stance
 
 __all__ = ["Tree", "backwards", "c_code", "gamma_of", "scalar_functions", "tangent_back", "tree_functions"]
@@ -73,17 +73,14 @@ def gamma_of(stance: Stance, held: int) -> list[float]:
 
 
 def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
-    """Law and target as SX functions; with Taylor steps also their time derivatives order by order, and with
-    implicit ones their coefficients (`linear_contact`).
+    """Law and target as SX functions; with implicit steps also their values and slopes (`contact_functions`).
 
-    `law` and `target` are the numbers of both, z the target's state; jets have a column for each order:
+    `law` and `target` are the numbers of both, z the target's state:
 
-        restitution_force (x, rate, law), contact_force (x, rate, law) -> force
+        left_force (x, rate, law) : above zero while contact lasts in restitution
+        contact_force (x, rate, law) -> force
         target_velocity (z, target), target_rates (z, force, target), target_energy, target_result (z, target)
         target_yield (target)
-        order_<k> (hand speed's derivative, compressing, x, rates, forces, z, law, target)
-            -> rate, force, and the next derivative of z; the last without it
-        switches (forces, z, target) -> jets of the switches, a column each
     """
     law_numbers, target_numbers = list(model.law.parameters), list(model.target.parameters)
     law, target = ca.SX.sym("law", len(law_numbers)), ca.SX.sym("target", len(target_numbers))
@@ -93,12 +90,13 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
     z = ca.SX.sym("z", model.target.n_states)
     states = [z[i] for i in range(model.target.n_states)]
     thing = model.target
+    left = model.law.separation if method == "implicit" else partial(_restitution, model.law)
 
     def column(values: Any) -> Any:
         return ca.densify(ca.vertcat(ca.SX(0, 1), *values))
 
     functions = [
-        ca.Function("restitution_force", [x, rate, law], [model.law.branch(x, rate, False, of_law)]),
+        ca.Function("left_force", [x, rate, law], [_number(left(x, rate, of_law))]),
         ca.Function("contact_force", [x, rate, law], [model.law.force(x, rate, of_law)]),
         ca.Function("target_velocity", [z, target], [_number(thing.velocity(states, of_target))]),
         ca.Function("target_rates", [z, force, target], [column(thing.derivative(states, force, of_target))]),
@@ -106,53 +104,11 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         ca.Function("target_result", [z, target], [column(thing.result(states, of_target))]),
         ca.Function("target_yield", [target], [_number(target_yield(thing, of_target))]),
     ]
-    if method == "implicit":
-        return functions + linear_contact(model.law, model.target)
-    return functions + (_jets(model, law, target, of_law, of_target) if method == "events" else [])
+    return functions + (contact_functions(model.law, model.target) if method == "implicit" else [])
 
 
-def _jets(
-    model: JointSpaceModel, law: Any, target: Any, of_law: dict[str, Any], of_target: dict[str, Any]
-) -> list[Any]:
-    thing, size = model.target, ORDER + 1
-    speed, compressing, x = (ca.SX.sym(name) for name in ("speed", "compressing", "x"))
-    rates, forces = ca.SX.sym("rates", size), ca.SX.sym("forces", size)
-    z = ca.SX.sym("z", size, thing.n_states)
-    states = [[z[k, i] for k in range(size)] for i in range(thing.n_states)]
-    functions = []
-    for k in range(size):
-        moved = derivative(lambda *s: thing.velocity(s, of_target), states, k)
-        rate = speed - moved
-        known = [*[rates[i] for i in range(k)], rate]
-        penetration = [x, *known[:k]]
-        branches = [
-            derivative(lambda a, b, c=c: model.law.branch(a, b, c, of_law), [penetration, known], k)
-            for c in (True, False)
-        ]
-        force = ca.if_else(compressing, *branches)
-        reached = [*[forces[i] for i in range(k)], force]
-        nexts = [
-            derivative(lambda f, *s, i=i: thing.derivative(s, f, of_target)[i], [reached, *states], k)
-            for i in range(thing.n_states)
-        ]
-        out = [_number(rate), _number(force)]
-        if k < ORDER:
-            out.append(ca.densify(ca.vertcat(ca.SX(0, 1), *nexts)))
-        inputs = [speed, compressing, x, rates, forces, z, law, target]
-        functions.append(ca.Function(f"order_{k}", inputs, out))
-    jets = [forces[i] for i in range(size)]
-    count = len(thing.switches([state[0] for state in states], jets[0], of_target))
-    switches = [
-        ca.vertcat(
-            *[
-                derivative(lambda f, *s, i=i: thing.switches(s, f, of_target)[i], [jets, *states], k)
-                for k in range(size)
-            ]
-        )
-        for i in range(count)
-    ]
-    made = ca.densify(ca.horzcat(ca.SX(size, 0), *switches))
-    return [*functions, ca.Function("switches", [forces, z, target], [made])]
+def _restitution(law: ContactLaw, x: Any, rate: Any, numbers: Any) -> Any:
+    return law.branch(x, rate, False, numbers)
 
 
 def _number(expression: Any) -> Any:
@@ -160,7 +116,7 @@ def _number(expression: Any) -> Any:
 
 
 # of each function, the inputs that it is differentiated by
-_BACK = {"order": (0, 2, 3, 4, 5), "switches": (0, 1), "contact_force": (0, 1), "target_rates": (0, 1)}
+_BACK: dict[str, tuple[int, ...]] = {"contact_force": (0, 1), "target_rates": (0, 1)}
 _BACK |= {"target_velocity": (0,), "target_energy": (0,), "tree": (0, 1), "drift": (0, 1)}
 
 
@@ -168,12 +124,11 @@ def backwards(functions: list[Any]) -> list[Any]:
     """<name>_back (inputs, derivatives by the outputs) -> derivatives by some of the inputs, where used."""
     made = []
     for function in functions:
-        kind = function.name().split("_")[0] if function.name().startswith("order_") else function.name()
-        if kind in _BACK:
+        if function.name() in _BACK:
             x = [ca.SX.sym(name, *function.size_in(name)) for name in function.name_in()]
             y = function.call(x)
             seeds = [ca.SX.sym("seed", *part.shape) for part in y]
-            by = [x[i] for i in _BACK[kind]]
+            by = [x[i] for i in _BACK[function.name()]]
             (out,) = ca.reverse(y, by, [seeds])
             out = [ca.densify(part) for part in out]
             made.append(ca.Function(f"{function.name()}_back", [*x, *seeds], out))

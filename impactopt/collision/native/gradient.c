@@ -1,6 +1,7 @@
 /* A scalar output of a collision and its gradients: (q, v[, feedforward], settings) -> value, d/dq (nv), d/dv (nv),
    both in v's basis. */
 
+/* its value, and its derivatives by the final state */
 static double final_value(const Data *d, const Course *c, State *y_) {
   memset(y_, 0, sizeof *y_);
 #if defined(OUT_impulse)
@@ -23,6 +24,47 @@ static double final_value(const Data *d, const Course *c, State *y_) {
 #endif
 }
 
+#if FREEZES
+/* By differences of collisions, of whose steps the tolerance is far below: a stretch's length, and where it is frozen,
+   depend on the one before. */
+#define DIFFERENCE 1e-4
+static double value_at(const double **arg, const double *q, const double *v, Work *w) {
+  const double *in[N_IN];
+  Course c;
+  State unused;
+  FOR(k, N_IN) in[k] = arg[k];
+  in[ARG_q] = q, in[ARG_v] = v;
+  collide(in, 0, w, &c);
+  return final_value(&w->data, &c, &unused);
+}
+
+static void evaluate(const double **arg, double **res, Work *w) {
+  double q[NQ], v[NV], there[NQ], way[NV] = {0}, ends[2];
+  load(arg[ARG_q], q, NQ);
+  load(arg[ARG_v], v, NV);
+  if (res[0]) *res[0] = value_at(arg, q, v, w);
+  FOR(i, NV) {
+    FOR(side, 2) {
+      if (!res[1]) break;
+      way[i] = side ? -DIFFERENCE : DIFFERENCE;
+      const double *in[] = {q, way};
+      double *out[] = {there};
+      integrate(in, out, 0, 0, 0);
+      ends[side] = value_at(arg, there, v, w);
+    }
+    if (res[1]) res[1][i] = (ends[0] - ends[1]) / (2 * DIFFERENCE);
+    way[i] = 0.0;
+    const double here = v[i];
+    FOR(side, 2) {
+      if (!res[2]) break;
+      v[i] = here + (side ? -DIFFERENCE : DIFFERENCE);
+      ends[side] = value_at(arg, q, v, w);
+    }
+    v[i] = here;
+    if (res[2]) res[2][i] = (ends[0] - ends[1]) / (2 * DIFFERENCE);
+  }
+}
+#else
 static void evaluate(const double **arg, double **res, Work *w) {
   Course c;
   Back all;
@@ -47,3 +89,4 @@ static void evaluate(const double **arg, double **res, Work *w) {
     if (res[2]) res[2][i] = by_v[i] + 0.0 * value;
   }
 }
+#endif

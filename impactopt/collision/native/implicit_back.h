@@ -9,19 +9,24 @@
        a_j = p_j(theta) y_ + h J' b_(j+1),    a_0 the derivative by the state that the step began with
 
    so that v = Q (T, -p) + drift t of x_j has h (dF/dv)' b_(j+1). As in S itself only a product with X is left of
-   S', and three scalars. Lengths are constants, but where an event ends the step: that is a root of the series. */
+   S', and three scalars. Lengths are constants, but where an event ends the step: that is a root of the series.
 
-/* what a step is watched for, as a linear form of the state: of the velocity of one joint or the hand, and others */
+   What bends in law and target, n = R(o(n)), goes back by the transposed of I - dR K to what the nodes see: further
+   places that an output depends on. The slopes that it is beside are constants, as the series does not depend on
+   them but for its error. */
+
+/* what a step is watched for, as a linear form of the state and n: of velocities of joints and hand, and others */
 typedef struct {
-  int which;
-  double velocity, deviation, penetration, target[NZ1];
+  vec velocity[V], deviation[V];
+  double penetration, target[NZ1], inputs[INPUTS];
 } Form;
 
 /* derivatives by the state at a place in the step */
 typedef struct {
-  double p[TERMS];
+  double p[TERMS], inputs[INPUTS];
   Right by;
 } Seed;
+#define MOST_SEEDS (3 + (BENDS ? NODES : 0))
 
 /* how an output changes with theta, from its derivatives by the state there */
 static double by_place(const Series *s, double h, const State *y_, double theta) {
@@ -37,38 +42,53 @@ static double by_place(const Series *s, double h, const State *y_, double theta)
   return x + y_->time * h;
 }
 
-static void form_of(const Data *d, const State *y, const Series *s, const Contact *c, int kind, int number, Form *f) {
+static void form_of(const Data *d, const Series *s, const Contact *c, int kind, int number, double theta, Form *f) {
   double force = kind == OF_FORCE, rate = kind == OF_RATE;
-  *f = (Form){.which = N};
+  memset(f, 0, sizeof *f);
 #if SWITCHES
   if (kind == OF_SWITCH) {
-    double values[SWITCHES], by_z[SWITCHES * NZ1], by_force[SWITCHES];
-    const double *in[] = {y->target, &s->force[0], d->target};
-    double *out[] = {values, by_z, by_force};
-    switch_slopes(in, out, 0, 0, 0);
-    FOR(i, NZ) f->target[i] = by_z[number + SWITCHES * i];
-    force = by_force[number];
+    Switch x;
+    switch_in(d, s, theta, &x);
+    FOR(i, NZ) f->target[i] = x.by_z[number + SWITCHES * i];
+    force = x.by_force[number];
+  }
+#endif
+#if LAW_BENDS
+  if (kind == OF_SEPARATION) {
+    double at[3];
+    separation_at(d, s, theta, at);
+    f->penetration = at[1], rate = at[2];
   }
 #endif
   rate += c->d * force;
-  f->velocity = rate;
-  f->penetration = c->k * force;
+  put_speed(f->velocity, rate);
+  f->penetration += c->k * force;
+  f->inputs[0] = force;
+  if (TARGET_BENDS) f->inputs[INPUTS - 1] = -rate;
   FOR(i, NZ) f->target[i] -= c->at[i] * rate;
   if (kind == OF_DEMAND) {
-    f->which = number;
-    f->velocity = -((const double *)d->kd)[number];
-    if (STIFFNESS) f->deviation = ((const double *)d->kp)[number];
+#if KD_MATRIX
+    FOR(j, N) ((double *)f->velocity)[j] = -((const double *)d->kd[j])[number];
+#else
+    ((double *)f->velocity)[number] = -((const double *)d->kd)[number];
+#endif
+#if STIFFNESS && KP_MATRIX
+    FOR(j, N) ((double *)f->deviation)[j] = ((const double *)d->kp[j])[number];
+#elif STIFFNESS
+    ((double *)f->deviation)[number] = ((const double *)d->kp)[number];
+#endif
   }
-  if (kind == OF_SLIDING) f->which = number, f->velocity = 1.0;
+  if (kind == OF_SLIDING) ((double *)f->velocity)[number] = 1.0;
 }
 
-static double slope_of(const Form *f, const Series *s, double theta) {
+static double slope_of(const Form *f, const Series *s, const Inputs n, double theta) {
   double slope[TERMS], x = 0.0;
   slopes(theta, slope);
   for (int j = 1; j < TERMS; j++) {
-    double w = f->velocity * ((const double *)s->speeds[j])[f->which] + f->penetration * s->penetration[j];
-    w += f->deviation * ((const double *)s->deviation[j])[f->which];
+    double w = dot(f->velocity, s->speeds[j], V) + f->penetration * s->penetration[j];
+    if (STIFFNESS) w += dot(f->deviation, s->deviation[j], V);
     FOR(i, NZ) w += f->target[i] * s->target[i][j];
+    if (BENDS) FOR(a, INPUTS) w += f->inputs[a] * n[j][a];
     x += slope[j] * w;
   }
   return x;
@@ -78,50 +98,65 @@ static double slope_of(const Form *f, const Series *s, double theta) {
 static void form_back(const Data *d, const State *y, const Series *s, double h, const Form *f, double value_,
                       double theta, Seed *seed, Back *all) {
   const Frozen *F = d->frozen;
-  const double by = value_ * f->velocity;
-  const int own = f->which;
   Right *to = &seed->by;
+  vec torque[V];
   powers(theta, seed->p);
   FOR(i, V) {
-    to->torque[i] = by * F->Q[own][i] * d->kept[i];
-    to->deviation[i] = (vec){0};
-    all->Q[own][i] += by * vector(s->torque, i, seed->p);
+    torque[i] = vector(s->torque, i, seed->p);
+    to->torque[i] = (vec){0};
+    to->deviation[i] = value_ * f->deviation[i];
   }
-  ((double *)all->Q[own])[N] -= by * value(s->impulse, seed->p);
-  to->impulse = -by * ((const double *)F->Q[own])[N];
-  ((double *)to->deviation)[own] = value_ * f->deviation;
+  const double impulse = value(s->impulse, seed->p);
+  to->impulse = to->time = 0.0;
+  FOR(own, N + 1) {
+    const double by = value_ * ((const double *)f->velocity)[own];
+    if (by == 0.0) continue;
+    FOR(i, V) to->torque[i] += by * F->Q[own][i] * d->kept[i], all->Q[own][i] += by * torque[i];
+    ((double *)all->Q[own])[N] -= by * impulse;
+    to->impulse -= by * ((const double *)F->Q[own])[N];
+#if BIAS || JDOT
+    to->time += by * ((const double *)F->drift)[own];
+    ((double *)all->drift)[own] += by * (y->time + h * theta);
+#endif
+    if (own == N) all->hand_speed += by;
+  }
   to->penetration = value_ * f->penetration;
   FOR(i, NZ) to->target[i] = value_ * f->target[i];
-  to->time = 0.0;
-#if BIAS || JDOT
-  to->time = by * ((const double *)F->drift)[own];
-  ((double *)all->drift)[own] += by * (y->time + h * theta);
-#endif
-  if (own == N) all->hand_speed += by;
+  FOR(a, INPUTS) seed->inputs[a] = value_ * f->inputs[a];
 }
 
-/* a becomes h J' b, b = S' a; v_ is that of h times the slope of state, torque_ is b's */
-INLINE void solve_back(const Data *d, const Resolvent *r, Right *a, vec *v_, vec *torque_) {
+/* a becomes h J' b, b = S' a; v_ is that of h times the slope of state, torque_ is b's, inputs_ that of the stage's */
+INLINE void solve_back(const Data *d, const Resolvent *r, Right *a, vec *v_, vec *torque_, double *inputs_) {
   const Contact *c = &r->contact;
-  vec s[V], x[V];
+  vec s[V], x[V], held_[V];
+#if GAIN_MATRIX
+  const vec(*rows)[V] = r->rows;
+#else
+  const vec(*rows)[V] = r->X;
+#endif
+  damped_back(r, a->torque, held_);
   FOR(i, V) {
-    s[i] = -r->D[i] * a->torque[i];
+    s[i] = -held_[i];
     if (STIFFNESS) s[i] -= a->deviation[i];
     x[i] = (vec){0};
   }
-  add_columns(r->X, N, (const double *)s, x);
+  add_columns(rows, N, (const double *)s, x);
   const double slope = c->k * r->g + c->d;
   double force_ = a->impulse - r->g * x[N / LANES][N % LANES], held[NZ1];
   FOR(i, NZ) force_ += c->moved[i] * a->target[i];
   const double rate_ = (a->penetration + slope * force_) / (1.0 + slope * r->g * c->mobility);
   force_ -= r->g * c->mobility * rate_;
+  FOR(i, V) x[i] += rate_ * rows[N][i];
+  damped_back(r, x, held_);
   FOR(i, V) {
-    x[i] += rate_ * r->X[N][i];
-    v_[i] = r->h * (s[i] - r->g * r->D[i] * x[i]);
+    v_[i] = r->h * (s[i] - r->g * held_[i]);
     torque_[i] = a->torque[i] + r->g * d->kept[i] * x[i];
     a->torque[i] = r->h * d->kept[i] * x[i];
-    if (STIFFNESS) a->deviation[i] = r->h * r->kp[i] * torque_[i];
   }
+#if STIFFNESS
+  sprung_back(d, r, torque_, held_);
+  FOR(i, V) a->deviation[i] = r->h * held_[i];
+#endif
   put_speed(v_, r->h * rate_);
   a->impulse = -r->h * x[N / LANES][N % LANES];
   a->penetration = r->h * c->k * force_;
@@ -133,6 +168,11 @@ INLINE void solve_back(const Data *d, const Resolvent *r, Right *a, vec *v_, vec
     a->target[i] = -r->h * c->at[i] * rate_;
     FOR(k, NZ) a->target[i] += r->h * c->Z[k][i] * held[k];
   }
+  inputs_[0] = r->h * force_;
+#if TARGET_BENDS
+  FOR(i, NZ) inputs_[1 + i] = r->h * held[i];
+  inputs_[INPUTS - 1] = -r->h * rate_;
+#endif
 }
 
 INLINE void add_seed(const Seed *seed, int j, Right *a) {
@@ -162,6 +202,49 @@ static void products_back(const Series *s, const vec (*v_)[V], Back *all) {
   }
 }
 
+/* series by series, last first: from seeds to the first term */
+static void stages_back(const Data *d, const Resolvent *r, const Seed *seeds, int many, Right *a, vec (*v_)[V],
+                        vec *torque_, Inputs inputs_) {
+  memset(a, 0, sizeof *a);
+  for (int j = STAGES; j >= 0; j--) {
+    double unused[INPUTS];
+    if (j < STAGES) solve_back(d, r, a, v_[j], torque_, BENDS ? inputs_[j] : unused);
+    FOR(k, many) add_seed(&seeds[k], j, a);
+  }
+}
+
+#if BENDS
+/* what depends on n as further seeds: what the nodes see; how many seeds there are then */
+static int bend_back(const Data *d, const State *y, const Resolvent *r, const Series *s, const Bend *b, Seed *seeds,
+                     int many, Back *all) {
+  Inputs of_stage, n_;
+  Right a;
+  vec v_[STAGES][V], torque_[V];
+  double by[UNKNOWNS];
+  stages_back(d, r, seeds, many, &a, v_, torque_, of_stage);
+  FOR(j, TERMS) FOR(k, INPUTS) {
+    n_[j][k] = (j && j < STAGES ? of_stage[j][k] : 0.0) + (j ? GAMMA_OF_STEPS * of_stage[j - 1][k] : 0.0);
+    FOR(i, many) n_[j][k] += seeds[i].p[j] * seeds[i].inputs[k];
+  }
+  FOR(k, INPUTS) FOR(i, NODES) {
+    by[k * NODES + i] = 0.0;
+    FOR(j, TERMS) by[k * NODES + i] += FROM_NODES[j][i] * n_[j][k];
+  }
+  solve_bend_transposed(b, by);
+  FOR(i, NODES) {
+    double seen_[SEEN] = {0};
+    FOR(k, INPUTS) FOR(o, SEEN) seen_[o] += b->by[i][k][o] * by[k * NODES + i];
+    Form f;
+    memset(&f, 0, sizeof f);
+    f.penetration = seen_[0];
+    put_speed(f.velocity, seen_[1]);
+    FOR(z, NZ) f.target[z] = (z + 2 < SEEN ? seen_[2 + z] : 0.0) - r->contact.at[z] * seen_[1];
+    form_back(d, y, s, r->h, &f, 1.0, AT_NODES[i][1], &seeds[many++], all);
+  }
+  return many;
+}
+#endif
+
 /* one step back: `y_` goes from the state after it to the one before it */
 static void step_back(const Data *d, const Tape *tape, int step, Resolvent *r, State *y_, Back *all) {
   const State *y = &tape->states[step];
@@ -169,13 +252,21 @@ static void step_back(const Data *d, const Tape *tape, int step, Resolvent *r, S
   const Event *e = &tape->events[step];
   Instant now;
   Series s;
-  Seed seeds[3];
+  Bend bend;
+  Seed seeds[MOST_SEEDS];
   Form form;
   int many = 1;
   look(d, y, &now);
   judge(d, y, &now);
   prepare(d, y, &now, h, r);
-  make_series(d, y, &now, r, &s);
+  series_of(d, y, &now, r, &bend, &s);
+#if BENDS
+  settle(d, y, &now, r, &s, &bend);
+  const double(*n)[INPUTS] = (const double(*)[INPUTS])bend.n;
+#else
+  const double(*n)[INPUTS] = 0;
+#endif
+  memset(seeds[0].inputs, 0, sizeof seeds[0].inputs);
 
   /* where the output depends on the step's path: its end, the largest force, and the event that ends it */
   double theta_ = theta < 1.0 ? by_place(&s, h, y_, theta) : 0.0, time_ = y_->time;
@@ -190,16 +281,17 @@ static void step_back(const Data *d, const Tape *tape, int step, Resolvent *r, S
 #if PEAK
   double place;
   if (y_->peak != 0.0 && y->peak < largest(s.force, theta, y->peak, &place)) {
-    form_of(d, y, &s, &r->contact, OF_FORCE, 0, &form);
+    form_of(d, &s, &r->contact, OF_FORCE, 0, place, &form);
     form_back(d, y, &s, h, &form, y_->peak, place, &seeds[many], all);
-    if (place == theta) theta_ += y_->peak * slope_of(&form, &s, theta);
+    if (place == theta) theta_ += y_->peak * slope_of(&form, &s, n, theta);
     time_ += seeds[many++].by.time;
     y_->peak = 0.0;
   }
 #endif
   if (e->kind && e->at > 0.0) {
-    form_of(d, y, &s, &r->contact, e->kind, e->number, &form);
-    const double slope = slope_of(&form, &s, e->at);
+    const int kind = LAW_BENDS && e->kind == OF_FORCE ? OF_SEPARATION : e->kind;
+    form_of(d, &s, &r->contact, kind, e->number, e->at, &form);
+    const double slope = slope_of(&form, &s, n, e->at);
     if (slope != 0.0) {
       const double value_ = -theta_ / slope;
       form_back(d, y, &s, h, &form, value_, e->at, &seeds[many], all);
@@ -209,24 +301,22 @@ static void step_back(const Data *d, const Tape *tape, int step, Resolvent *r, S
   }
   if (!e->kind && theta < 1.0) time_ -= theta_ / h;
 
-  /* series by series, last first */
   Right a;
   vec v_[STAGES][V], torque_[V];
-  memset(&a, 0, sizeof a);
-  for (int j = STAGES; j >= 0; j--) {
-    if (j < STAGES) solve_back(d, r, &a, v_[j], torque_);
-    FOR(k, many) add_seed(&seeds[k], j, &a);
-  }
+  Inputs of_stage;
+#if BENDS
+  const int before = many;
+  many = bend_back(d, y, r, &s, &bend, seeds, many, all);
+  for (int k = before; k < many; k++) time_ += seeds[k].by.time;
+#endif
+  stages_back(d, r, seeds, many, &a, v_, torque_, of_stage);
   products_back(&s, v_, all);
 #if BIAS || JDOT
   time_ += dot(d->frozen->drift, v_[0], V);
   FOR(i, V) all->drift[i] += (y->time + r->g) * v_[0][i] + h * v_[1][i];
 #endif
 #if FRICTION
-  FOR(i, V) {
-    const bits sliding = magnitude(d->joint_velocity[i] + now.u[i]) > TRANSITION;
-    all->joint_velocity[i] -= h * torque_[i] * (d->viscous[i] + choose(sliding, (vec){0}, d->coulomb[i] / TRANSITION));
-  }
+  FOR(i, V) all->joint_velocity[i] -= h * torque_[i] * friction_slope(d, &now, i);
 #endif
   all->hand_speed += v_[0][N / LANES][N % LANES];
   FOR(i, V) {

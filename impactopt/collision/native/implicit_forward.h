@@ -23,6 +23,7 @@ typedef struct {
   const FrozenTangent *frozen;
   const Series *series;
   const Resolvent *resolvent;
+  const Bend *bend;
   const State *begin;
   vec dQ[STAGES][N + 1][VD];   /* times (T, -p) of each term but the first */
   /* of the joints: 1 but for saturated ones; friction's slope */
@@ -52,12 +53,42 @@ static void rates_forward(const FrozenTangent *t, int kind, const Contact *c, St
   }
 }
 
+/* out += factor times gains (one number a joint, or a matrix) times x */
+INLINE void add_gain(const vec *gain, int matrix, double factor, const vec (*x)[VD], vec (*out)[VD]) {
+  const double *g = (const double *)gain;
+  FOR(i, N) {
+    if (!matrix) FOR_EACH(k) out[i][k] += factor * g[i] * x[i][k];
+    else FOR(j, N) FOR_EACH(k) out[i][k] += factor * g[j * V * LANES + i] * x[j][k];
+  }
+}
+/* out += factor times the springs of what is not saturated times x */
+INLINE void add_springs(const Linear *l, double factor, const vec (*x)[VD], vec (*out)[VD]) {
+#if STIFFNESS && GAIN_MATRIX
+  vec whole[N1][VD];
+  memset(whole, 0, sizeof whole);
+  add_gain((const vec *)l->d->kp, KP_MATRIX, factor, x, whole);
+  FOR(i, N) FOR_EACH(k) out[i][k] += l->free[i] * whole[i][k];
+#elif STIFFNESS
+  add_gain(l->resolvent->kp, 0, factor, x, out);
+#endif
+}
+
+/* tangents of n, term by term */
+typedef vec InputsTangent[BENDS ? TERMS : 1][INPUTS][VD];
+
 /* S b, with dJ's part on the right-hand side: dQ of both terms that this stage is made of, the drift's over `time` */
-INLINE void solve_forward(const Linear *l, int kind, int stage, double time, const RightTangent *b, LeftTangent *x) {
+INLINE void solve_forward(const Linear *l, int kind, int stage, double time, const RightTangent *b,
+                          const InputsTangent n, LeftTangent *x) {
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
-  const double *D = (const double *)r->D, *kp = (const double *)r->kp, *X = (const double *)r->X[N];
-  vec rho[N1][VD];
+  const double *X = (const double *)r->X[N];
+  vec rho[N1][VD], inputs[INPUTS][VD];
+#if BENDS
+  FOR(a, INPUTS) FOR_EACH(k)
+    inputs[a][k] = either(stage, n[stage][a][k] + GAMMA_OF_STEPS * n[stage + 1][a][k], n[1][a][k]);
+#else
+  memset(inputs, 0, sizeof inputs);
+#endif
   FOR(i, ROWS_OF_V) FOR_EACH(k) {
     vec a = {0};
     if (kind == BY_Q && i <= N) {
@@ -68,11 +99,10 @@ INLINE void solve_forward(const Linear *l, int kind, int stage, double time, con
     if (time != 0.0 && i <= N) a += l->frozen->drift[kind][i][k] * time;
 #endif
     x->speeds[i][k] = a;
-    if (i < N) {
-      rho[i][k] = b->torque[i][k] - r->g * D[i] * a;
-      if (STIFFNESS) rho[i][k] += r->g * kp[i] * b->deviation[i][k];
-    }
+    if (i < N) rho[i][k] = b->torque[i][k];
   }
+  add_gain((const vec *)r->D, GAIN_MATRIX, -r->g, (const vec(*)[VD])x->speeds, rho);
+  add_springs(l, r->g, (const vec(*)[VD])b->deviation, rho);
   add_product(r->X, N, rho[0], VD, x->speeds[0]);
   const double slope = c->k * r->g + c->d;
   FOR_EACH(k) {
@@ -80,9 +110,11 @@ INLINE void solve_forward(const Linear *l, int kind, int stage, double time, con
     FOR(i, NZ) {
       held[i] = (vec){0};
       FOR(j, NZ) held[i] += c->inverse[i][j] * b->target[j][k];
+      if (TARGET_BENDS) FOR(j, NZ) held[i] += c->inverse[i][j] * r->g * inputs[1 + j][k];
       rate -= c->at[i] * held[i];
     }
-    x->force[k] = (c->k * b->penetration[k] + slope * rate) / (1.0 + slope * r->g * c->mobility);
+    if (TARGET_BENDS) rate -= inputs[INPUTS - 1][k];
+    x->force[k] = (c->k * b->penetration[k] + slope * rate + inputs[0][k]) / (1.0 + slope * r->g * c->mobility);
     x->impulse[k] = b->impulse[k] + r->g * x->force[k];
     x->rate[k] = rate - r->g * c->mobility * x->force[k];
     x->penetration[k] = b->penetration[k] + r->g * x->rate[k];
@@ -92,12 +124,11 @@ INLINE void solve_forward(const Linear *l, int kind, int stage, double time, con
 }
 
 /* the tangents of all terms, from that of the state at the begin */
-static void series_forward(const Linear *l, int kind, const StateTangent *dy, SeriesTangent *s) {
+static void terms_forward(const Linear *l, int kind, const StateTangent *dy, const InputsTangent n, SeriesTangent *s) {
   const Data *d = l->d;
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
-  const double h = r->h, by_gamma = 1.0 / GAMMA_OF_STEPS, *kd = (const double *)d->kd, *kp = (const double *)d->kp;
-  const double *D = (const double *)r->D, *given = (const double *)r->kp;
+  const double h = r->h, by_gamma = 1.0 / GAMMA_OF_STEPS;
   RightTangent b;
   LeftTangent x;
   memcpy(s->speeds[0], dy->speeds, sizeof dy->speeds);
@@ -122,23 +153,29 @@ static void series_forward(const Linear *l, int kind, const StateTangent *dy, Se
     }
   }
   FOR(j, STAGES) {
-    solve_forward(l, kind, j, j < 2 ? h : 0.0, &b, &x);
+    solve_forward(l, kind, j, j < 2 ? h : 0.0, &b, n, &x);
+    vec net[N1][VD];
+    memset(net, 0, sizeof net);
+    add_gain((const vec *)r->D, GAIN_MATRIX, -1.0, (const vec(*)[VD])x.speeds, net);
+    add_springs(l, 1.0, (const vec(*)[VD])b.deviation, net);
+    memset(s->demand[j + 1], 0, sizeof s->demand[j + 1]);
     FOR_EACH(k) s->speeds[j + 1][N][k] = either(j, (x.speeds[N][k] - s->speeds[j][N][k]) * by_gamma, x.speeds[N][k]);
     FOR(i, N) FOR_EACH(k) {
-      vec v = x.speeds[i][k], net = -D[i] * v;
-      if (STIFFNESS) net += given[i] * b.deviation[i][k];
+      vec v = x.speeds[i][k];
       if (j) {
-        b.torque[i][k] = h * net;
+        b.torque[i][k] = h * net[i][k];
         b.deviation[i][k] = -h * v;
         v = (v - s->speeds[j][i][k]) * by_gamma;
       } else {
-        b.torque[i][k] += r->g * net;
+        b.torque[i][k] += r->g * net[i][k];
         b.deviation[i][k] -= r->g * v;
       }
       s->speeds[j + 1][i][k] = v;
-      s->demand[j + 1][i][k] = -kd[i] * v;
-      if (STIFFNESS) s->demand[j + 1][i][k] += kp[i] * b.deviation[i][k];
     }
+    add_gain((const vec *)d->kd, KD_MATRIX, -1.0, (const vec(*)[VD])s->speeds[j + 1], s->demand[j + 1]);
+#if STIFFNESS
+    add_gain((const vec *)d->kp, KP_MATRIX, 1.0, (const vec(*)[VD])b.deviation, s->demand[j + 1]);
+#endif
     FOR_EACH(k) {
       b.impulse[k] = s->impulse[j + 1][k] = either(j, h * x.force[k], x.impulse[k]);
       b.penetration[k] = s->penetration[j + 1][k] = either(j, h * x.rate[k], x.penetration[k]);
@@ -152,7 +189,61 @@ static void series_forward(const Linear *l, int kind, const StateTangent *dy, Se
   }
 }
 
+#if BENDS
+/* of n, from tangents of the series at n as it is */
+static void bend_forward(const Bend *b, const SeriesTangent *s, InputsTangent n) {
+  double at[NV][UNKNOWNS];
+  FOR(i, NODES) {
+    vec seen[SEEN][VD];
+    FOR_EACH(k) FOR(o, SEEN) {
+      seen[o][k] = (vec){0};
+      FOR(j, TERMS) {
+        const vec w = o == 0 ? s->penetration[j][k] : o == 1 ? s->rate[j][k] : s->target[j][(o - 2) % NZ1][k];
+        seen[o][k] += AT_NODES[i][j] * w;
+      }
+    }
+    FOR(way, NV) FOR(a, INPUTS) {
+      double x = 0.0;
+      FOR(o, SEEN) x += b->by[i][a][o] * ((const double *)seen[o])[way];
+      at[way][a * NODES + i] = x;
+    }
+  }
+  memset(n, 0, sizeof(InputsTangent));
+  FOR(way, NV) {
+    solve_bend(b, at[way]);
+    FOR(j, TERMS) FOR(a, INPUTS) FOR(i, NODES)
+      *lane(n[j][a], way) += FROM_NODES[j][i] * at[way][a * NODES + i];
+  }
+}
+#endif
+
+static void series_forward(const Linear *l, int kind, const StateTangent *dy, SeriesTangent *s) {
+  InputsTangent n;
+  memset(n, 0, sizeof n);
+  terms_forward(l, kind, dy, (const vec(*)[INPUTS][VD])n, s);
+#if BENDS
+  bend_forward(l->bend, s, n);
+  terms_forward(l, kind, dy, (const vec(*)[INPUTS][VD])n, s);
+#endif
+}
+
 /* ------------------------------------------------------------ places within a step */
+/* law and target in their piece, at an instant within a step */
+static void contact_within(const Linear *l, const State *then, const Instant *now, const Instant *at, Contact *c) {
+  *c = l->resolvent->contact;
+#if LAW_BENDS
+  double law[3];
+  law_here(l->d, then->penetration, at->rate, now->compressing, law);
+  c->k = law[1], c->d = law[2];
+#endif
+#if TARGET_BENDS
+  double Z[NZ * NZ], G[NZ1];
+  const double force = 0.0, *in[] = {then->target, &force, l->d->target};
+  double *out[] = {Z, G, c->at};
+  target_slopes(in, out, 0, 0, 0);
+#endif
+}
+
 INLINE vec along(const vec *w, long stride, const double *p) {
   vec s = w[0];
   for (int j = 1; j < TERMS; j++) s += p[j] * w[j * stride];
@@ -179,17 +270,22 @@ static void event_forward(const Linear *l, int kind, const Event *e, const Serie
     FOR_EACH(k) moved[k] = ALONG(t->speeds, [i][k]);
     if (kind == BY_V) *lane(moved, NV - N + i) += 1.0;
   } else if (e->kind == OF_FORCE) {
+#if LAW_BENDS
+    double at[3];
+    separation_at(l->d, s, e->at, at);
+    along_step = at[1] * change(s->penetration, slope) + at[2] * change(s->rate, slope);
+    FOR_EACH(k) moved[k] = at[1] * ALONG(t->penetration, [k]) + at[2] * ALONG(t->rate, [k]);
+#else
     by_force = 1.0;
+#endif
   }
 #if SWITCHES
   if (e->kind == OF_SWITCH) {
-    double values[SWITCHES], by_z[SWITCHES * NZ1], by_forces[SWITCHES];
-    const double *in[] = {l->begin->target, &s->force[0], l->d->target};
-    double *out[] = {values, by_z, by_forces};
-    switch_slopes(in, out, 0, 0, 0);
-    by_force = by_forces[i];
+    Switch x;
+    switch_in(l->d, s, e->at, &x);
+    by_force = x.by_force[i];
     FOR(z, NZ) {
-      const double by = by_z[i + SWITCHES * z];
+      const double by = x.by_z[i + SWITCHES * z];
       along_step += by * change(s->target[z], slope);
       FOR_EACH(k) moved[k] += by * ALONG(t->target, [z][k]);
     }

@@ -146,5 +146,5 @@ static void no_number(const Data *d, State *y, Instant *now) {
 /* phase: contact is over when, in restitution, no force is left */
 INLINE void judge(const Data *d, const State *y, Instant *now) {
   now->compressing = now->rate > 0.0;
-  now->contact = now->compressing || call(restitution_force, &y->penetration, &now->rate, d->law) > 0.0;
+  now->contact = now->compressing || call(left_force, &y->penetration, &now->rate, d->law) > 0.0;
 }

@@ -1,4 +1,15 @@
-/* CasADi's interface of external functions. All memory is the caller's work vector, so that threads do not meet. */
+/* CasADi's interface of external functions. All memory is the caller's work vector, so that threads do not meet.
+
+   One library has one of these functions under NAME, with the same inputs in the same order: q, v[, feedforward] and
+   the settings (NAMES_IN, SHAPES_IN).
+
+     collision           value: the outputs asked for (collision.c); collision_batch beside it runs many (batch.c)
+     collision_gradient  adjoint: a scalar output, d/dq (nv), d/dv (nv) (gradient.c); a null result is not computed
+     collision_jacobian  tangents: of each output its value, d/dq and d/dv (entries, nv) (jacobian.c); likewise
+
+   Derivatives by q are in the basis of v: d/dq (nq) is its tangent map's transposed times them. To wrap them as one
+   differentiable function: `reverse` from the gradient, `forward` and the Jacobian from the tangents. Derivatives by
+   feedforward and settings are not there. */
 
 #ifndef ROOM
 #define ROOM Work

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
 from impactopt.collision.course import GIVES_WAY, cuts
-from impactopt.collision.events import BEYOND
-from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model, number_of_steps
-from impactopt.collision.implicit import STAGES, gamma, tables
+from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model
+from impactopt.collision.implicit import NODES, STAGES, gamma, tables
 from impactopt.collision.loop import BLOCK
 from impactopt.collision.model import shape_of
 from impactopt.collision.native.generated import Tree, gamma_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 from impactopt.collision.runge_kutta import LEFT_OUT_BY_RK4
-from impactopt.collision.taylor import LEFT_OUT_BY_TAYLOR, ORDER
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
+from impactopt.collision.stepped import SteppedModel, number_of_steps
 
 __all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_jacobians"]
 
 
-def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:
+def shapes_in(collision: SteppedModel) -> dict[str, tuple[int, int]]:
     """Shapes of the inputs by name."""
     robot = collision.robot
     shapes = {"q": (robot.nq, 1), "v": (robot.nv, 1)}
@@ -34,7 +31,7 @@ def shapes_in(collision: SymbolicModel) -> dict[str, tuple[int, int]]:
     return shapes | {name: shape_of(value) for name, value in collision.settings.items()}
 
 
-def shapes_out(collision: SymbolicModel, outputs: tuple[str, ...], every: int) -> dict[str, tuple[int, int]]:
+def shapes_out(collision: SteppedModel, outputs: tuple[str, ...], every: int) -> dict[str, tuple[int, int]]:
     """Shapes of the outputs by name."""
     robot, columns = collision.robot, sum(_columns(collision, every))
     shapes = dict.fromkeys(outputs, (1, 1))
@@ -58,39 +55,39 @@ def with_jacobians(shapes: dict[str, tuple[int, int]], nv: int) -> dict[str, tup
     return made
 
 
-def _rows(collision: SymbolicModel, history: str) -> int:
+def _rows(collision: SteppedModel, history: str) -> int:
     n, soles = collision.n_servos, 6 * len(collision.held_by.sole_frames(collision.robot))
     hands = 6 * len(collision.held_by.hand_frames(collision.robot))
     rows = {"joint_velocity": n, "torque": n, "demand": n, "sole_wrench": soles, "hand_wrench": hands}
     return {**rows, "ground_wrench": 6, "zmp": 2}.get(history, 1)
 
 
-def _ends(collision: SymbolicModel) -> list[float]:
+def _ends(collision: SteppedModel) -> list[float]:
     """Where stretches end, as fractions of the contact's duration."""
     return cuts(max(collision.n_freezes, 1))
 
 
-def _blocks(collision: SymbolicModel, fraction: float) -> int:
+def _blocks(collision: SteppedModel, fraction: float) -> int:
     """Steps for a fraction of the horizon, in whole blocks; or the most, where they find their own length."""
     if collision.stepping == "implicit":
         return MOST_STEPS
     return -(-number_of_steps(collision, fraction) // BLOCK) * BLOCK
 
 
-def _steps(collision: SymbolicModel) -> list[int]:
+def _steps(collision: SteppedModel) -> list[int]:
     """Steps of each stretch; the last may take as long as the horizon."""
     shares = [b - a for a, b in pairwise(_ends(collision))]
     return [_blocks(collision, share) for share in (*shares[:-1], 1.0)]
 
 
-def _columns(collision: SymbolicModel, every: int) -> list[int]:
+def _columns(collision: SteppedModel, every: int) -> list[int]:
     if collision.stepping == "implicit":
         shares = [b - a for a, b in pairwise(_ends(collision))]
         return [columns_of(collision, share, every) for share in (*shares[:-1], 1.0)]
     return [-(-count // every) + 1 for count in _steps(collision)]
 
 
-def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: Tree) -> str:
+def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: Tree) -> str:
     """Everything that the kernel has to know of the model, as macros and tables."""
     robot, terms, settings, n = collision.robot, collision.terms, collision.settings, collision.n_servos
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
@@ -114,12 +111,12 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "N_LAW": len(laws),
         "N_TARGET": len(targets),
         "SWITCHES": switch_count,
-        "ORDER": ORDER,
-        "SIZE": ORDER + 1,
         "COLUMN(i)": f"((i) >= {robot.nv - n} ? (i) - {robot.nv - n} : {n + 1} + (i))",
         "LENGTH": repr(float(collision.step_length)),
-        "BEYOND": repr(BEYOND),
         "STAGES": STAGES,
+        "NODES": NODES,
+        "LAW_BENDS": int(not law_is_linear(collision.law)),
+        "TARGET_BENDS": int(not target_is_linear(collision.target)),
         "TOLERANCE": repr(float(collision.tolerance)),
         "GAMMA_OF_STEPS": repr(gamma()),
         "GIVES_WAY": repr(GIVES_WAY),
@@ -136,8 +133,6 @@ def sizes(collision: SymbolicModel, outputs: tuple[str, ...], every: int, tree: 
         "KP_MATRIX": int(n > 0 and terms.stiffness and settings["kp"].ndim == 2),
         "PEAK": int(model.peak),
         "STEP_ERROR": int(model.error),
-        "PULLS": int(collision.stepping == "events"),
-        "LEFT_OUT_BY_TAYLOR": repr(LEFT_OUT_BY_TAYLOR),
         "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),
         "SECOND_INTEGRALS": int(model.second_integrals),
         "FREEZES": freezes,

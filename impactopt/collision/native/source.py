@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,20 +20,15 @@ from impactopt.collision.native.generated import (
 )
 from impactopt.collision.native.lanes import tree_in_lanes
 from impactopt.collision.native.sizes import names_table, shapes_out, shapes_table, sizes, with_jacobians
+from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
-
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
 
 __all__ = ["native_collision", "native_gradient", "native_jacobian"]
 
 # the kernel's files of the steps, and of the way back
-_STEPS = {"events": ("taylor.h", "steps.h"), "rk4": ("rk4.h", "steps.h"), "implicit": ("implicit.h",)}
-_BACK = {
-    "events": ("taylor_back.h", "steps_back.h"),
-    "rk4": ("rk4_back.h", "steps_back.h"),
-    "implicit": ("implicit_back.h",),
-}
+_IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "bend", "events", "run")))
+_STEPS = {"rk4": ("rk4.h", "steps.h"), "implicit": tuple(f"{name}.h" for name in _IMPLICIT)}
+_BACK = {"rk4": ("rk4_back.h", "steps_back.h"), "implicit": ("implicit_back.h",)}
 # the tree's code is long and straight: this makes it a sixth faster than -Og, for half a second more of the
 # compiler; -O2 takes as much again and gains no more. Its angles' sines and cosines are our own
 _TREE = (
@@ -41,15 +37,16 @@ _TREE = (
     + files(__package__).joinpath("angles.h").read_text(encoding="utf-8"),
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
+_OF_DIFFERENCES = 1e-11
 _NEEDS_COMPILER = (
-    "{}: derivatives of implicit steps need a C compiler that works: install gcc or clang, or name one in "
+    "{}: derivatives need a C compiler that works: install gcc or clang, or name one in "
     "the environment variable CC{}"
 )
 # with a direction a lane, without anything but sums and products: there only the time to compile it counts
 _LANES = ('#pragma GCC push_options\n#pragma GCC optimize ("Og")\n', "#pragma GCC pop_options\n")
 
 
-def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
+def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
     """C code of the function that `collision_graph` gives, with the same inputs and outputs.
 
     Its numbers agree with the graph's to rounding, but for implicit steps, which the graph has not. It has no
@@ -63,18 +60,17 @@ def native_collision(collision: SymbolicModel, outputs: tuple[str, ...], *, ever
     )
 
 
-def native_gradient(collision: SymbolicModel, output: str) -> Any:
-    """C code of the function that `gradient_graph` gives; with several freezes, that graph itself.
+def native_gradient(collision: SteppedModel, output: str) -> NativeCode:
+    """C code of the function that `gradient_graph` gives.
 
-    Where there is no compiler, the graph takes its place, but not that of implicit steps: its own are
-    Taylor's, which a stiff contact or servo spoils without a word.
+    Where there is no compiler, the graph takes its place, but not that of implicit steps or several freezes:
+    its own steps are Runge-Kutta's, which a stiff contact or servo spoils without a word, and which say
+    nothing of how the contact's duration changes.
     """
-    if collision.n_freezes:
-        return gradient_graph(collision, output)
 
     def graph() -> Any:
-        if collision.stepping == "implicit":
-            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'events'"))
+        if collision.stepping == "implicit" or collision.n_freezes:
+            raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
         return _no_nan(gradient_graph(collision, output))
 
     return NativeCode(
@@ -84,8 +80,8 @@ def native_gradient(collision: SymbolicModel, output: str) -> Any:
     )
 
 
-def native_jacobian(collision: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
-    """C code of what `SymbolicModel.jacobian_function` gives, for implicit steps and one freeze."""
+def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every: int = 1) -> NativeCode:
+    """C code of what `SteppedModel.jacobian_function` gives, for implicit steps and one freeze."""
 
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("jacobian_function", ""))
@@ -104,7 +100,7 @@ def _no_nan(graph: ca.Function) -> ca.Function:
     return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 
-def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: int) -> str:
+def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: int) -> str:
     frozen, gradient = frozen_dynamics(collision), name == "collision_gradient"
     jacobian = name == "collision_jacobian"
     ground = bool({"ground_wrench", "zmp"} & {*outputs})
@@ -113,6 +109,12 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
     scalars = scalar_functions(model, method=collision.stepping)
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
     if gradient:
+        # several freezes have differences of collisions with steps that do not count beside them
+        collision = (
+            replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
+            if collision.n_freezes
+            else collision
+        )
         of_tree = [*of_tree, *backwards(of_tree), tangent_back(frozen)]
         scalars += backwards(scalars)
         by = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
@@ -135,7 +137,7 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
         c_code("tree", of_tree),
         _TREE[1],
         c_code("scalars", scalars),
-        f"#define GRADIENT {int(gradient or jacobian)}",
+        f"#define GRADIENT {int((gradient and not collision.n_freezes) or jacobian)}",
         f"#define NAME {name}\n#define OF_NAME(part) {name}_##part",
         *text("vectors.h"),
         *lanes,
@@ -147,7 +149,8 @@ def _code(collision: SymbolicModel, name: str, outputs: tuple[str, ...], every: 
     method = collision.stepping
     files_used = ["freeze.h", "instant.h", "outputs.h", *_STEPS[method], "course.h"]
     if gradient:
-        files_used += ["back.h", *_BACK[method], "freeze_back.h", "gradient.c"]
+        files_used += ["results.h"] if collision.n_freezes else ["back.h", *_BACK[method], "freeze_back.h"]
+        files_used += ["gradient.c"]
     elif jacobian:
         parts_of_way = ("freeze", "outputs", "implicit", "course")
         forward = ["forward.h", *(f"{name}_forward.h" for name in parts_of_way)]

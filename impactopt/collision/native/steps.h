@@ -23,10 +23,6 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
   }
   if (GRADIENT) tape->states[made] = *y, tape->made = made;
   if (made % BLOCK) stand_still(d, y, &now);
-#if STEP_ERROR && PULLS
-  /* what a separation that was not seen in time has added */
-  if (made) y->left_out += fmax(0.0, -call(restitution_force, &y->penetration, &now.rate, d->law)) * LENGTH * !now.contact;
-#endif
   no_number(d, y, &now);
   if (record) {
     const int column = made < steps ? (made + EVERY - 1) / EVERY : record->columns - 1;

@@ -35,6 +35,10 @@ typedef long long bits __attribute__((vector_size(8 * LANES), may_alias));
 INLINE vec choose(bits condition, vec yes, vec no) {
   return (vec)(((bits)yes & condition) | ((bits)no & ~condition));
 }
+INLINE vec either(int condition, vec yes, vec no) {
+  if (condition) return yes;
+  return no;
+}
 #ifdef __clang__
 #define SHUFFLED(x, ...) __builtin_shufflevector(x, x, __VA_ARGS__)
 #else

@@ -30,12 +30,9 @@ class ContactLaw(Described, ABC):
     Attributes
     ----------
     word : what problem files call it; "" for one that they do not know.
-    analytic : whether the branches have derivatives of all orders at and around x = 0, as Taylor steps need
-        them; a law that has only the first, as x^1.5, says False and is integrated by Runge-Kutta steps.
     """
 
     word: ClassVar[str] = ""
-    analytic: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_numbers(self)

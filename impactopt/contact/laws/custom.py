@@ -52,7 +52,7 @@ class CustomLaw(ContactLaw):
     ----------
     compression : force while the rate is > 0.
     restitution : force after that; None: the same.
-    analytic : whether both have derivatives of all orders at and around x = 0; see `ContactLaw`.
+    analytic : whether both have derivatives of all orders at and around x = 0; else they are rounded there.
     numbers : finite; the functions' own arguments.
 
     Raises
@@ -64,6 +64,7 @@ class CustomLaw(ContactLaw):
     # Each law made here is a class with these functions, so that type(law)(**numbers) is the same law with
     # other numbers, as it is for any law.
     _branches: ClassVar[tuple[Branch, Branch] | None] = None
+    analytic: ClassVar[bool] = False
     _numbers: dict[str, float]
     _rough: bool  # at or below zero
 

@@ -33,8 +33,6 @@ class HertzDamped(ContactLaw):
     stiffness: float = field(metadata=about("k", unit="N/m^1.5", above=0))
     damping: float = field(metadata=about("d", unit="N s/m^1.25", least=0))
 
-    analytic: ClassVar[bool] = False
-
     @classmethod
     def of_spheres(
         cls,

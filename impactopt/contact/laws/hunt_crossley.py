@@ -28,8 +28,6 @@ class HuntCrossley(ContactLaw):
     dissipation: float = field(metadata=about("alpha", unit="s/m", least=0))
     exponent: float = field(default=1.5, metadata=about("p; 1.5 for a sphere on a plane", least=1))
 
-    analytic: ClassVar[bool] = False
-
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None
     ) -> Any:

@@ -29,7 +29,6 @@ class Target(Described, ABC):
     word : what problem files call it; "" for one that they do not know.
     n_states : size of the state.
     results : names of what `result` gives.
-    analytic : whether there are derivatives of all orders between switches, as Taylor steps need them.
     typical : sizes of the state's numbers, for scaling; ones if not given.
     events : what a plan has in the place of switches: what happens to it in a blow, in this order, each of
         which ends a phase of the contact; see `smooth`.
@@ -42,7 +41,6 @@ class Target(Described, ABC):
     word: ClassVar[str] = ""
     n_states: int
     results: ClassVar[tuple[str, ...]] = ()
-    analytic: ClassVar[bool] = True
     typical: ClassVar[tuple[float, ...]] = ()
     events: ClassVar[tuple[str, ...]] = ()
     phases: ClassVar[tuple[str, ...]] = ("compression", "restitution")

@@ -30,6 +30,7 @@ from impactopt.studies.bench.scene import (
     outcome,
     run_of,
 )
+from impactopt.studies.exact import ExactCollision
 from impactopt.studies.report import Report, Say, cell, columns_table, make_table
 
 # calls of some 30 ms: of 200 collisions, checks of the inputs and a thread's start would be a tenth of the
@@ -116,7 +117,7 @@ def default_of(scene: Scene, true: Collision, rows: Sequence[dict[str, Any]], re
         other = at.get((method, setting))
         return None if other is None else other / own
 
-    exact = scene.model(SDC, method="exact").collide(case.q, case.v, case.torque)
+    exact = ExactCollision(scene.model(SDC)).collide(case.q, case.v, case.torque)
     gradient = runner(compiled_gradient(model, "impulse"), inputs(model, case))
     usual = runner(model.function(("impulse",)), [case.q, case.v, case.torque])
     runs = {"value": run_of(model, case, ("impulse",)), "gradient": gradient, "function": usual}

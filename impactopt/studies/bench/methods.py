@@ -13,12 +13,12 @@ from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.clock import runner
 from impactopt.studies.bench.peers import cvodes, mujoco_loop, mujoco_steps, pinocchio_calls
 from impactopt.studies.bench.scene import EVALUATION, Scene, graph, inputs, outcome, run_of
+from impactopt.studies.exact import ExactCollision
 from impactopt.studies.report import Say
 
 __all__ = ["Entry", "entries"]
 
 PAPER_STEPS = (1e-3, 1e-4, 1e-5, 2e-6)  # [s]; 1e-6 would be more steps than a model allows
-TAYLOR_STEPS = (2e-3, 1e-3, 5e-4, 2.5e-4, 1e-4)
 OUR_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
 FREEZES = (1, 2, 4, 8)
 FULL_STEPS = (4e-4, 2e-4, 1e-4)
@@ -55,13 +55,10 @@ def entries(scene: Scene, true: Collision, say: Say, quick: bool) -> tuple[list[
         ours("paper, by hand", f"{step:g} s", partial(_stepped, paper, step))
     for tolerance in (1e-7,) if quick else OUR_TOLERANCES:
         ours("sdc", f"tolerance {tolerance:g}", partial(scene.model, SDC, tolerance=tolerance))
-    for step in (2.5e-4,) if quick else TAYLOR_STEPS:
-        taylor = partial(scene.model, SDC, method="events", step=step)
-        ours("sdc, Taylor's steps", f"{_plain(step)} s", taylor)
     for freezes in (2,) if quick else FREEZES:
         ours(f"sdc, {freezes} freezes", usual, partial(scene.model, SDC, freezes=freezes))
     found += _by_graph(scene, paper, say)
-    exact = scene.model(SDC, method="exact")
+    exact = ExactCollision(scene.model(SDC))
     frozen = exact.collide(case.q, case.v, case.torque)
     found.append(
         Entry(
@@ -104,22 +101,18 @@ def _stepped(make: Callable[..., Any], step: float) -> Any:
     return replace(make(), step=step)
 
 
-def _plain(step: float) -> str:
-    return {2.5e-4: "2.5e-4", 5e-4: "5e-4"}.get(step, f"{step:g}")
-
-
 def _by_graph(scene: Scene, paper: Callable[..., Any], say: Say) -> list[Entry]:
     """The paper's scheme and ours by CasADi's route: from the graph to C, at -O1."""
     made = []
-    taylor = scene.model(SDC, method="events")
-    for method, model in (("paper, CasADi's C", paper()), ("sdc, CasADi's C", taylor)):
+    ours = scene.model(SDC, method="rk4")
+    for method, model in (("paper, CasADi's C", paper()), ("sdc, CasADi's C", ours)):
         say(f"{scene.name}: {method}")
         wanted = tuple(name for name in EVALUATION if name in model.available)
         run = runner(graph(model, wanted), inputs(model, scene.case))
         made.append(
             Entry(
                 method=method,
-                setting=f"{_plain(model.step_length)} s",
+                setting=f"{model.step_length:g} s",
                 run=run,
                 result=outcome(model, scene.case),
             )

@@ -15,8 +15,9 @@ import casadi as ca
 
 from impactopt.collision import SDC, JointFriction, Terms
 from impactopt.collision.describe import independent_joints, instructions
-from impactopt.collision.graph import METHODS, joint_space_model
+from impactopt.collision.graph import joint_space_model
 from impactopt.collision.outputs import HISTORIES, OF_SOLES
+from impactopt.collision.runge_kutta import rk4_step
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.kinematics.stance import FixedBase, OneSole
 from impactopt.pictures.skip import skip_picture
@@ -201,8 +202,7 @@ def _of_leg(name: str) -> bool:
 def constant_step(variant: Variant) -> int:
     """Instructions of a step whose settings are constants of the graph."""
     model = joint_space_model(variant.model, variant.outputs)
-    method, length = variant.model.of_graph
-    step = METHODS[method](model, length)
+    step = rk4_step(model, variant.model.step_of_graph)
     names = step.name_in()
     free = {name: ca.SX.sym(name, *step.size_in(name)) for name in names}
     given = [variant.model.settings.get(name, free[name]) for name in names]

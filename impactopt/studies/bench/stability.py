@@ -35,7 +35,7 @@ __all__ = ["Outcome", "judge", "judge_rig", "run"]
 
 # of the impulse, or of that of a plastic blow of two masses where the contact is broken off before: what the
 # methods say of themselves (see `SymbolicModel`)
-TOLERANCES = {"implicit": 1e-5, "events": 1e-5, "rk4": 1e-2}
+TOLERANCES = {"implicit": 1e-5, "rk4": 1e-2}
 CASES = 5400
 VERDICTS = ("agree", "refused", "nan", "wrong")
 

@@ -90,7 +90,6 @@ class Rig:
 # steps of a fixed length for slow contacts, for fast and for the fastest
 _FINE: dict[str, Any] = {"step": 1e-5, "horizon": 0.01}
 _FINEST: dict[str, Any] = {"step": 1e-6, "horizon": 1e-3}
-_TAYLOR: tuple[dict[str, Any], ...] = tuple({"method": "events", **s} for s in ({}, _FINE, _FINEST))
 RIGS = (
     *(Rig(robot=r) for r in ("arm", "slider", "bare arm", "whip", "mace")),
     *(Rig(robot="arm", horizon=horizon) for horizon in (1e-3, 1.0)),
@@ -104,11 +103,12 @@ RIGS = (
     Rig(robot="whip", point=True),
     Rig(robot="standin", share=0.25),
     Rig(robot="talos", share=0.25),
-    *(Rig(robot=r, **s) for r in ("arm", "mace") for s in _TAYLOR),
-    *(Rig(robot="arm", target=t, **_TAYLOR[1]) for t in ("wall", "nail", "board")),
-    Rig(robot="arm", friction=True, **_TAYLOR[0]),
-    *(Rig(robot="arm", law=law, **s) for law in ("hertz", "hunt") for s in ({}, _FINE)),
-    Rig(robot="slider", law="hunt", target="wall", **_FINE),
+    *(Rig(robot=r, law=law) for r in ("arm", "mace") for law in ("hertz", "hunt")),
+    *(Rig(robot="arm", law=law, target=t) for t in ("wall", "nail", "board") for law in ("hertz", "hunt")),
+    Rig(robot="arm", law="hunt", friction=True),
+    Rig(robot="slider", law="hunt", target="wall"),
+    *(Rig(robot="arm", law=law, method="rk4", **_FINE) for law in ("spring", "hertz", "hunt")),
+    Rig(robot="mace", method="rk4", **_FINEST),
     Rig(robot="arm", paper=True),
 )
 

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.collision import SDC, effective_mass
+from impactopt.collision.graph import collision_graph
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.kinematics.held import Held
@@ -66,7 +67,8 @@ def freezes_of(counts: tuple[int, ...]) -> list[Found]:
             if count <= COMPILED:
                 impulse = model.collide(q, v, torque).impulse
             else:
-                impulse = float(model.graph()(q, v, torque, *model.settings.values()))
+                graph = collision_graph(model, ("impulse",), as_compiled=True)
+                impulse = float(graph(q, v, torque, *model.settings.values()))
         except InputError as refusal:
             found.append(("refused", str(refusal)[:60], 0.0, what))
             continue

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from impactopt.collision.exact import ExactCollision
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import Board, FreeMass
 from impactopt.errors import InputError
 from impactopt.studies.bench.stability_cases import Case
+from impactopt.studies.exact import ExactCollision
 
 __all__ = ["Expected", "TakesTooLong", "reference"]
 

@@ -20,8 +20,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.collision import SDC
-from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model, number_of_steps
+from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.loop import run as time_loop
+from impactopt.collision.runge_kutta import rk4_step
+from impactopt.collision.stepped import number_of_steps
 from impactopt.errors import InputError
 from impactopt.kinematics.held import Held
 from impactopt.kinematics.stance import BothSoles
@@ -182,8 +184,7 @@ def _strike(robot: Robot) -> Any:
     collision = _model(robot, None)
     model = joint_space_model(collision)
     data = model.symbols(ca.MX)
-    method, length = collision.of_graph
-    step = METHODS[method](model, length)
+    step = rk4_step(model, collision.step_of_graph)
     steps = number_of_steps(collision)
     final, _ = time_loop(model, step, ca.MX(model.start()), steps, list(data.values()), record=False)
     function = ca.Function("impulse", list(data.values()), [model.part(final, "impulse")])

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from impactopt.codegen.cache import cached
 from impactopt.codegen.hashing import model_hash
 from impactopt.collision import SDC
-from impactopt.collision.graph import METHODS, frozen_dynamics, joint_space_model
+from impactopt.collision.graph import frozen_dynamics, joint_space_model
+from impactopt.collision.runge_kutta import rk4_step
 from impactopt.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 from impactopt.studies.bench.clock import medians, runner
@@ -102,8 +103,7 @@ def _sdc_functions(sdc: SDC) -> tuple[Any, Any]:
     model, frozen = joint_space_model(sdc), frozen_dynamics(sdc)
 
     def build() -> list[Any]:
-        method, length = sdc.of_graph
-        step = METHODS[method](model, length)
+        step = rk4_step(model, sdc.step_of_graph)
         y, data = ca.MX.sym("y", model.n_states), model.symbols(ca.MX)
         end = y
         for _ in range(STEPS):

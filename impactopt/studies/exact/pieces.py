@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.linear_contact import force_coefficients, target_pieces
 from impactopt.collision.model import JointSpaceModel
+from impactopt.studies.exact.linear_contact import force_coefficients, target_pieces
 
 __all__ = ["Phase", "Pieces", "Watch"]
 

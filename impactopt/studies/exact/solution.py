@@ -11,25 +11,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
 from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
 from impactopt.collision.course import Stretch, relative_to
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
-from impactopt.collision.linear_contact import force_coefficients, target_pieces
 from impactopt.collision.outputs import Outputs, frozen_for
-from impactopt.collision.pieces import Phase, Pieces
 from impactopt.collision.result import Collision
+from impactopt.collision.stepped import SteppedModel
+from impactopt.errors import InputError, check_array
+from impactopt.studies.exact.linear_contact import force_coefficients, target_pieces
+from impactopt.studies.exact.pieces import Phase, Pieces
 
-if TYPE_CHECKING:
-    from impactopt.collision.symbolic import SymbolicModel
-
-__all__ = ["ExactCollision", "Path", "exact_collision", "exact_path"]
+__all__ = ["ExactCollision", "Path", "exact_path"]
 
 Array = NDArray[np.float64]
 
@@ -38,38 +37,28 @@ _TO_BERNSTEIN = bernstein_matrix(_DEGREE)
 # of the terms that a watched form sums up: below this its value is rounding
 _ROUNDING = 64 * np.finfo(float).eps
 _MOST_PHASES = 10_000
+_SPACING = 2.5e-4  # [s]
 _MOST_HALVINGS = 16
 
 
-def exact_collision(
-    collision: SymbolicModel, q: Array, v: Array, torque: Array | None, values: dict[str, Array]
-) -> Collision:
-    """One collision, exact but for rounding.
+class ExactCollision:
+    """The collisions of a model, exact but for rounding; of one freeze.
 
     Parameters
     ----------
-    collision : the model; of its `method` nothing is used, and of its `step` the histories' spacing.
-    q, v : (nq), (nv) at contact, Pinocchio's.
-    torque : (n) [N m] feed-forward; None where terms.feedforward is off.
-    values : all of `collision.settings`.
+    collision : the model; how it is stepped is not used.
+    spacing : [s] of the histories; None: the model's `step`, or 0.25 ms.
 
     Raises
     ------
-    InputError : law or target that are not linear between events.
-    """
-    return ExactCollision(collision)(q, v, torque, values)
-
-
-class ExactCollision:
-    """`exact_collision` for one model, with what it takes to freeze it kept.
-
-    Raises
-    ------
-    InputError : law or target that are not linear between events.
+    InputError : law or target that are not linear between events; a model with freezes on the way.
     """
 
-    def __init__(self, collision: SymbolicModel) -> None:
-        self.collision = collision
+    def __init__(self, collision: SteppedModel, *, spacing: float | None = None) -> None:
+        if collision.n_freezes:
+            raise InputError("the exact solution: only without further freezes; give freezes=0")
+        own = collision.step or min(_SPACING, collision.horizon)
+        self.collision, self.spacing = collision, own if spacing is None else spacing
         self.model = joint_space_model(collision, ("configuration",))
         force_coefficients(collision.law, collision.law.parameters)
         target_pieces(collision.target, collision.target.parameters)
@@ -83,7 +72,25 @@ class ExactCollision:
         names = (*self.model.frozen, *frozen_for(self.collision.available))
         return self._frozen.function("frozen", tuple(dict.fromkeys(names)))
 
+    def collide(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        torque: ArrayLike | None = None,
+        *,
+        require_separation: bool = True,
+        **overrides: ArrayLike,
+    ) -> Collision:
+        """One collision, as of `CollisionModel.collide`."""
+        robot, values = self.collision.robot, self.collision.settings.override(overrides)
+        given = None if torque is None else check_array("torque [N m]", torque, (robot.n,))
+        result = self(robot.check_configuration(q), robot.check_velocity(v), given, values)
+        if require_separation:
+            self.collision.check_separation(result)
+        return result
+
     def __call__(self, q: Array, v: Array, torque: Array | None, values: dict[str, Array]) -> Collision:
+        """Of all of the model's settings, by name."""
         model, collision = self.model, self.collision
         gives_way = target_yield(model.target, model.target_numbers(values))
         found = self._freeze.call([ca.DM(x) for x in (q, v, values["normal"], gives_way)])
@@ -93,7 +100,7 @@ class ExactCollision:
             data["feedforward"] = torque
         data = relative_to({name: ca.DM(x) for name, x in values.items()}, 0.0, data)
         numbers = {name: _array(data[name]) for name in model.data}
-        path = exact_path(Pieces(model, numbers), collision.horizon, collision.step_length)
+        path = exact_path(Pieces(model, numbers), collision.horizon, self.spacing)
         return self._result({name: ca.DM(x) for name, x in data.items()}, path)
 
     def _result(self, data: dict[str, Any], path: Path) -> Collision:

@@ -14,7 +14,7 @@ from impactopt.errors import InputError
 __all__ = ["TargetPiece", "force_coefficients", "target_pieces"]
 
 Array = NDArray[np.float64]
-_INSTEAD = "method 'exact': {} is not linear between events; use 'events' or 'rk4'"
+_INSTEAD = "the exact solution: {} is not linear between events; measure by SciPy"
 
 
 def force_coefficients(law: ContactLaw, numbers: Mapping[str, float]) -> tuple[Array, Array]:

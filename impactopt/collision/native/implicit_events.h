@@ -1,0 +1,191 @@
+/* What ends a step before its end, and the state where it ends. */
+
+/* what falls below zero before the first event so far takes its place */
+static void look_at(const double *b, double sign, double level, int kind, int number, Event *e) {
+  double mine[TERMS], lowest = INFINITY;
+  FOR(i, TERMS) {
+    mine[i] = sign * b[i] + level;
+    lowest = mine[i] < lowest ? mine[i] : lowest;
+  }
+  if (lowest >= 0.0) return;
+  const double at = first_below(mine);
+  if (at < e->at) *e = (Event){.at = at, .kind = kind, .number = number};
+}
+
+/* a joint's series against a level: stays within it, or beyond */
+static void look_at_joint(const vec (*w)[V], int i, double offset, double level, int kind, Event *e) {
+  double mine[TERMS], b[TERMS];
+  FOR(j, TERMS) mine[j] = ((const double *)w[j])[i];
+  mine[0] += offset;
+  hull(mine, b);
+  if (fabs(mine[0]) <= level) { /* as what is at its level counts elsewhere */
+    look_at(b, 1.0, level, kind, i, e);
+    look_at(b, -1.0, level, kind, i, e);
+  } else {
+    look_at(b, mine[0] < 0.0 ? -1.0 : 1.0, -level, kind, i, e);
+  }
+}
+
+/* whether a joint's series may cross the level in this step, a joint a lane: from its terms' sizes, and where these
+   leave it open from its hull */
+INLINE bits may_cross(const vec (*w)[V], int i, vec offset, vec level) {
+  vec reach = BOUND[1] * magnitude(w[1][i]);
+  for (int j = 2; j < TERMS; j++) reach += BOUND[j] * magnitude(w[j][i]);
+  const vec start = w[0][i] + offset, size = magnitude(start);
+  const bits open = magnitude(size - level) <= reach;
+  if (!any(open)) return open;
+  const bits within = size <= level, sign = (bits)start & SIGN_BIT;
+  bits crosses = {0};
+  for (int k = 1; k < TERMS; k++) {
+    vec b = start;
+    for (int j = 1; j < TERMS; j++) b += HULL[j][k] * w[j][i];
+    const vec out = magnitude(b) - level, in = level - (vec)((bits)b ^ sign);
+    crosses |= choose(within, out, in) > 0.0;
+  }
+  return crosses & open;
+}
+
+#if LAW_BENDS
+/* what falls through zero at separation, and its slopes by penetration and rate */
+static void separation_at(const Data *d, const Series *s, double theta, double *found) {
+  double p[TERMS];
+  powers(theta, p);
+  const double x = value(s->penetration, p), rate = value(s->rate, p);
+  const double *in[] = {&x, &rate, d->law};
+  double *out[] = {found};
+  separation(in, out, 0, 0, 0);
+}
+/* where a polynomial through its values at the nodes says, and then itself */
+static void look_at_separation(const Data *d, const Series *s, Event *e) {
+  double w[TERMS], b[TERMS], at[3], before = 0.0, beyond = 1.0;
+  double first[3];
+  separation_at(d, s, 0.0, first);
+  FOR(j, TERMS) w[j] = j ? 0.0 : first[0];
+  FOR(i, NODES) {
+    const double x = at_node(s->penetration, i), rate = at_node(s->rate, i);
+    const double *in[] = {&x, &rate, d->law};
+    double *out[] = {at};
+    separation(in, out, 0, 0, 0);
+    for (int j = 1; j < TERMS; j++) w[j] += FROM_NODES[j][i] * (at[0] - first[0]);
+  }
+  Event found = {.at = e->at};
+  hull(w, b);
+  look_at(b, 1.0, 0.0, OF_FORCE, 0, &found);
+  if (!found.kind) return;
+  double t = found.at;
+  FOR(tries, 60) {
+    separation_at(d, s, t, at);
+    if (at[0] > 0.0) before = t;
+    else beyond = t;
+    double p[TERMS];
+    slopes(t, p);
+    const double slope = at[1] * change(s->penetration, p) + at[2] * change(s->rate, p), next = t - at[0] / slope;
+    if (slope < 0.0 && fabs(next - t) <= 1e-12 * fmax(t, 1e-4)) {
+      t = fmin(fmax(next, before), beyond);
+      break;
+    }
+    t = next > before && next < beyond ? next : (before + beyond) / 2;
+  }
+  if (t < e->at) *e = (Event){.at = t, .kind = OF_FORCE};
+}
+#endif
+
+/* switches of the target, and their slopes by state and force */
+#if SWITCHES
+typedef struct {
+  double values[SWITCHES], by_z[SWITCHES * NZ1], by_force[SWITCHES];
+} Switch;
+static void switches_at(const Data *d, const double *z, double force, Switch *x) {
+  const double *in[] = {z, &force, d->target};
+  double *out[] = {x->values, x->by_z, x->by_force};
+  switch_slopes(in, out, 0, 0, 0);
+}
+/* the slopes of those that a step ends on */
+static void switch_in(const Data *d, const Series *s, double theta, Switch *x) {
+  double p[TERMS], z[NZ1];
+  powers(TARGET_BENDS ? theta : 0.0, p);
+  FOR(i, NZ) z[i] = value(s->target[i], p);
+  switches_at(d, z, value(s->force, p), x);
+}
+#endif
+
+static void find_event(const Data *d, const State *y, const Instant *now, const Series *s, double end, Event *e) {
+  double b[TERMS];
+  *e = (Event){.at = end};
+  hull(s->rate, b);
+  look_at(b, now->compressing ? 1.0 : -1.0, 0.0, OF_RATE, 0, e);
+  if (!now->compressing) {
+#if LAW_BENDS
+    look_at_separation(d, s, e);
+#else
+    hull(s->force, b), look_at(b, 1.0, 0.0, OF_FORCE, 0, e);
+#endif
+  }
+#if SATURATION
+  FOR(i, V) {
+    const bits may = may_cross(s->demand, i, (vec){0}, d->limit[i]) & (bits)(d->kept[i] > 0.0);
+    if (any(may)) FOR(l, LANES) if (may[l])
+      look_at_joint(s->demand, i * LANES + l, 0.0, d->limit[i][l], OF_DEMAND, e);
+  }
+#endif
+#if FRICTION
+  FOR(i, V) {
+    const bits may = may_cross(s->speeds, i, d->joint_velocity[i], (vec){0} + TRANSITION) & (bits)(d->kept[i] > 0.0);
+    if (any(may)) FOR(l, LANES) if (may[l])
+      look_at_joint(s->speeds, i * LANES + l, d->joint_velocity[i][l], TRANSITION, OF_SLIDING, e);
+  }
+#endif
+#if SWITCHES
+  Switch here;
+  switches_at(d, y->target, s->force[0], &here);
+#if TARGET_BENDS
+  Switch there[NODES];
+  FOR(i, NODES) {
+    double z[NZ1];
+    FOR(k, NZ) z[k] = at_node(s->target[k], i);
+    switches_at(d, z, at_node(s->force, i), &there[i]);
+  }
+#endif
+  FOR(k, SWITCHES) {
+    double w[TERMS] = {here.values[k]};
+#if TARGET_BENDS
+    FOR(i, NODES) for (int j = 1; j < TERMS; j++)
+      w[j] += FROM_NODES[j][i] * (there[i].values[k] - here.values[k]);
+#else
+    for (int j = 1; j < TERMS; j++) {
+      w[j] = here.by_force[k] * s->force[j];
+      FOR(i, NZ) w[j] += here.by_z[k + SWITCHES * i] * s->target[i][j];
+    }
+#endif
+    hull(w, b);
+    const double side = b[0] != 0.0 ? b[0] : b[1];
+    look_at(b, side < 0.0 ? -1.0 : 1.0, 0.0, OF_SWITCH, k, e);
+  }
+#endif
+}
+
+INLINE void move(State *y, const Series *s, double h, double theta) {
+  double p[TERMS];
+#if SECOND_INTEGRALS
+  integrals(theta, p);
+  FOR(i, V) {
+    vec more = p[0] * s->torque[0][i];
+    for (int j = 1; j < TERMS; j++) more += p[j] * s->torque[j][i];
+    y->torque2[i] += h * more;
+  }
+  FOR(j, TERMS) y->impulse2 += h * p[j] * s->impulse[j];
+#endif
+#if PEAK
+  double where;
+  y->peak = largest(s->force, theta, y->peak, &where);
+#endif
+  powers(theta, p);
+  FOR(i, V) {
+    y->torque[i] = vector(s->torque, i, p);
+    if (STIFFNESS) y->deviation[i] = vector(s->deviation, i, p);
+  }
+  y->impulse = value(s->impulse, p);
+  y->penetration = value(s->penetration, p);
+  FOR(i, NZ) y->target[i] = value(s->target[i], p);
+  y->time += h * theta;
+}

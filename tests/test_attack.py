@@ -154,6 +154,12 @@ def test_a_board_that_breaks_within_a_step_is_followed_or_refused() -> None:
     assert shorter.batch(**given, **rows)["impulse"] == pytest.approx([alone.impulse], rel=1e-9)
 
 
+def test_a_row_whose_steps_are_used_up_has_no_number_as_alone() -> None:
+    # found by this seed: a nail that rattles; alone it is refused
+    found = strike("arm7", "spring-damper", "nail", 10, 405)
+    assert (found.collisions, found.off, found.refused) == (10, 0, 1)
+
+
 @pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
 def test_collisions_are_the_same_with_and_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     found = compare("planar_arm", "spring-damper", "mass", 2, SEED)

@@ -50,6 +50,7 @@ class Batch:
         # these say which contacts have not ended, and which steps were too long
         judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
         self._given = {*outputs, *judges}
+        judges = (*judges, "duration")
         if breaks(model):
             judges = (*judges, "impulse", "target_result")
         self.model, self.outputs = model, tuple(dict.fromkeys((*outputs, *judges)))
@@ -102,6 +103,12 @@ class Batch:
             for name, x in zip(names, found, strict=True):
                 if name != "step_error":
                     x[wrong] = np.nan
+        # steps that events have used up before the horizon, which `collide` refuses too
+        separated, duration = (found[names.index(name)][:, 0] for name in ("separated", "duration"))
+        cut = ~(separated > 0.5) & (duration < self.model.horizon * (1 - 1e-9))
+        for name, x in zip(names, found, strict=True):
+            if name not in ("separated", "step_error"):
+                x[cut] = np.nan
         return {
             name: self._shaped(name, x, shape)
             for name, x, shape in zip(names, found, shapes, strict=True)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.cache import cached, library_path
-from impactopt.collision.checks import ACCURACY, too_large
+from impactopt.collision.checks import ACCURACY, breaks, left_out_by_breaking, too_large
 from impactopt.collision.native import native_collision
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
@@ -56,6 +56,10 @@ class Batch:
     ) -> None:
         # these say which contacts have not ended, and which steps were too long
         judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
+        self._given = {*outputs, *judges}
+        judges = (*judges, "duration")
+        if breaks(model):
+            judges = (*judges, "impulse", "target_result")
         self.model, self._stability = model, stability
         self.outputs = tuple(dict.fromkeys((*outputs, *judges)))
         recipe = (*model._recipe, *self.outputs, every)
@@ -95,15 +99,28 @@ class Batch:
         names = function.name_out()
         if "step_error" in names:
             # a contact that never was has left nothing out
-            wrong = too_large(self.model.stepping, found[names.index("step_error")][:, 0])
+            error = found[names.index("step_error")]
+            if breaks(self.model):
+                impulse, results = (found[names.index(name)] for name in ("impulse", "target_result"))
+                force = given["target_breaking_force"][:, 0]
+                error[:, 0] += left_out_by_breaking(self.model, impulse[:, 0], results, force)
+            wrong = too_large(self.model.stepping, error[:, 0])
             if unstable is not None:
-                found[names.index("step_error")][unstable] = np.nan
+                error[unstable] = np.nan
                 wrong |= unstable
             for name, x in zip(names, found, strict=True):
                 if name != "step_error":
                     x[wrong] = np.nan
+        # steps that events have used up before the horizon, which `collide` refuses too
+        separated, duration = (found[names.index(name)][:, 0] for name in ("separated", "duration"))
+        cut = ~(separated > 0.5) & (duration < self.model.horizon * (1 - 1e-9))
+        for name, x in zip(names, found, strict=True):
+            if name not in ("separated", "step_error"):
+                x[cut] = np.nan
         return {
-            name: self._shaped(name, x, shape) for name, x, shape in zip(names, found, shapes, strict=True)
+            name: self._shaped(name, x, shape)
+            for name, x, shape in zip(names, found, shapes, strict=True)
+            if name in self._given
         }
 
     def _unstable(self, given: Mapping[str, Array]) -> Any:

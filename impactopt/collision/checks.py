@@ -9,9 +9,19 @@ from numpy.typing import NDArray
 
 from impactopt.collision.result import Collision
 from impactopt.collision.stepped import SteppedModel
+from impactopt.contact import Board
 from impactopt.errors import InputError
 
-__all__ = ["ACCURACY", "check_course", "check_finite", "check_frozen", "spoiled", "too_large"]
+__all__ = [
+    "ACCURACY",
+    "breaks",
+    "check_course",
+    "check_finite",
+    "check_frozen",
+    "left_out_by_breaking",
+    "spoiled",
+    "too_large",
+]
 
 Array = NDArray[np.float64]
 
@@ -64,6 +74,21 @@ def check_finite(outputs: dict[str, Array], step: float) -> None:
 def too_large(method: str, error: Array) -> Any:
     """Whether what Runge-Kutta steps are estimated to have left out of impulses is more than a method may."""
     return ~(error <= ACCURACY[method])
+
+
+def left_out_by_breaking(collision: SteppedModel, impulse: Any, results: Any, force: Any) -> Any:
+    """What Runge-Kutta's steps may leave out where a board breaks within one of them, relative.
+
+    Its stages judge whether it has broken: for up to half a step its force is taken for what it is not.
+    results (..., k) : of the target.  force [N] : that breaks it.
+    """
+    broken = np.asarray(results)[..., list(collision.target.results).index("broken")] > 0.5
+    return broken * 0.5 * collision.step_length * np.asarray(force) / np.maximum(impulse, 1e-300)
+
+
+def breaks(collision: SteppedModel) -> bool:
+    """Whether `left_out_by_breaking` is to be looked at."""
+    return collision.stepping == "rk4" and isinstance(collision.target, Board)
 
 
 def check_course(collision: SteppedModel, result: Collision, error: float) -> None:

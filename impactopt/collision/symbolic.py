@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.cache import cached
 from impactopt.collision.batch import Batch
-from impactopt.collision.checks import check_course, check_finite
+from impactopt.collision.checks import breaks, check_course, check_finite, left_out_by_breaking
 from impactopt.collision.describe import Description, describe
 from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
 from impactopt.collision.graph import collision_graph, target_yield
@@ -275,6 +275,9 @@ class SymbolicModel(SteppedModel):
         check_finite(outputs, self.step_length)
         error = float(outputs.get("step_error", np.zeros(1)).item())
         result = Collision.from_outputs(outputs, self.target)
+        if breaks(self):
+            force = values["target_breaking_force"]
+            error += float(left_out_by_breaking(self, result.impulse, outputs["target_result"][:, 0], force))
         # of a plastic blow, where the contact is broken off before
         numbers = {name: values[f"target_{name}"] for name in self.target.parameters}
         yields = float(frozen["m"].item()) + float(target_yield(self.target, numbers))

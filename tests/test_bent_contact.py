@@ -14,6 +14,7 @@ from test_native import ROBOTS, X, robot_named, situation
 
 from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, JointFriction, Terms
+from impactopt.collision.contact_slopes import law_is_linear
 from impactopt.collision.dense_step import Contact
 from impactopt.collision.graph import collision_graph
 from impactopt.collision.implicit import NODES, STAGES, gamma, node_tables
@@ -95,6 +96,8 @@ def test_polynomials_through_the_nodes_are_what_they_go_through() -> None:
 
 def test_what_bends() -> None:
     assert Contact(HUNT, MASS).law_bends and not Contact(HUNT, MASS).target_bends
+    # whatever its numbers are now; and a kink
+    assert not law_is_linear(HuntCrossley(stiffness=1e6, dissipation=0.0, exponent=1.0))
     assert Contact(SPRING, Dragged(mass=1.0)).target_bends and not Contact(SPRING, MASS).law_bends
 
 
@@ -176,7 +179,7 @@ def way_and_slopes(model: SDC, values: list[Any], function: Any) -> tuple[Any, A
         ends = []
         for t in (h, -h):
             there = pin.integrate(robot.model, q, t * way[: robot.nv]), v + t * way[robot.nv :]
-            ends.append([np.array(x).ravel(order="F") for x in function(*there, *values[2:])])
+            ends.append([np.array(x).ravel(order="F") for x in function.call([*there, *values[2:]])])
         return [(a - b) / (2 * h) for a, b in zip(*ends, strict=True)]
 
     pairs = zip(difference(2.5e-4), difference(5e-4), strict=True)

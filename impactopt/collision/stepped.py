@@ -11,6 +11,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from impactopt.codegen.hashing import model_hash
+from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
 from impactopt.collision.interface import CollisionModel
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Settings
@@ -135,7 +136,8 @@ class SteppedModel(CollisionModel):
         held = (self.held_by.sole_frames(self.robot), self.held_by.hand_frames(self.robot))
         held_by = (*held, tuple(self.held_by.compliance))
         transition = self.joint_friction.transition if self.terms.friction else None
-        kinds = (self.law.formula(), self.target.formula(), self.terms, transition)
+        bends = (law_is_linear(self.law), target_is_linear(self.target))
+        kinds = (self.law.formula(), self.target.formula(), *bends, self.terms, transition)
         shapes = tuple((name, value.shape) for name, value in self.settings.items())
         frame = self.robot.striker(self.striker).model_frame
         steps = (self.stepping, self.step_length, self.tolerance, self.step_of_graph)

@@ -154,7 +154,8 @@ def test_what_is_left_out_is_not_computed() -> None:
     lean = sdc("biped", terms=Terms.none()).describe(("impulse",)).as_dict()["instructions"]
     full = sdc("biped", terms=Terms(friction=True), friction=FRICTION)
     rich = full.describe(full.available).as_dict()["instructions"]
-    assert lean["freeze"] < 0.9 * rich["freeze"] and lean["step"] < 0.6 * rich["step"]
+    # of a Runge-Kutta step the four products with A stay
+    assert lean["freeze"] < 0.9 * rich["freeze"] and lean["step"] < 0.7 * rich["step"]
 
 
 def test_a_point_mass_has_no_servo() -> None:

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 # of the shortest compression that each of the two may last which an event makes of it, and the first of them
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
-OF_NATURAL, LEAST = 0.15, 2e-3  # of a phase without a shortest time: share of the natural one, and [s] at most
+# of a phase without a shortest time: share of the natural one, and [s] at most
+OF_NATURAL, LEAST = 0.15, 2e-3
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 

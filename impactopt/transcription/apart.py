@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -52,14 +53,20 @@ class Chain:
         """To which it is filled up."""
         return next((n for n in LENGTHS if n >= len(self.columns)), len(self.columns))
 
-    def numbers(self, before: Any = None) -> list[float]:
+    def numbers(self, before: Any = None) -> Array:
         """The chain's part of a row's parameters; ``before``: a placement in front of all (pin.SE3)."""
+        if before is None:
+            return self._numbers
+        out = self._numbers.copy()
+        out[:12] = _placement(before * self.places[0])
+        return out
+
+    @cached_property
+    def _numbers(self) -> Array:
+        """Thousands of rows have the same."""
         more = self.length - len(self.columns)
         places = [*self.places, *[pin.SE3.Identity()] * more]
-        if before is not None:
-            places[0] = before * places[0]
-        out = [x for m in places for x in (*np.asarray(m.rotation).ravel(), *m.translation)]
-        return [*out, *self.turns, *[1.0] * more]
+        return np.concatenate([*map(_placement, places), self.turns, np.ones(more)])
 
     def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Array, Array, Array]:
         """z of a row's function, sums of coordinates: slots, coordinates (y, then legs), factors, (k,) each.
@@ -75,6 +82,11 @@ class Chain:
                 coordinates += [0, 1, 2]
                 factors += [float(rotation[j, i]) for j in range(3)]
         return np.array(slots), np.array(coordinates), np.array(factors)
+
+
+def _placement(m: Any) -> Array:
+    """Rotation by rows, and translation [m] (12)."""
+    return np.concatenate([np.asarray(m.rotation).ravel(), m.translation])
 
 
 def _places(c: StanceCoordinates) -> list[int]:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impactopt.solvers.program import Vector, scaled_residual
+from impactopt.solvers.program import Determined, Vector, scaled_residual
 from impactopt.solvers.sqp.barrier import Bounded
-from impactopt.solvers.sqp.condense import Determined
 from impactopt.solvers.sqp.elastic import Elastic
 from impactopt.solvers.sqp.linesearch import Progress
 from impactopt.solvers.sqp.newton import borrow, give_back

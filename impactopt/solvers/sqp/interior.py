@@ -19,9 +19,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from impactopt.solvers.program import Status, Vector, complementarity, stationarity
+from impactopt.solvers.program import Determined, Status, Vector, complementarity, stationarity
 from impactopt.solvers.sqp.barrier_problem import BarrierProblem
-from impactopt.solvers.sqp.condense import Determined
 from impactopt.solvers.sqp.elastic_phase import ElasticPhase
 from impactopt.solvers.sqp.run import Run, Task
 from impactopt.solvers.sqp.search import LineSearch

@@ -9,9 +9,10 @@ import scipy.sparse as sp
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from impactopt.solvers.program import Determined
 from impactopt.solvers.sqp.cholesky import BlockCholesky
 from impactopt.solvers.sqp.compiled import kernels
-from impactopt.solvers.sqp.condense import Condenser, Determined, find_eliminations
+from impactopt.solvers.sqp.condense import Condenser, find_eliminations
 from impactopt.solvers.sqp.kernels import Kernels
 from impactopt.solvers.sqp.newton import NewtonSystem
 from impactopt.solvers.sqp.patterns import Elimination

@@ -152,7 +152,7 @@ def test_a_contact_that_ends_at_another_time(transcription: Transcription, facto
 def test_an_impact_in_no_time_has_no_elements(transcription: Transcription) -> None:
     t = changed(transcription, collision="rigid")
     assert contact_error(t, np.zeros(t.program.n)) is None
-    assert refined_elements(None, t.elements) is None
+    assert refined_elements(None, t.hit.elements) is None
 
 
 def told(errors: tuple[tuple[float, ...], ...], **options: Any) -> ContactError:
@@ -190,14 +190,15 @@ def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> N
     x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
     g = new.program.constraints(x)
     assert np.maximum(new.program.g_lower - g, g - new.program.g_upper).max() < 0.2
-    pairs = same_places(new.stages, old.stages)
-    assert len(pairs) == sum(map(len, old.elements)) and len(contact_mesh(old.problem)) == len(old.stages)
-    for mine, its in zip(new.collisions, old.collisions, strict=True):
+    pairs = same_places(new.hit.stages, old.hit.stages)
+    assert len(pairs) == sum(map(len, old.hit.elements))
+    assert len(contact_mesh(old.problem)) == len(old.hit.stages)
+    for mine, its in zip(new.hit.collisions, old.hit.collisions, strict=True):
         for name in ("u", "f", "p", "legs", "w"):
             a, b = getattr(mine, name).read(x), getattr(its, name).read(result.x)
             np.testing.assert_allclose([a[i] for i, _ in pairs], [b[k] for _, k in pairs], atol=1e-9)
     # what is not of the contact is as it was
-    np.testing.assert_array_equal(new.swing_c.read(x), old.swing_c.read(result.x))
+    np.testing.assert_array_equal(new.swing.c.read(x), old.swing.c.read(result.x))
     assert np.count_nonzero(y) and np.count_nonzero(z)
     # and it does not pull
     assert isinstance(new.expected, Collision)
@@ -207,7 +208,7 @@ def test_finer_elements_start_where_the_old_ones_ended(biped_plan: Planned) -> N
 def test_the_old_contact_is_a_warm_start(transcription: Transcription) -> None:
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4))
     first = solve_sqp(t.program, first_iterate(t))
-    new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.elements))
+    new = Transcription(t.problem, t.coordinates, t.functions, elements=halved(t.hit.elements))
     x, y, z = carried_over(new, t, first.x, first.multipliers, first.bound_multipliers)
     again = solve_sqp(new.program, x, multipliers=y, bound_multipliers=z)
     assert again.status is Status.SOLVED and again.iterations < first.iterations

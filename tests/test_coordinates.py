@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from small_robots import arm, biped
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates, base_motion, elimination_order, solve_in_order
+from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
+from impactopt.kinematics.fixed_order import elimination_order, solve_in_order
 from impactopt.kinematics.inverse_kinematics import reach
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.robots.presets import load_robot

@@ -14,7 +14,7 @@ from textbook import CASES, INF, Textbook, assert_optimal
 
 from impactopt import load_problem
 from impactopt.solvers.program import Status
-from impactopt.solvers.sqp import SQPOptions, interior, solve_sqp
+from impactopt.solvers.sqp import SQPOptions, interior, search, solve_sqp
 from impactopt.transcription.start import first_iterate
 
 
@@ -64,8 +64,8 @@ def test_rows_far_off_are_not_bent():
 
 def test_steps_that_crawl_give_way(monkeypatch):
     """Every step counts as a crawl here: after a few of them the rows become elastic."""
-    monkeypatch.setattr(interior, "_CRAWL", 2.0)
-    monkeypatch.setattr(interior, "_PATIENCE", 2)
+    monkeypatch.setattr(search, "_CRAWL", 2.0)
+    monkeypatch.setattr(search, "_PATIENCE", 2)
     case = CASES["HS71"]
     result = solve_sqp(case.build(), case.x0)
     assert next(k for k, r in enumerate(result.history) if r.note == "rows become elastic") == 3

@@ -35,7 +35,7 @@ def test_imports_go_one_way(file: Path) -> None:
 
 
 def test_no_import_leads_back() -> None:
-    """Neither between rooms nor inside one."""
+    """Neither between rooms nor inside one; in `STRICT` rooms not for types either."""
     left = {name: modules_imported(file) - {name} for name, file in MODULES.items()}
     while free := [name for name, needs in left.items() if not needs & set(left)]:
         for name in free:
@@ -66,3 +66,8 @@ def test_engines_share_no_code_with_the_planner() -> None:
     shared = [PACKAGE / "simulation" / f"{name}.py" for name in (*names, *robots)]
     for file in [*engines, *shared]:
         assert rooms_imported(file) <= ENGINE, file
+
+
+def test_no_file_is_longer_than_400_lines() -> None:
+    lines = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in FILES}
+    assert [str(file.relative_to(PACKAGE)) for file, count in lines.items() if count > 400] == []

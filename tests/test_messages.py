@@ -57,14 +57,14 @@ def test_times_are_those_of_the_solution(biped_transcription: Transcription) -> 
         i = next(i for i in range(t.program.m) if t.program.row_name(i).startswith(name))
         return t.program.describe_violation(i, at, 0.1)[0]
 
-    hit = t.collisions[0]
+    hit = t.hit.collisions[0]
     for compression, restitution, follow in ((0.02, 0.01, 0.6), (0.03, 0.015, 0.75)):
         for group, value in zip((*hit.T, t.follow.T), (compression, restitution, follow), strict=True):
             group.write(x, value)
         place = t.follow_nodes[3]
         name = f"closed legs, follow-through, {100 * place:.0f} %"
         assert f"follow-through at {place * follow:.2f} s" in what(name, x)
-        stage = next(s for s in t.stages if s.phase == 1)
+        stage = next(s for s in t.hit.stages if s.phase == 1)
         after = compression + stage.place * restitution
         assert f"{1e3 * after:.0f} ms after contact" in what(f"contact law, {stage.name}", x)
 
@@ -76,11 +76,11 @@ def test_a_centre_of_pressure_outside_its_sole_is_told_in_millimetres(
     """Beyond the margin's line, whatever the sole bears; of all facets that say so there is one message."""
     t, x = biped_transcription, first_iterate(biped_transcription)
     cone, sole = t.problem.term(ContactWrenchCone), t.coordinates.legs[0].sole
-    force = 0.3 * t.weight
+    force = 0.3 * t.builder.limits.weight
     front = sole.polygon[:, 0].max() - cone.margin + outside
-    wrench = np.tile([0, 0, 0.5 * t.weight, 0, 0, 0], len(t.coordinates.legs))
+    wrench = np.tile([0, 0, 0.5 * t.builder.limits.weight, 0, 0, 0], len(t.coordinates.legs))
     wrench[:6] = [0, 0, force, 0, -front * force, 0]
-    t.swing_w.write(x, wrench)
+    t.swing.w.write(x, wrench)
     k = len(t.swing_nodes) // 2
     when = t.swing_nodes[k] * t.problem.swing.duration[0]
     place = f"contact wrench cone, swing at {when:.2f} s, {sole.name} sole"
@@ -92,10 +92,10 @@ def test_a_sole_that_slips_is_told_in_parts_of_its_friction(biped_transcription:
     t, x = biped_transcription, first_iterate(biped_transcription)
     friction, sole = t.problem.term(ContactWrenchCone).friction, t.coordinates.legs[1].sole
     middle = sole.polygon.mean(axis=0)
-    force = np.array([1.25 * friction * 0.4 * t.weight, 0, 0.4 * t.weight])
-    wrench = np.tile([0, 0, 0.5 * t.weight, 0, 0, 0], len(t.coordinates.legs))
+    force = np.array([1.25 * friction * 0.4 * t.builder.limits.weight, 0, 0.4 * t.builder.limits.weight])
+    wrench = np.tile([0, 0, 0.5 * t.builder.limits.weight, 0, 0, 0], len(t.coordinates.legs))
     wrench[6:12] = [*force, *np.cross([*middle, 0.0], force)]
-    t.swing_w.write(x, wrench)
+    t.swing.w.write(x, wrench)
     found = [v for v in told(t, x) if v.what.startswith("contact wrench cone, swing")]
     assert len(found) == len(t.swing_nodes)
     assert {v.by for v in found} == {"25 % beyond its friction"}
@@ -103,7 +103,7 @@ def test_a_sole_that_slips_is_told_in_parts_of_its_friction(biped_transcription:
 
 def test_rows_of_a_term_at_a_place_are_told_once_by_the_worst(biped_transcription: Transcription) -> None:
     t, x = biped_transcription, first_iterate(biped_transcription)
-    t.swing_legs.write(x, t.legs0 + 0.1)
+    t.swing.legs.write(x, t.legs0 + 0.1)
     g = t.program.constraints(x)
     over = np.maximum(np.maximum(t.program.g_lower - g, g - t.program.g_upper), 0)
     groups = {t.program.row_group(i) for i in np.flatnonzero(over > 1e-6)}
@@ -129,7 +129,7 @@ def test_torques_that_cannot_be_held_are_told_with_joint_and_time(arm_transcript
     assert result.status is Status.INFEASIBLE
     assert "Rows that cannot be met: torque limit, swing at " in result.message
     model, joints = t.robot.model, list(t.robot.joint_names)
-    swing = t.spline(result.x, t.swing_control, t.swing_breaks, t.swing_T)
+    swing = t.swing.spline(result.x)
     checked = 0
     for violation in told(t, result.x):
         said = re.fullmatch(
@@ -153,7 +153,7 @@ def test_a_point_that_is_out_of_time_is_told_in_millimetres(arm_transcription: T
     result = solve_ipopt(t.program, first_iterate(t))
     assert result.status is Status.INFEASIBLE
     model = t.robot.model
-    swing = t.spline(result.x, t.swing_control, t.swing_breaks, t.swing_T)
+    swing = t.swing.spline(result.x)
     data, q = model.createData(), t.coordinates.join(swing.sample(swing.duration)[0][0], t.legs0)
     pin.framesForwardKinematics(model, data, q)
     at = data.oMf[model.getFrameId(f"striker:{t.problem.striker}")].translation

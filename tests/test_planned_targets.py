@@ -37,8 +37,8 @@ from impactopt.problem.objectives import Penetration
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Status, check_program
-from impactopt.solvers.sqp.condense import Condenser, Determined, find_eliminations
+from impactopt.solvers.program import Determined, Status, check_program
+from impactopt.solvers.sqp.condense import Condenser, find_eliminations
 from impactopt.solvers.sqp.kernels import Kernels
 from impactopt.transcription.clearance import CLEARANCE, HASTE
 from impactopt.transcription.mesh import contact_mesh

@@ -131,8 +131,8 @@ def test_a_scenario_costs_impulse(biped: Planned, biped_plan: Planned) -> None:
 def test_the_robot_keeps_its_balance_after_a_scenario(biped: Planned) -> None:
     t, x = biped.transcription, biped.result.x
     limit, c = biped.problem.term(Balance), biped.problem.coordinates
-    assert [s.scenario for s in t.scenarios] == [EXPECTED, HEAVY]
-    for other in t.scenarios:
+    assert [s.scenario for s in t.hit.scenarios] == [EXPECTED, HEAVY]
+    for other in t.hit.scenarios:
         assert other.scenario is not None
         y, rate = other.after.read(x)[0], other.u.read(x)[other.end[1]]
         legs = c.solve_legs(y, other.legs.read(x)[other.end[1]])
@@ -146,7 +146,7 @@ def test_the_robot_keeps_its_balance_after_a_scenario(biped: Planned) -> None:
 
 def test_the_state_after_a_scenario_is_where_its_collision_ends(biped: Planned) -> None:
     sim, t, c = biped.simulation, biped.transcription, biped.problem.coordinates
-    (other,) = [s for s in t.scenarios if s.scenario is HEAVY]
+    (other,) = [s for s in t.hit.scenarios if s.scenario is HEAVY]
     end = sim.contact_start + foreseen(biped, HEAVY.name).collision.time[-1]
     near = np.flatnonzero(np.abs(sim.time - end) < 5e-3)
     y = np.array([c.split(sim.q[k])[0] for k in near])

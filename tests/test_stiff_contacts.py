@@ -13,9 +13,10 @@ from impactopt.planning.verdict import second_look
 from impactopt.problem.objectives import Impulse, PeakForce
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Status
-from impactopt.transcription.collision import Collision, shortest_phases
+from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_error import ASKED
 from impactopt.transcription.guess import fastest, parting
+from impactopt.transcription.phases import shortest_phases
 from impactopt.transcription.rattle import rattle_of
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
@@ -172,8 +173,9 @@ def test_the_fastest_is_where_all_joints_are() -> None:
         jacobian = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
         return float(problem.normal @ jacobian @ rates)
 
-    expected = sum(abs(along(e)) * limit for e, limit in zip(np.eye(c.ny), t.rate_limit, strict=True))
-    found = fastest(c, problem.striker, problem.normal, problem.contact_posture, t.rate_limit)
+    rates = t.builder.limits.rate_limit
+    expected = sum(abs(along(e)) * limit for e, limit in zip(np.eye(c.ny), rates, strict=True))
+    found = fastest(c, problem.striker, problem.normal, problem.contact_posture, rates)
     assert found == pytest.approx(expected)
 
 

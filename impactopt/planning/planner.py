@@ -124,7 +124,7 @@ def solve(
     return Solution(
         plan=t.decode(result.x),
         nodes=t.nodes,
-        elements=t.elements if t.guarded else (),
+        elements=t.hit.elements if t.hit.guarded else (),
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         rattle=rattle(t, result.x) if result.status.usable else None,
         apart=t.apart_rows,
@@ -306,14 +306,14 @@ class _Refining:
                 known = t.nodes if violated is None else violated.nodes
                 nodes = nodes_to_add(t.decode(old.x), known)
             error = self.error(t, old.x)
-            elements = refined_elements(error, t.elements)
+            elements = refined_elements(error, t.hit.elements)
         if violated is None and nodes == t.nodes and elements is None:
             return None
         rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
         finer = t
         if nodes != t.nodes or elements is not None:
             self._refined += 1
-            finer_elements = elements or (t.elements if t.guarded else ())
+            finer_elements = elements or (t.hit.elements if t.hit.guarded else ())
             functions = block_functions(t.problem, t.coordinates, self.report, finer_elements)
             finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements)
         finer = finer.with_apart(rows) if self.margins is not None else finer

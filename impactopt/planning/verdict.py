@@ -67,8 +67,8 @@ def _too_stiff(t: ContactProgram) -> str:
     p = t.problem
     if not isinstance(t.expected, Collision) or not p.target.events:
         return ""
-    limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.rate_limit)
-    found = parting(p.law, p.target, t.mass_at_contact, limit)
+    limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.builder.limits.rate_limit)
+    found = parting(p.law, p.target, t.hit.mass, limit)
     return "" if found is None else _told(found, limit)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,17 @@ from impactopt.errors import InputError, check_array
 
 Vector = npt.NDArray[np.float64]
 Matrix = Any  # scipy.sparse.csc_array; SciPy ships no types
+
+
+class Determined(NamedTuple):
+    """Variables, by number, that equality rows of their own determine; those of lower rank go first.
+
+    A program may have a sequence ``determined`` of them. Where rows would do for several, what stands first
+    there takes those that stand first.
+    """
+
+    rank: tuple[int, ...]
+    variables: npt.NDArray[np.intp]
 
 
 @runtime_checkable

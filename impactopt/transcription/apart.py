@@ -7,7 +7,7 @@ serves all pairs of all robots.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -22,9 +22,10 @@ from impactopt.codegen.cache import cached
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.transcription.blocks import BlockExpression, make_block
+from impactopt.transcription.builder import Builder
 from impactopt.transcription.lanes import in_lanes
 from impactopt.transcription.layout import Affine, Array, stack
-from impactopt.transcription.rows import Row, millimetres
+from impactopt.transcription.rows import Place, Row, millimetres
 from impactopt.transcription.structured import derivative_functions
 
 LENGTHS = (4, 8, 12, 16, 20)  # of chains, in joints
@@ -245,23 +246,24 @@ class Held(NamedTuple):
     travel: float = 0.0
 
 
-def add_apart_rows(t: Any, rows: Mapping[ApartRow, Held]) -> None:
-    """Blocks and rows of a program ``t`` for these."""
+def add_apart_rows(
+    b: Builder, spots: Sequence[tuple[Place, list[Affine]]], rows: Mapping[ApartRow, Held]
+) -> None:
+    """Blocks and rows for these.  spots : places of a program, with coordinates and legs."""
     if not rows:
         return
-    bodies, links = t.problem.bodies, t.problem.bodies.links
-    spots = [*t.swing_spots(), *t.follow_spots()]
+    bodies, links = b.problem.bodies, b.problem.bodies.links
     spot_of = {place.name: k for k, (place, _) in enumerate(spots)}
-    width = t.ny + t.nl
+    width = b.ny + b.nl
     everywhere = stack([part for _, slots in spots for part in slots])
-    coordinates, constants = everywhere.matrix(t.layout.n), everywhere.const
+    coordinates, constants = everywhere.matrix(b.layout.n), everywhere.const
     chains: dict[tuple[int, int], tuple[Chain, Any]] = {}
     groups: dict[str, _Group] = {}
     for row, held in rows.items():
         body = bodies.world[-1 - row.other] if row.other < 0 else None
         if (row.joint, row.other) not in chains:
-            chain = chain_between(t.robot.model, row.joint, max(row.other, 0))
-            pattern = chain.pattern(t.coordinates, None if body is None else body.rotation)
+            chain = chain_between(b.robot.model, row.joint, max(row.other, 0))
+            pattern = chain.pattern(b.coordinates, None if body is None else body.rotation)
             chains[row.joint, row.other] = chain, pattern
         chain, pattern = chains[row.joint, row.other]
         before = None
@@ -282,7 +284,7 @@ def add_apart_rows(t: Any, rows: Mapping[ApartRow, Held]) -> None:
         shape = len(counts) * group.size, len(constants)
         chosen = sp.csr_array((factors, (instance * group.size + slots, at)), shape=shape)
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
-        first = t.add_lifted(name, lift, len(counts), np.array(group.numbers))
+        first = b.add_lifted(name, lift, len(counts), np.array(group.numbers))
         origins = [
             Row(
                 (SelfCollision if row.other >= 0 else KeepOut).name,
@@ -292,7 +294,7 @@ def add_apart_rows(t: Any, rows: Mapping[ApartRow, Held]) -> None:
             )
             for row, spot in zip(group.rows, group.spots, strict=True)
         ]
-        t.rows.add_each(origins, outputs=first + np.arange(len(counts)), lower=0.0)
+        b.rows.add_each(origins, outputs=first + np.arange(len(counts)), lower=0.0)
 
 
 @dataclass(frozen=True)

@@ -1,39 +1,32 @@
-"""What programs have about the contact: the state before it, collisions, and what they leave behind."""
+"""Programs with a contact in them: parts put together, as terms, objectives, starts and planners see them."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from impactopt.kinematics.support import support_polygon
-from impactopt.kinematics.wrench_cone import inward_edges
-from impactopt.problem.objectives import AngularMomentum, Objective
-from impactopt.problem.terms import HitCone, HitRegion, Term
+from impactopt.problem.objectives import Objective
+from impactopt.problem.terms import Term
+from impactopt.solvers.program import Determined
 from impactopt.transcription.apart import ApartRow, Held, add_apart_rows
+from impactopt.transcription.batched import Block
 from impactopt.transcription.blocks import DEPTH_SCALE
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
-from impactopt.transcription.guess import effective_mass
+from impactopt.transcription.elimination import Turn, by_choice, determined
+from impactopt.transcription.hit import Hit
 from impactopt.transcription.impulse import InstantImpact
-from impactopt.transcription.layout import Affine, Array, Group
-from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh
+from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
-from impactopt.transcription.plan import PlannedScenario
-from impactopt.transcription.rows import Index, Measure, Place, Rank, millimetres, percent
+from impactopt.transcription.rows import Index, Measure, Place, Rows
 from impactopt.transcription.structured import StructuredProgram
 
 Program = TypeVar("Program", bound="ContactProgram")
-
-
-def rotation_rows(normal: Array) -> Array:
-    """(3, 3) rows: the normal and two tangents."""
-    _, _, vt = np.linalg.svd(normal.reshape(1, 3))
-    rows = np.vstack([normal, vt[1:]])
-    return rows
 
 
 class BodyState(NamedTuple):
@@ -47,216 +40,111 @@ class BodyState(NamedTuple):
     q: Array
 
 
-class ContactProgram(Builder):
-    """A program with a contact in it.
+class ContactProgram(ABC):
+    """A builder, a hit, and what whoever completes it adds: its parts, and the rows between them.
 
-    Whoever completes it says what the contact starts from, before :meth:`_hit`.
-
-    contact_state : y, y' and y'' at contact; contact_T: the duration [s] of the phase that they are of, so
-        that ydot = y'/T; contact_legs, contact_w: legs and sole wrenches there.
+    Attributes
+    ----------
+    builder : with which all parts are built.  hit : the contact with all targets.
+    problem, coordinates, robot, functions, y0, legs0 : the builder's.
+    angular_momentum : after contact, a group of three, if an objective asks for it.
+    objectives : the problem's that it knows, with their quantities.
+    apart_rows : rows between bodies.
     """
 
-    contact_state: tuple[Affine, Affine, Affine]
-    contact_T: Affine
-    contact_legs: Affine
-    contact_w: Affine
-    elements: Elements = ()  # of the contact; none: those that the problem asks for
+    def __init__(self, builder: Builder, hit: Hit) -> None:
+        self.builder, self.hit = builder, hit
+        self.problem, self.coordinates, self.robot = builder.problem, builder.coordinates, builder.robot
+        self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0
+        self.angular_momentum: Group | None = None
+        self.objectives: list[tuple[Objective, Quantity]] = []
+        self.apart_rows: Mapping[ApartRow, Held] = {}
 
-    def _hit(self, *, after: bool, rates: dict[str, Any] | None = None) -> None:
-        """Variables of the hit.
+    # ------------------------------------------------------------------ for terms and objectives
+    @property
+    def layout(self) -> Layout:
+        return self.builder.layout
 
-        after : the position after the expected one is among them.  rates : bounds of the rates at contact.
-        """
-        p, labels = self.problem, self.coordinates.labels
-        # finer elements are there because a plan was wrong on others: it may have pulled within a phase
-        self.guarded = bool(self.elements)
-        self.elements = self.elements or contact_elements(p)
-        self.stages = contact_mesh(p, self.elements)
-        compression, restitution, _ = p.law.formula()
-        self.law_switches = compression != restitution
-        self.law_pulls = float(p.law.branch(1e-6, -10.0, False)) < 0  # when bodies part fast
-        limit, names = self.torque.fraction, self.robot.joint_names
-        self.feedforward = self.layout.add(
-            "feed-forward at contact", 1, self.robot.n, lower=-limit, upper=limit, labels=names
-        )
-        self.u0 = self.layout.add("rate at contact", 1, self.ny, labels=labels, **(rates or {}))
-        self.angular_momentum: Group | None = None  # after contact, if an objective asks for it
-        self.scenarios: list[Collision] = []
-        self.expected: Collision | InstantImpact
-        if p.collision == "dynamics":
-            self.scenarios = [
-                Collision(self, s, after={"labels": labels}) for s in p.scenarios if not s.missing
-            ]
-            self.expected = Collision(self, after=self.of_y if after else None)
-        else:
-            self.expected = InstantImpact(self)
-        self.collisions = [self.expected, *self.scenarios]
+    @property
+    def rows(self) -> Rows:
+        return self.builder.rows
 
-    @cached_property
-    def mass_at_contact(self) -> float:
-        """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
-        c, p = self.coordinates, self.problem
-        y, legs = c.split(p.contact_posture)
-        return effective_mass(c, p.striker, p.normal, y, legs, np.zeros(c.ny))[0]
+    @property
+    def blocks(self) -> list[Block]:
+        return self.builder.blocks
 
-    def _feedforward_rows(self, torque: Index) -> None:
-        """The feed-forward is the torque at the node at contact, whose outputs are given."""
-        self.rows.add(
-            term="feed-forward that makes the robot coast",
-            place="contact",
-            components=self.robot.joint_names,
-            outputs=torque,
-            affine=-self.feedforward[0],
-            lower=0,
-            upper=0,
-            measure=percent("of the joint's limit off"),
-        )
+    def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
+        """:meth:`impactopt.transcription.builder.Builder.add_block`."""
+        return self.builder.add_block(name, instances, parameters)
 
-    def _contact_rows(self) -> None:
-        """Where and how the striking point meets the target."""
-        p = self.problem
-        y, y1, _ = self.contact_state
-        at = self.add_block("contact", [[y, y1, self.contact_T]], rotation_rows(p.normal).ravel())
-        if p.extra(HitRegion) is None:
-            self.rows.add(
-                term="hit point",
-                place=Place("contact", ""),
-                components=["x", "y", "z"],
-                outputs=at + np.arange(3),
-                lower=p.point,
-                upper=p.point,
-                measure=millimetres("away"),
-            )
-        self.rows.add(
-            term="approach speed",
-            place="contact",
-            components=["normal"],
-            outputs=np.array([at + 3]),
-            lower=0.05,
-            measure=Measure("m/s", 1.0, "too slow"),
-        )
-        if p.extra(HitCone) is None:
-            self.rows.add(
-                term=self.incidence.name,
-                place="contact",
-                components=["tangent 1", "tangent 2"],
-                outputs=at + np.array([4, 5]),
-                lower=-self.incidence.speed,
-                upper=self.incidence.speed,
-                measure=Measure("m/s", 1.0, "too fast across the normal"),
-                whole="",
-            )
+    def lift(self, name: str, outputs: Index, **options: Any) -> Group:
+        """:meth:`impactopt.transcription.builder.Builder.lift`."""
+        return self.builder.lift(name, outputs, **options)
 
-    def _collision_rows(self) -> None:
-        """One block for all collisions, each with its rows."""
-        slots: dict[str, list[Any]] = {}
-        parameters: dict[str, list[Any]] = {}
-        first: list[dict[str, int]] = []
-        for collision in self.collisions:
-            found = collision.instances()
-            first.append({name: len(slots.get(name, ())) for name in found})
-            for name, (instances, numbers) in found.items():
-                slots.setdefault(name, []).extend(instances)
-                parameters.setdefault(name, []).extend(numbers)
-        at = {name: self.add_block(name, slots[name], np.array(parameters[name])) for name in slots}
-        sizes = {block.name: block.n_out for block in self.blocks}
-        if isinstance(self.expected, Collision):
-            self._deepest = (
-                at["force"] + self.expected.end[-2] * sizes["force"] + self.parts("force")["penetration"]
-            )
-        for collision, index in zip(self.collisions, first, strict=True):
-            collision.add_rows({name: (at[name] + k * sizes[name], sizes[name]) for name, k in index.items()})
-
-    def _balance_rows(self, after: list[Affine]) -> None:
-        """Balance of what each target leaves behind; ``after``: y, y', legs and T after the expected one."""
-        y, y1, _ = self.contact_state
-        found = [(after, self.balance.capture_margin, "after contact")]
-        for other in self.scenarios:
-            assert other.scenario is not None
-            found.append((other.state_after, other.scenario.capture_margin, f"after contact{other.suffix}"))
-        for s in self.problem.scenarios:
-            if s.missing:
-                slots = [y, y1, self.contact_legs, self.contact_T]
-                found.append((slots, s.capture_margin, f"contact, if {s.name}"))
-        inward, offset = inward_edges(support_polygon(self.robot, self.coordinates))
-        parameters = [np.column_stack([inward, offset + (m or 0.0)]).ravel() for _, m, _ in found]
-        at = self.add_block("balance", [slots for slots, _, _ in found], np.array(parameters))
-        k = len(inward)
-        wanted = any(isinstance(o, AngularMomentum) for o in self.problem.objectives)
-        for i, (_, margin, place) in enumerate(found):
-            start = at + i * (k + 4)
-            if margin is not None:
-                self.rows.add(
-                    term="capture point",
-                    place=place,
-                    components=[f"edge {e}" for e in range(k)],
-                    outputs=start + np.arange(k),
-                    lower=0,
-                    measure=millimetres("outside"),
-                    whole="",
-                )
-            slow, still = self.balance.vertical_speed, self.balance.angular_momentum
-            self.rows.add(
-                term="vertical speed",
-                place=place,
-                components=["z"],
-                outputs=np.array([start + k]),
-                lower=-slow,
-                upper=slow,
-                measure=Measure("m/s", 1.0, "too fast"),
-            )
-            outputs, turning = start + k + 1 + np.arange(3), Measure("N m s", 1.0, "too much")
-            if wanted and i == 0:
-                self.angular_momentum = self.lift(
-                    "angular momentum",
-                    outputs,
-                    place=place,
-                    labels=["x", "y", "z"],
-                    measure=turning,
-                    lower=-still,
-                    upper=still,
-                )
-                continue
-            self.rows.add(
-                term="angular momentum",
-                place=place,
-                components=["x", "y", "z"],
-                outputs=outputs,
-                lower=-still,
-                upper=still,
-                measure=turning,
-            )
-
-    def link_slots(
+    def equal(
         self,
-        start: tuple[Affine, Affine, Affine],
-        times: tuple[Affine, Affine],
-        travel: tuple[Affine, Affine],
-        rate: Affine,
-    ) -> list[list[Affine]]:
-        """Slots of the block ``link``, coordinate by coordinate: from the state at contact to a later start.
+        term: str,
+        place: Place | str,
+        components: Sequence[str],
+        outputs: Any,
+        measure: Measure | Sequence[Measure] | None = None,
+    ) -> None:
+        """:meth:`impactopt.transcription.builder.Builder.equal`."""
+        self.builder.equal(term, place, components, outputs, measure)
 
-        start : y and d y/ds of what starts, and its duration [s].  times [s], travel : of two phases between,
-        whose ways are time x travel.  rate : ydot after them.
-        """
-        y, y1, _ = self.contact_state
-        out = []
-        for k in range(self.ny):
-            yk, rk, a, b, one, two, u0, u = (
-                e[k : k + 1] for e in (*start[:2], y, y1, *travel, self.u0[0], rate)
-            )
-            out.append([yk, rk, start[2], a, b, self.contact_T, *times, one, two, u0, u])
-        return out
+    @property
+    def expected(self) -> Collision | InstantImpact:
+        """The collision with the expected target."""
+        return self.hit.expected
 
+    @property
+    def contact_state(self) -> tuple[Affine, Affine, Affine]:
+        """y, y' and y'' at contact."""
+        y, y1, y2, *_ = self.hit.contact.state
+        return y, y1, y2
+
+    @property
+    def contact_T(self) -> Affine:
+        """The duration [s] of the phase that `contact_state` is of, so that ydot = y'/T."""
+        return self.hit.contact.state.T
+
+    @property
+    def contact_legs(self) -> Affine:
+        """Legs at contact."""
+        return self.hit.contact.state.legs
+
+    @property
+    def contact_w(self) -> Affine:
+        """Sole wrenches at contact."""
+        return self.hit.contact.state.w
+
+    @property
+    def feedforward(self) -> Group:
+        """Torques over limit (n) at contact, held from there on."""
+        return self.hit.contact.feedforward
+
+    @property
+    def u0(self) -> Group:
+        """The rate ydot (ny) at contact."""
+        return self.hit.contact.u0
+
+    def deepest_penetration(self) -> Affine:
+        """[m], of a contact that lasts: at the end of compression, as a variable."""
+        return self.lift("deepest penetration", self.hit.deepest)[0] * DEPTH_SCALE
+
+    def squares(self, group: Group) -> Quantity:
+        """The sum of the squares of a group's variables, in physical units."""
+        return Quantity(Affine.zeros(1), group)
+
+    # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
-        """Rows that these terms bring, the objective, and the program."""
+        """Rows that these terms bring, and the objective."""
         for term in terms:
             if type(term).add_rows is not Term.add_rows:  # those of the others are there
                 term.add_rows(self)
         self.objectives = quantities(self, objectives)
         self._worth = assemble(self.layout, self.objectives, self._prices())
-        self.apart_rows: Mapping[ApartRow, Held] = {}
-        self._bare = tuple(self.blocks), self.rows
+        self._bare = self.builder
 
     @cached_property
     def program(self) -> StructuredProgram:
@@ -269,105 +157,66 @@ class ContactProgram(Builder):
             objective=objective,
             quadratic=quadratic,
             linear=linear,
-            determined=self._determined(),
+            determined=by_choice(
+                [*(determined(Turn.LIFTED, g.index(0)) for g, _ in self.builder.lifted), *self._determined()]
+            ),
         )
 
     def with_apart(self: Program, rows: Mapping[ApartRow, Held]) -> Program:
         """The same program with just these rows between bodies."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
-        blocks, bare = self._bare
-        other.blocks, other.rows = [block.copy() for block in blocks], bare.copy()
-        other.apart_rows = dict(rows)
-        add_apart_rows(other, other.apart_rows)
+        other.builder, other.apart_rows = self._bare.copy(), dict(rows)
+        add_apart_rows(other.builder, [*self.swing_spots(), *self.follow_spots()], other.apart_rows)
         return other
 
-    # ------------------------------------------------------------------ for objectives
-    def deepest_penetration(self) -> Affine:
-        """[m], of a contact that lasts: at the end of compression, as a variable."""
-        return self.lift("deepest penetration", self._deepest)[0] * DEPTH_SCALE
+    def with_lifted(self, x: Array) -> Array:
+        """The variables (n,) with lifted ones made equal to what they stand for."""
+        x = x.copy()
+        for group, outputs in self.builder.lifted:  # in order: one may be a function of one before
+            found = np.concatenate([out.ravel() for out in self.program.outputs(x).values()])[outputs]
+            group.write(x, np.where(np.isfinite(found), found, 0.0))
+        return x
 
-    def squares(self, group: Group) -> Quantity:
-        """The sum of the squares of a group's variables, in physical units."""
-        return Quantity(Affine.zeros(1), group)
+    # ------------------------------------------------------------------ what completes it
+    @abstractmethod
+    def _determined(self) -> list[Determined]:
+        """What rows determine, of all parts."""
 
-    # ------------------------------------------------------------------ structure
-    def _determined(self) -> list[tuple[Rank, Index]]:
-        """What rows determine by themselves, with its rank in the elimination.
-
-        Where there are rows to choose from, what stands first here takes the rows that stand first.
-        """
-        out = [((0, k), part) for parts in self._nodes() for k, part in enumerate(parts, -len(parts))]
-        out += [((1, 0), group.index(0)) for group, _ in self._lifted]
-        found = [c.determined() for c in self.collisions]
-        out += [((4, k), legs) for stages, _ in found for parts in stages for k, legs in enumerate(parts)]
-        out += [((5, k), part) for _, steps in found for k, parts in enumerate(steps) for part in parts]
-        out.append(((3, 0), self.feedforward.index(0)))
-        out += [((6, 0), c.after.index(0)) for c in self.scenarios]
-        return out + [((6, 0), start) for start in self._starts()]
-
-    def _nodes(self) -> list[list[Index]]:
-        """Variables that the rows of each node determine, one after the other: of each leg, and the first
-        sole's wrench.
-        """
-        raise NotImplementedError
-
-    def _starts(self) -> list[Index]:
-        """Variables that the state after contact determines."""
-        return []
-
+    @abstractmethod
     def _prices(self) -> Prices:
-        raise NotImplementedError
+        """What makes the optimum unique."""
 
+    @abstractmethod
     def swing_spots(self, since: float = 0.0) -> list[tuple[Place, list[Affine]]]:
         """Places of the swing's nodes with coordinates and legs, from a fraction of it on to the contact."""
-        raise NotImplementedError
 
+    @abstractmethod
     def follow_spots(self) -> list[tuple[Place, list[Affine]]]:
         """Places after contact with coordinates and legs."""
-        raise NotImplementedError
 
+    @abstractmethod
     def body_states(self, x: Array) -> list[BodyState]:
         """Where bodies are at all places of `swing_spots` and `follow_spots`, for solver variables (n,)."""
-        raise NotImplementedError
 
+    @abstractmethod
+    def travel(self, x: Array, time: Array) -> Array:
+        """How far (k,) [m] the target has gone at these times [s] since the start."""
+
+    @abstractmethod
+    def decode(self, x: Array) -> Any:
+        """The plan or the strike that solver variables (n,) stand for."""
+
+    # ------------------------------------------------------------------ solution
     def posture(self, x: Array, slots: list[Affine]) -> Array:
         """Configuration (nq,) of coordinates and legs."""
         y, legs = slots
         return self.coordinates.join(y.evaluate(x), legs.evaluate(x))
 
-    def travel(self, x: Array, time: Array) -> Array:
-        """How far (k,) [m] the target has gone at these times [s] since the start."""
-        raise NotImplementedError
-
-    # ------------------------------------------------------------------ solution
     def achieved(self, x: Array) -> dict[str, float]:
         """What the objectives' quantities come to, by their names, for solver variables (n,)."""
         return {o.name: quantity.evaluate(x) for o, quantity in self.objectives}
 
     def impulse(self, x: Array) -> float:
         """To the expected target [N s], for solver variables (n,)."""
-        return float(self.expected.impulse.evaluate(x)[0])
-
-    def _decode_hit(self, x: Array) -> dict[str, Any]:
-        """What plans and strikes say of the contact, for solver variables (n,)."""
-        outputs = self.program.outputs(x)
-        approach = float(outputs["contact"][0, 3])
-        compression, restitution = self.expected.durations(x)
-        scenarios = [
-            PlannedScenario(
-                name=other.scenario.name,
-                impulse=float(other.impulse.evaluate(x)[0]),
-                collision=other.decode(x, outputs, approach),
-            )
-            for other in self.scenarios
-            if other.scenario is not None
-        ]
-        return {
-            "compression": compression,
-            "restitution": restitution,
-            "collision": self.expected.decode(x, outputs, approach),
-            "hand_speed": approach,
-            "impulse": self.impulse(x),
-            "scenarios": tuple(scenarios),
-        }
+        return self.hit.impulse(x)

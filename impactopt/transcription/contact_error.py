@@ -17,10 +17,14 @@ from scipy.sparse.linalg import splu
 
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.blocks import DEPTH_SCALE, RESTITUTING
+from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact import Contact, ContactState, add_coasting
 from impactopt.transcription.finer_contact import carry_contact, same_places
+from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.mesh import Elements, halved
+from impactopt.transcription.phases import switches
 from impactopt.transcription.rows import Index
 from impactopt.transcription.structured import StructuredProgram
 
@@ -52,21 +56,21 @@ class ContactError:
 
 def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
     """The error of the contact of solver variables (n,); None of an impact without duration."""
-    if not isinstance(t.expected, Collision):
+    if not isinstance(t.hit.expected, Collision):
         return None
     again = _Again(t, x)
     try:
         branches, law = again.integrated(x)
     except ArithmeticError:
-        unknown = tuple((np.inf,) * len(phase) for phase in t.elements)
+        unknown = tuple((np.inf,) * len(phase) for phase in t.hit.elements)
         return ContactError(pct=np.inf, coarse=np.inf, of_elements=unknown, missed=False)
     coarse, grown, errors = [], [], []
-    for new, old in zip(again.collisions, t.collisions, strict=True):
+    for new, old in zip(again.hit.collisions, t.hit.collisions, strict=True):
         assert isinstance(new, Collision) and isinstance(old, Collision)
         coarse.append(_off(new, old, branches, x))
         grown.append(_grown(new, old, branches, x))
         errors.append(_off(new, old, law, x))
-    ends = np.cumsum([len(phase) for phase in t.elements])[:-1]
+    ends = np.cumsum([len(phase) for phase in t.hit.elements])[:-1]
     return ContactError(
         pct=max(errors, key=abs),
         coarse=max(coarse, key=abs),
@@ -95,41 +99,28 @@ def refined_elements(error: ContactError | None, elements: Elements, asked: floa
     return None if refined == elements else refined
 
 
-class _Again(ContactProgram):
+class _Again:
     """The contact alone on elements half as long, from a state at contact that is given, for as long."""
 
     def __init__(self, t: ContactProgram, x: Array) -> None:
-        super().__init__(t.problem, t.coordinates, t.functions)
-        self._of, self.elements = t, halved(t.elements)
-
-        def given(e: Affine) -> Affine:
-            return Affine.constant(e.evaluate(x))
-
-        y, y1, y2 = t.contact_state
-        self.contact_state = given(y), given(y1), given(y2)
-        self.contact_T, self.contact_legs = given(t.contact_T), given(t.contact_legs)
-        self.contact_w = given(t.contact_w)
-        self._hit(after=False)
-        self._collision_rows()
+        self._of, b = t.hit, Builder(t.problem, t.coordinates, t.functions)
+        given = ContactState(*(Affine.constant(e.evaluate(x)) for e in t.hit.contact.state))
+        self._builder = b
+        self.hit = Hit(b, Contact(given, *add_coasting(b)), halved(t.hit.elements), after=False)
+        self.hit.add_rows()
         # a plan has no law where contact ends, as force is zero there; here it is what it comes to
-        law = self._first_output("force") + self.parts("force")["law"]
-        outputs = next(b for b in self.blocks if b.name == "force").n_out
-        for k in range(len(self.collisions)):
-            last = (k + 1) * len(self.stages) - 1
-            self.equal("contact law", "end", ["force"], law + last * outputs)
-        n = self.layout.n
+        last = len(self.hit.stages) - 1
+        for k in range(len(self.hit.collisions)):
+            b.equal("contact law", "end", ["force"], self.hit.output(k, last, "law"))
+        n = b.layout.n
         self.program = StructuredProgram(
-            self.layout,
-            self.blocks,
-            self.rows,
+            b.layout,
+            b.blocks,
+            b.rows,
             objective=Affine.zeros(1),
             quadratic=sp.csr_array((n, n)),
             linear=np.zeros(n),
         )
-
-    def _first_output(self, block: str) -> int:
-        names = [b.name for b in self.blocks]
-        return sum(b.count * b.n_out for b in self.blocks[: names.index(block)])
 
     def integrated(self, x: Array) -> tuple[Array, Array]:
         """Variables (n,) of the contact that starts as in those of the plan: with the branches of the law
@@ -139,22 +130,23 @@ class _Again(ContactProgram):
         ------
         ArithmeticError : Newton's method finds none.
         """
-        z, t, program = np.zeros(self.layout.n), self._of, self.program
-        self.u0.write(z, t.u0.read(x))
-        self.feedforward.write(z, t.feedforward.read(x))
-        held = [self.u0.index(0), self.feedforward.index(0)]
-        for new, old in zip(self.collisions, t.collisions, strict=True):
+        program, held = self.program, []
+        z = np.zeros(program.n)
+        for mine, its in zip(self.hit.contact[1:], self._of.contact[1:], strict=True):
+            mine.write(z, its.read(x))
+            held.append(mine.index(0))
+        for new, old in zip(self.hit.collisions, self._of.collisions, strict=True):
             assert isinstance(new, Collision) and isinstance(old, Collision)
             carry_contact(new, old, z, x)
             held += [group.index(0) for group in new.T]
             held += [new.after.index(0)] if new.after.count else []
         free = np.setdiff1d(np.arange(program.n), np.concatenate(held))
-        ends = {*self.problem.target.events, "end of compression", "separation"}
+        ends = {*self._builder.problem.target.events, "end of compression", "separation"}
         equal = program.g_lower == program.g_upper
         rows = np.flatnonzero([e and o.term not in ends for e, o in zip(equal, program.origins, strict=True)])
         self._newton(z, free, rows)
         branches = z.copy()
-        for _ in range(_SWITCHES if self.law_switches else 0):
+        for _ in range(_SWITCHES if switches(self._builder.problem.law) else 0):
             if not self._turned(z):
                 break
             self._newton(z, free, rows)
@@ -177,13 +169,14 @@ class _Again(ContactProgram):
 
     def _turned(self, z: Array) -> bool:
         """Put points on the branch of the law that their rates ask for; whether any was on the other."""
-        block, part = next(b for b in self.blocks if b.name == "force"), self.parts("force")
+        block = next(b for b in self._builder.blocks if b.name == "force")
+        part = self._builder.parts("force")
         of = self.program.outputs(z)["force"]
         depth, rate = DEPTH_SCALE * of[:, part["penetration"][0]], of[:, part["rate"][0]]
         restituting = block.value.inputs[1][: block.count, RESTITUTING] > 0
-        law, n = self.problem.law, len(self.stages)
+        law, n = self._builder.problem.law, len(self.hit.stages)
         wrong = np.zeros(block.count, dtype=bool)
-        for k, collision in enumerate(self.collisions):
+        for k, collision in enumerate(self.hit.collisions):
             assert isinstance(collision, Collision)
             mine = slice(k * n, (k + 1) * n)
             force = collision.f.read(z)[:, 0]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from impactopt.kinematics.statics import static_wrenches
+from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.plan import complete_reference
 from impactopt.transcription.rows import Place
-
-if TYPE_CHECKING:
-    from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.way import Way
 
 
 class TorqueCourse(NamedTuple):
@@ -29,22 +28,26 @@ class TorqueCourse(NamedTuple):
     place_at: Callable[[float], Place]
 
 
-def torque_courses(t: Transcription) -> list[TorqueCourse]:
-    """Of the swing from its start on, where the torque is given; of follow-through; of the brake if any."""
-    swing, follow = len(t.swing_nodes), len(t.follow_nodes)
-    start = Affine.constant(_start_torque(t))
-    nodes = np.append(0.0, t.swing_nodes)
-    out = [TorqueCourse(nodes, [start, *t.torques[:swing]], t.swing_T[0], t.swing_place)]
-    for k, part in enumerate(t.follows):
-        first = swing + k * follow
-        torques = t.torques[first : first + follow]
-        out.append(TorqueCourse(t.follow_nodes, torques, part.T[0], part.place_at))
+def torque_courses(
+    b: Builder, swing: Way, follows: Sequence[Way], torques: Sequence[Affine]
+) -> list[TorqueCourse]:
+    """Of the swing from its start on, where the torque is given, and of each way to rest.
+
+    torques : over limit, at the nodes of all of these, one way after the other.
+    """
+    start, first = Affine.constant(_start_torque(b)), len(swing.nodes)
+    nodes = np.append(0.0, swing.nodes)
+    out = [TorqueCourse(nodes, [start, *torques[:first]], swing.T[0], swing.place_at)]
+    for way in follows:
+        last = first + len(way.nodes)
+        out.append(TorqueCourse(way.nodes, list(torques[first:last]), way.T[0], way.place_at))
+        first = last
     return out
 
 
-def _start_torque(t: Transcription) -> Array:
+def _start_torque(b: Builder) -> Array:
     """Torque over limit (n,) at rest in the start posture."""
-    c, rest = t.coordinates, np.zeros((1, t.ny))
-    wrench = static_wrenches(c, t.y0, t.legs0)[None]
-    torque = complete_reference(t.problem, t.y0[None], rest, rest, wrench, t.legs0)[3][0]
-    return np.asarray(torque / t.robot.torque_limit)
+    c, rest = b.coordinates, np.zeros((1, b.ny))
+    wrench = static_wrenches(c, b.y0, b.legs0)[None]
+    torque = complete_reference(b.problem, b.y0[None], rest, rest, wrench, b.legs0)[3][0]
+    return np.asarray(torque / b.robot.torque_limit)

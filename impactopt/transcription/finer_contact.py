@@ -16,7 +16,7 @@ def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None
 
     into : solver variables of the new one's program.  x : of the old one's.
     """
-    start = {"u": old.t.u0.read(x), "state": np.zeros((1, old.state.size))}
+    start = {"u": old.contact.u0.read(x), "state": np.zeros((1, old.state.size))}
     start |= {name: np.zeros((1, 1)) for name in ("xt", "p")}
     for name, at_contact in start.items():
         weights = _weights(new.stages, old.stages, anew=name == "xt")

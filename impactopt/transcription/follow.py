@@ -5,90 +5,84 @@ There is one after the expected blow and, where a problem asks for it, one for a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from impactopt.kinematics.splines import CubicSpline
-from impactopt.transcription.layout import Affine, Array, Group
-from impactopt.transcription.mesh import percentage
-from impactopt.transcription.rows import Index, Place
+from impactopt.kinematics.splines import CubicSpline, graded_breaks
+from impactopt.solvers.program import Determined
+from impactopt.transcription.builder import Builder
+from impactopt.transcription.contact import Contact
+from impactopt.transcription.elimination import Turn, determined
+from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.mesh import with_middles
+from impactopt.transcription.rows import Place
+from impactopt.transcription.way import Way, at_node
 
-if TYPE_CHECKING:
-    from impactopt.transcription.transcription import Transcription
 
+class FollowThrough(Way):
+    """A clamped cubic spline to rest; it hands back where it starts.
 
-class FollowThrough:
-    """A clamped cubic spline to rest, with legs and sole wrenches at its nodes.
-
-    name : of its variables; place : what rows and messages call it.
+    more : nodes beside the ends and middles of its intervals.
+    kind : first word of its variables' names; name : what rows and messages call it.
     """
 
-    def __init__(self, t: Transcription, name: str, place: str) -> None:
-        self.t, self.place = t, place
-        p, add = t.problem, t.layout.add
-        nodes = len(t.follow_nodes)
-        self.c = add(f"{name} control point", p.follow.intervals + 1, t.ny, **t.of_y)
-        self.legs = add(f"{name} legs", nodes, t.nl, **t.of_legs)
-        self.w = add(f"{name} sole wrench", nodes, t.nw, **t.of_wrenches)
-        self.T = t.duration(f"{name} duration", p.follow.duration, 0.1)
+    def __init__(
+        self,
+        b: Builder,
+        more: tuple[float, ...] = (),
+        *,
+        kind: str = "follow",
+        name: str = "follow-through",
+    ) -> None:
+        phase = b.problem.follow
+        breaks = graded_breaks(phase.intervals, phase.grading, fine_end=False)
+        super().__init__(name, phase, breaks, np.union1d(with_middles(breaks), more), more)
+        self._add_variables(b, kind, phase.intervals + 1)
 
     def control(self, j: int) -> Affine:
         """Control point j = 0 .. N+2; the last three coincide: it ends at rest."""
         return self.c[min(j, self.c.count - 1)]
 
     @property
-    def start(self) -> tuple[Affine, Affine]:
-        """y and y' at its start."""
-        y, y1, _ = self.t.at(self.control, self.t.follow_breaks, 0.0)
-        return y, y1
+    def start(self) -> tuple[Affine, Affine, Affine]:
+        """y and y' at its start, and the duration [s] that y' is of."""
+        y, y1, _ = self.at(0.0)
+        return y, y1, self.T[0]
 
-    def determined(self) -> Index:
-        """Control points that the state at its start determines: position and rate."""
-        return np.concatenate([self.c.index(0), self.c.index(1)])
+    def determined(self) -> list[Determined]:
+        """And the control points that the state at its start determines: position and rate."""
+        first = np.concatenate([self.c.index(0), self.c.index(1)])
+        return [*super().determined(), determined(Turn.AFTER, first)]
 
-    def place_at(self, s: float) -> Place:
-        name = f"{self.place}, {percentage(s, self.t.nodes.follow)}"
-        return Place(name, f"{self.place} at {{s}}", self.T[0] * s)
-
-    def nodes(self) -> tuple[list[list[Affine]], list[Place]]:
-        """Slots of the block ``node`` and the places of its instances."""
-        instances, places = [], []
-        for k, at in enumerate(self.t.follow_nodes):
-            y, y1, y2 = self.t.at(self.control, self.t.follow_breaks, at)
-            instances.append([y, y1, y2, self.legs[k], self.w[k], self.T[0]])
-            places.append(self.place_at(at))
-        return instances, places
-
-    def spots(self) -> list[tuple[Place, list[Affine]]]:
-        """Places of its nodes with coordinates and legs."""
-        instances, places = self.nodes()
-        return [(place, [slots[0], slots[3]]) for place, slots in zip(places, instances, strict=True)]
-
-    def coasting_node(self, wrench: Group) -> tuple[list[Affine], Place]:
-        """Slots of the block ``node`` where coasting ends and this begins: without acceleration, under a sole
-        wrench of its own; and its place. Until then a robot that has hit nothing still coasts."""
-        y, y1 = self.start
-        slots = [y, y1, Affine.zeros(self.t.ny), self.legs[0], wrench[0], self.T[0]]
-        return slots, Place.plain("end of coasting, if nothing is hit")
-
-    def add_rate_rows(self) -> None:
-        # the last two velocity control points are zero by construction
-        t = self.t
-        t.rate_rows(self.place, self.control, range(t.problem.follow.intervals), t.follow_breaks, self.T)
-
-    def decode(self, x: Array) -> tuple[CubicSpline, Array]:
-        """The spline, and the sole wrenches at the nodes (k, 6 a sole)."""
-        t = self.t
-        return t.spline(x, self.control, t.follow_breaks, self.T), self.w.read(x)
+    def add_rate_rows(self, b: Builder) -> None:
+        """Velocities within their limit; the last two control points of them are zero by construction."""
+        self._add_rate_rows(b, range(self.phase.intervals))
 
     def guess(self, x: Array, curve: CubicSpline, end: Array) -> None:
         """Write a spline that ends at ``end`` (ny,), and its duration."""
         self.c.write(x, np.vstack([curve.control[: self.c.count - 1], end]))
         self.T.write(x, curve.duration)
 
-    def link_from_coasting(self, after: float) -> list[list[Affine]]:
-        """Slots of the block ``link``: it starts where coasting for ``after`` [s] from contact ends."""
-        u0 = self.t.u0[0]
-        times = Affine.constant(after), Affine.zeros(1)
-        return self.t.link_slots((*self.start, self.T[0]), times, (u0, u0), u0)
+
+class Brake(FollowThrough):
+    """The way to rest of a robot that has hit nothing, and coasts for ``after`` [s] from contact on until it
+    knows. It has one node more, where coasting ends, under a sole wrench of its own.
+    """
+
+    def __init__(self, b: Builder, more: tuple[float, ...] = (), *, after: float) -> None:
+        super().__init__(b, more, kind="brake", name="brake")
+        self.after = after
+        self.coast_w = b.layout.add("coasting sole wrench", 1, b.nw, **b.limits.of_wrenches)
+
+    def coasting_node(self) -> tuple[list[Affine], Place]:
+        """Slots of the block ``node`` where coasting ends, without acceleration; and its place."""
+        y, y1, T = self.start
+        slots = [y, y1, Affine.zeros(y.size), self.legs[0], self.coast_w[0], T]
+        return slots, Place.plain("end of coasting, if nothing is hit")
+
+    def link(self, contact: Contact) -> list[list[Affine]]:
+        """Slots of the block ``link``: it starts where coasting ends."""
+        u0 = contact.u0[0]
+        return contact.link(self.start, (Affine.constant(self.after), Affine.zeros(1)), (u0, u0), u0)
+
+    def determined(self) -> list[Determined]:
+        return [*super().determined(), *at_node([self.coast_w.index(0)[:6]])]

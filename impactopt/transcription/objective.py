@@ -7,19 +7,18 @@ is there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from impactopt.errors import InputError
 from impactopt.problem.objectives import Objective
+from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, Group, Layout, stack
-
-if TYPE_CHECKING:
-    from impactopt.transcription.at_contact import ContactProgram
-    from impactopt.transcription.transcription import Transcription
+from impactopt.transcription.way import Way
 
 
 @dataclass(frozen=True)
@@ -35,13 +34,13 @@ class Quantity:
         return float(self.affine.evaluate(x)[0]) + squared
 
 
-def quantities(t: ContactProgram, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
-    """Objectives with their quantities; adds what they need to the program."""
-    return [(o, _quantity(t, o)) for o in objectives]
+def quantities(program: Any, objectives: tuple[Objective, ...]) -> list[tuple[Objective, Quantity]]:
+    """Objectives with their quantities; adds what they need to the program, which they get to see whole."""
+    return [(o, _quantity(program, o)) for o in objectives]
 
 
-def _quantity(t: ContactProgram, objective: Objective) -> Quantity:
-    found = objective.quantity(t)
+def _quantity(program: Any, objective: Objective) -> Quantity:
+    found = objective.quantity(program)
     whole = found if isinstance(found, Quantity) else Quantity(found)
     if not isinstance(whole.affine, Affine) or whole.affine.size != 1:
         raise InputError(
@@ -74,38 +73,36 @@ def assemble(
     return objective, prices.quadratic + sp.diags_array(diagonal), prices.linear
 
 
-def wrench_prices(t: ContactProgram, groups: list[tuple[Group, int]]) -> Array:
+def wrench_prices(b: Builder, groups: list[tuple[Group, int]]) -> Array:
     """Diagonal (n,) of the price of sole wrenches: the mean of so many nodes as each group comes with."""
-    diagonal = np.zeros(t.layout.n)
+    diagonal = np.zeros(b.layout.n)
     for group, nodes in groups:
         span = slice(group.offset, group.offset + group.count * group.size)
-        diagonal[span] = t.problem.wrench_price / max(1, nodes)
+        diagonal[span] = b.problem.wrench_price / max(1, nodes)
     return diagonal
 
 
-def motion_prices(t: Transcription) -> Prices:
-    """Of accelerations, of sole wrenches and of ending away from the start posture."""
-    p, n = t.problem, t.layout.n
+def motion_prices(b: Builder, ways: Sequence[Way], to_rest: Sequence[Way], wrenches: list[Group]) -> Prices:
+    """Of the accelerations of ways, of sole wrenches, and of ending away from the start posture.
+
+    to_rest : those of the ways that end at rest.  wrenches : the means of these groups.
+    """
+    p, n = b.problem, b.layout.n
     linear, diagonal, constant = np.zeros(n), np.zeros(n), 0.0
     accelerations: list[Affine] = []
-    for control, breaks, nodes, bounds in (
-        (t.swing_control, t.swing_breaks, t.swing_nodes, p.swing.duration),
-        *((f.control, t.follow_breaks, t.follow_nodes, p.follow.duration) for f in t.follows),
-    ):
-        typical = float(np.mean(bounds))
-        lengths = np.gradient(nodes)
-        for at, length in zip(nodes, lengths, strict=True):
+    for way in ways:
+        typical = float(np.mean(way.phase.duration))
+        for s, length in zip(way.nodes, np.gradient(way.nodes), strict=True):
             weight = p.smoothness * typical * length
-            accelerations.append(t.at(control, breaks, at)[2] * (np.sqrt(2 * weight) / typical**2))
+            accelerations.append(way.at(s)[2] * (np.sqrt(2 * weight) / typical**2))
     weighted = stack(accelerations)
     m = weighted.matrix(n)
     linear += m.T @ weighted.const
     constant += float(weighted.const @ weighted.const) / 2
-    groups = (t.swing_w, t.coast_w, *[part.w for part in (*t.follows, *t.collisions)])
-    diagonal += wrench_prices(t, [(group, group.count) for group in groups])
-    for follow in t.follows:  # price (y_end - y_start)^2: rest near the start posture
-        end = follow.c.index(-1)
+    diagonal += wrench_prices(b, [(group, group.count) for group in wrenches])
+    for way in to_rest:  # price (y_end - y_start)^2: rest near the start posture
+        end = way.c.index(-1)
         diagonal[end] += 2 * p.return_price
-        linear[end] -= 2 * p.return_price * t.y0
-        constant += p.return_price * float(t.y0 @ t.y0)
+        linear[end] -= 2 * p.return_price * b.y0
+        constant += p.return_price * float(b.y0 @ b.y0)
     return Prices(m.T @ m + sp.diags_array(diagonal), linear, constant)

@@ -49,7 +49,7 @@ class Rattle:
 
 def rattle(t: ContactProgram, x: Array) -> Rattle | None:
     """Of the expected target of solver variables (n,); None where nothing parts, or may."""
-    hit, c, p = t.expected, t.coordinates, t.problem
+    hit, c, p = t.hit.expected, t.coordinates, t.problem
     if not isinstance(hit, Collision) or not hit.holds:
         return None
     y, legs, rates = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x), t.u0.read(x)[0]

@@ -19,7 +19,6 @@ __all__ = [
     "Index",
     "Measure",
     "Place",
-    "Rank",
     "Row",
     "Rows",
     "along",
@@ -31,7 +30,6 @@ __all__ = [
 ]
 
 Index = NDArray[np.intp]
-Rank = tuple[int, int]  # of variables that rows determine: those of lower rank are eliminated first
 
 
 def by_leg(joints: Index) -> list[Index]:

@@ -62,9 +62,10 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     rng = np.random.default_rng(seed)
     y, legs = c.split(p.contact_posture)
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
-    y = np.clip(y, t.y_lower, t.y_upper)
+    limits = t.builder.limits
+    y = np.clip(y, limits.y_lower, limits.y_upper)
     rates = strike_rates(c, p.striker, y, legs, speed * p.normal)
-    return Contact(y, rates * _within(rates[c.base :], 0.8 * t.rate_limit[c.independent]), legs)
+    return Contact(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 
 
 def _within(rates: Array, limit: Array) -> float:
@@ -75,15 +76,15 @@ def _within(rates: Array, limit: Array) -> float:
 def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Array:
     """Solver variables (n,) of a plain reach; speed, noise, seed: as of :func:`reached`."""
     hit = reached(t, speed=speed, noise=noise, seed=seed)
-    zero, (swing_T, follow_T) = np.zeros(t.ny), _durations(t)
-    swing = quintic(t.y0, zero, hit.y, hit.rates, swing_T, t.swing_breaks)
-    back = quintic(hit.y, 0.5 * hit.rates, t.y0, zero, follow_T, t.follow_breaks)
+    zero, (swing_T, follow_T) = np.zeros(len(t.y0)), _durations(t)
+    swing = quintic(t.y0, zero, hit.y, hit.rates, swing_T, t.swing.breaks)
+    back = quintic(hit.y, 0.5 * hit.rates, t.y0, zero, follow_T, t.follow.breaks)
     x = _motion(
         t,
-        CubicSpline.fit(swing, t.swing_breaks, zero, hit.rates, swing_T),
-        CubicSpline.fit(back, t.follow_breaks, 0.5 * hit.rates, zero, follow_T),
+        CubicSpline.fit(swing, t.swing.breaks, zero, hit.rates, swing_T),
+        CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T),
     )
-    _write_hit(t, x, hit)
+    t.hit.guess(x, hit.y, hit.rates, hit.legs)
     return _finished(t, x)
 
 
@@ -96,7 +97,7 @@ def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float =
     t.y.write(x, hit.y)
     t.legs.write(x, hit.legs)
     t.w.write(x, static_wrenches(t.coordinates, hit.y, hit.legs))
-    _write_hit(t, x, hit)
+    t.hit.guess(x, hit.y, hit.rates, hit.legs)
     return _finished(t, x)
 
 
@@ -110,8 +111,8 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
     swing_T, follow_T = _durations(t)
     out = _motion(
         t,
-        _least_accelerations(t, t.swing_breaks, swing_T, t.y0, y, end_rates=u),
-        _least_accelerations(t, t.follow_breaks, follow_T, after, t.y0, rates=rates),
+        _least_accelerations(t, t.swing.breaks, swing_T, t.y0, y, end_rates=u),
+        _least_accelerations(t, t.follow.breaks, follow_T, after, t.y0, rates=rates),
     )
     for name, group in strike.layout.groups.items():
         mine = t.layout.groups.get(name)
@@ -126,7 +127,7 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
     What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
     multipliers are those of the same rows and variables.
     """
-    stages = same_places(t.stages, old.stages)
+    stages = same_places(t.hit.stages, old.hit.stages)
     places = {"swing": (old.swing_nodes, t.swing_nodes)}
     places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
@@ -142,14 +143,14 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
             before, now = places[name.split()[0]]
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
             group.write(new, np.column_stack([np.interp(now, before, column) for column in known.read(x).T]))
-        elif known.count == len(old.stages) and known.count != group.count:
+        elif known.count == len(old.hit.stages) and known.count != group.count:
             pairs = stages
         else:
             group.write(new, known.read(x))
         for i, k in pairs:
             bounds[group.index(i)] = z[known.index(k)]
-    for mine, its in zip(t.collisions, old.collisions, strict=True):
-        if t.elements != old.elements and isinstance(mine, Collision) and isinstance(its, Collision):
+    for mine, its in zip(t.hit.collisions, old.hit.collisions, strict=True):
+        if t.hit.elements != old.hit.elements and isinstance(mine, Collision) and isinstance(its, Collision):
             carry_contact(mine, its, new, x)
     of_rows = dict(zip(_keys(old), y, strict=True))
     rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
@@ -177,12 +178,6 @@ def _keys(t: Transcription) -> Iterator[tuple[str, str, str, int]]:
         yield *name, seen[name]
 
 
-def _write_hit(t: ContactProgram, x: Array, hit: Contact) -> None:
-    t.u0.write(x, hit.rates)
-    for collision in t.collisions:
-        collision.guess(x, hit.y, hit.rates, hit.legs)
-
-
 def _finished(t: ContactProgram, x: Array) -> Array:
     return np.clip(t.with_lifted(x), t.layout.lower, t.layout.upper)
 
@@ -195,25 +190,26 @@ def _durations(t: Transcription) -> tuple[float, float]:
 def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
     """A swing and a follow-through, with legs and sole wrenches as at rest."""
     c, x = t.coordinates, np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper)
-    t.swing_c.write(x, curve.control[3:-1])
+    limits = t.builder.limits
+    t.swing.c.write(x, curve.control[3:-1])
     for follow in t.follows:
         follow.guess(x, back, t.y0)
     for group, wrench, spline, nodes in (
-        (t.swing_legs, t.swing_w, curve, t.swing_nodes),
-        *((follow.legs, follow.w, back, t.follow_nodes) for follow in t.follows),
+        (t.swing.legs, t.swing.w, curve, t.swing.nodes),
+        *((follow.legs, follow.w, back, follow.nodes) for follow in t.follows),
     ):
         legs, all_legs, all_w = t.legs0, [], []
         for y in spline.sample(nodes * spline.duration)[0]:
             with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
                 legs = c.solve_legs(y, legs)
-            all_legs.append(np.clip(legs, t.legs_lower, t.legs_upper))
+            all_legs.append(np.clip(legs, limits.legs_lower, limits.legs_upper))
             all_w.append(static_wrenches(c, y, legs))
         if c.legs:
             group.write(x, np.array(all_legs))
             wrench.write(x, np.array(all_w))
     if t.brake is not None and c.legs:
-        t.coast_w.write(x, t.swing_w.read(x)[-1:])
-    t.swing_T.write(x, curve.duration)
+        t.brake.coast_w.write(x, t.swing.w.read(x)[-1:])
+    t.swing.T.write(x, curve.duration)
     return x
 
 
@@ -235,9 +231,10 @@ def _least_accelerations(
     factors, count = rate_weights(breaks), len(breaks) + 2
     nodes = with_middles(breaks)
     accelerations = basis(breaks, nodes)[2] * np.sqrt(np.gradient(nodes))[:, None]
-    limit = np.concatenate([np.full(t.coordinates.base, np.inf), t.rate_limit[t.coordinates.independent]])
-    control = np.zeros((count, t.ny))
-    for k in range(t.ny):
+    c, limits = t.coordinates, t.builder.limits
+    limit = np.concatenate([np.full(c.base, np.inf), limits.rate_limit[c.independent]])
+    control = np.zeros((count, c.ny))
+    for k in range(c.ny):
         fastest = np.inf
         for slower in (1.0, 0.8, 0.6, 0.4, 0.2):
             way = slower * duration
@@ -253,7 +250,7 @@ def _least_accelerations(
             points[-2] = points[-1] - u1 / factors[-1]
             points[-3] = points[-2] - u1 / factors[-2]
             free = np.setdiff1d(np.arange(count), held)
-            bounds = t.y_lower[k] - 1e-9, t.y_upper[k] + 1e-9
+            bounds = limits.y_lower[k] - 1e-9, limits.y_upper[k] + 1e-9
             found = lsq_linear(accelerations[:, free], -accelerations @ points, bounds)
             points[free] = found.x
             fast = float(np.abs(factors * np.diff(points)).max()) / duration

@@ -13,13 +13,21 @@ import scipy.sparse as sp
 
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Determined
 from impactopt.transcription.at_contact import BodyState, ContactProgram
+from impactopt.transcription.balance import add_balance
+from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact import Contact, ContactState, add_coasting
+from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, wrench_prices
 from impactopt.transcription.plan import total_ground_wrench
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.rows import Index, Measure, Place, along, by_leg
+from impactopt.transcription.rows import Measure, Place, along, by_leg
+from impactopt.transcription.touch import add_touch_rows
+from impactopt.transcription.way import at_node
 
 
 class StrikeTranscription(ContactProgram):
@@ -31,42 +39,45 @@ class StrikeTranscription(ContactProgram):
     def __init__(
         self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
     ) -> None:
-        super().__init__(problem, coordinates, functions)
-        add, c = self.layout.add, coordinates
-        self.y = add("posture at contact", 1, self.ny, **self.of_y)
-        self.legs = add("legs at contact", 1, self.nl, **self.of_legs)
-        self.w = add("sole wrench at contact", 1, self.nw, **self.of_wrenches)
-        fastest = np.full(self.ny, np.inf)
-        fastest[c.base :] = self.rate_limit[c.independent]
-        self._hit(after=True, rates={"lower": -fastest, "upper": fastest})
-        self.contact_state = self.y[0], self.u0[0], Affine.zeros(self.ny)
-        self.contact_T = Affine.constant(1.0)
-        self.contact_legs, self.contact_w = self.legs[0], self.w[0]
-        node = [*self.contact_state, self.contact_legs, self.contact_w, self.contact_T]
-        (torque,) = self.add_nodes([node], ["contact"])
-        self._feedforward_rows(torque)
-        self._contact_rows()
-        self._collision_rows()
-        self._after(fastest)
+        b, c = Builder(problem, coordinates, functions), coordinates
+        add, limits = b.layout.add, b.limits
+        self.y = add("posture at contact", 1, b.ny, **limits.of_y)
+        self.legs = add("legs at contact", 1, b.nl, **limits.of_legs)
+        self.w = add("sole wrench at contact", 1, b.nw, **limits.of_wrenches)
+        fastest = np.full(b.ny, np.inf)
+        fastest[c.base :] = limits.rate_limit[c.independent]
+        coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
+        still, one = Affine.zeros(b.ny), Affine.constant(1.0)
+        state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])
+        super().__init__(b, Hit(b, Contact(state, *coasting), after=True))
+        node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
+        (torque,) = add_nodes(b, [node], ["contact"])
+        self.hit.add_feedforward_rows(torque)
+        add_touch_rows(b, state)
+        self.hit.add_rows()
+        self._add_after(fastest)
+        if c.legs:
+            left = self.expected.state_after
+            self.angular_momentum = add_balance(b, state, left, self.hit.scenarios)
         self._finish(
             tuple(term for term in problem.terms if not term.whole_motion),
             tuple(o for o in problem.objectives if not o.whole_motion),
         )
 
-    def _nodes(self) -> list[list[Index]]:
-        return [[*by_leg(self.legs.index(0)), self.w.index(0)[:6]]]
+    def _determined(self) -> list[Determined]:
+        return [*at_node([*by_leg(self.legs.index(0)), self.w.index(0)[:6]]), *self.hit.determined()]
 
-    def _after(self, fastest: Array) -> None:
+    def _add_after(self, fastest: Array) -> None:
         """The state that each target leaves behind is one to go on from."""
-        labels, far = self.coordinates.labels, along(self.coordinates.labels, "off")
-        hits = [hit for hit in self.collisions if isinstance(hit, Collision)]
+        b, labels, far = self.builder, self.coordinates.labels, along(self.coordinates.labels, "off")
+        hits = [hit for hit in self.hit.collisions if isinstance(hit, Collision)]
         if hits:
-            at = self.add_block("link", [slots for hit in hits for slots in hit.link_after()], np.zeros(0))
+            at = b.add_block("link", [slots for hit in hits for slots in hit.link_after()], np.zeros(0))
             for k, hit in enumerate(hits):
-                outputs = at + 3 * (k * self.ny + np.arange(self.ny)) + 1
-                self.equal("state after contact", f"position{hit.suffix}", labels, outputs, far)
-        self.rows.add(
-            term=self.velocity.name,
+                outputs = at + 3 * (k * b.ny + np.arange(b.ny)) + 1
+                b.equal("state after contact", f"position{hit.suffix}", labels, outputs, far)
+        b.rows.add(
+            term=b.limits.velocity.name,
             place="after contact",
             components=labels,
             affine=self.expected.state_after[1],
@@ -74,8 +85,6 @@ class StrikeTranscription(ContactProgram):
             upper=fastest,
             measure=Measure("rad/s", 1.0, "too fast"),
         )
-        if self.coordinates.legs:
-            self._balance_rows(self.expected.state_after)
 
     def _prices(self) -> Prices:
         """Of sole wrenches, and of the least accelerations that lead to the state at contact from rest.
@@ -89,9 +98,11 @@ class StrikeTranscription(ContactProgram):
         way, both, rate = (2 * p.smoothness * k for k in (12 / T**3, -6 / T**2, 4 / T))
         diagonal[y], diagonal[u] = way, rate
         linear[y], linear[u] = -way * self.y0, -both * self.y0
-        mixed = sp.csr_array((np.full(self.ny, both), (y, u)), shape=(n, n))
+        mixed = sp.csr_array((np.full(len(y), both), (y, u)), shape=(n, n))
         of_swing = (self.w, 2 * p.swing.intervals)  # one of its nodes
-        diagonal += wrench_prices(self, [of_swing, *[(hit.w, hit.w.count) for hit in self.collisions]])
+        diagonal += wrench_prices(
+            self.builder, [of_swing, *[(hit.w, hit.w.count) for hit in self.hit.collisions]]
+        )
         quadratic = sp.diags_array(diagonal) + mixed + mixed.T
         return Prices(quadratic, linear, way / 2 * float(self.y0 @ self.y0))
 
@@ -118,7 +129,7 @@ class StrikeTranscription(ContactProgram):
     # ------------------------------------------------------------------ solution
     def decode(self, x: Array) -> PlannedStrike:
         """The strike that solver variables (n,) stand for."""
-        c, still = self.coordinates, np.zeros(self.ny)
+        c, still = self.coordinates, np.zeros(len(self.y0))
         before = self.y[0], self.u0[0], self.contact_legs
         states = [[e.evaluate(x) for e in state] for state in (before, self.expected.state_after[:3])]
         (q, v), (q_after, v_after) = (
@@ -132,5 +143,5 @@ class StrikeTranscription(ContactProgram):
             velocity_after=v_after,
             torque=self.feedforward.read(x)[0] * self.robot.torque_limit,
             ground=total_ground_wrench(c, self.w.read(x))[0],
-            **self._decode_hit(x),
+            **self.hit.decode(x, self.program.outputs(x)),
         )

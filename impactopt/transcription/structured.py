@@ -15,10 +15,11 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
 from impactopt.transcription.layout import Affine, Array, Layout, stack
 from impactopt.transcription.maps import HessianMap, JacobianMap
-from impactopt.transcription.rows import Index, Rank, Rows
+from impactopt.transcription.rows import Rows
 
 
 class StructuredProgram:
@@ -33,11 +34,11 @@ class StructuredProgram:
         objective: Affine,
         quadratic: sp.spmatrix | sp.sparray,
         linear: Array,
-        determined: Sequence[tuple[Rank, Index]] = (),
+        determined: Sequence[Determined] = (),
     ) -> None:
         """Minimize  objective(x) + 1/2 x'Qx + q'x  subject to ``rows`` and the layout's bounds.
 
-        determined : variables that equality rows of their own determine, with their rank in eliminating them.
+        determined : variables that equality rows of their own determine.
         """
         self.determined = tuple(determined)
         self.layout, self.blocks, self.origins = layout, tuple(blocks), tuple(rows.origins)

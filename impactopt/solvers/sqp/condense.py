@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from impactopt.solvers.program import Matrix, Vector
+from impactopt.solvers.program import Determined, Matrix, Vector
 from impactopt.solvers.sqp.kernels import Index, Kernels
 from impactopt.solvers.sqp.patterns import (
     Elimination,
@@ -33,13 +32,6 @@ from impactopt.solvers.sqp.patterns import (
 )
 
 Mask = npt.NDArray[np.bool_]
-
-
-class Determined(NamedTuple):
-    """Variables that equality rows of their own determine; those of lower rank are eliminated first."""
-
-    rank: tuple[int, ...]
-    variables: Index
 
 
 def find_eliminations(jacobian: Matrix, equal: Mask, determined: Sequence[Determined]) -> list[Elimination]:

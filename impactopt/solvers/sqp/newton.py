@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from impactopt.solvers.program import Matrix, Vector
+from impactopt.solvers.program import Determined, Matrix, Vector
 from impactopt.solvers.sqp.cholesky import BlockCholesky
 from impactopt.solvers.sqp.compiled import kernels as fastest
-from impactopt.solvers.sqp.condense import Condenser, Determined, Mask, find_eliminations
+from impactopt.solvers.sqp.condense import Condenser, Mask, find_eliminations
 from impactopt.solvers.sqp.kernels import Index, Kernels, Products
 
 _KEPT = 3  # structures

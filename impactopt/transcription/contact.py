@@ -1,0 +1,68 @@
+"""What all collisions of a program start from: the state at contact, and what the robot goes on with."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from impactopt.transcription.builder import Builder
+from impactopt.transcription.layout import Affine, Group
+
+
+class ContactState(NamedTuple):
+    """The state at contact, as a swing or a posture hands it over.
+
+    y, y1, y2 : coordinates, y' and y''.  T : the duration [s] of the phase that they are of: ydot = y'/T.
+    legs, w : legs and sole wrenches.
+    """
+
+    y: Affine
+    y1: Affine
+    y2: Affine
+    T: Affine
+    legs: Affine
+    w: Affine
+
+
+class Coasting(NamedTuple):
+    """What the robot goes on with: the torques over limit of the feed-forward (n), and the rate (ny) ydot."""
+
+    feedforward: Group
+    u0: Group
+
+
+def add_coasting(b: Builder, rates: dict[str, Any] | None = None) -> Coasting:
+    """Its variables.  rates : bounds of the rates at contact."""
+    limit, names = b.limits.torque.fraction, b.robot.joint_names
+    return Coasting(
+        b.layout.add("feed-forward at contact", 1, b.robot.n, lower=-limit, upper=limit, labels=names),
+        b.layout.add("rate at contact", 1, b.ny, labels=b.coordinates.labels, **(rates or {})),
+    )
+
+
+class Contact(NamedTuple):
+    """State at contact and what coasts from there."""
+
+    state: ContactState
+    feedforward: Group
+    u0: Group
+
+    def link(
+        self,
+        start: tuple[Affine, Affine, Affine],
+        times: tuple[Affine, Affine],
+        travel: tuple[Affine, Affine],
+        rate: Affine,
+    ) -> list[list[Affine]]:
+        """Slots of the block ``link``, coordinate by coordinate: from the state at contact to a later start.
+
+        start : y and d y/ds of what starts, and its duration [s].  times [s], travel : of two phases between,
+        whose ways are time x travel.  rate : ydot after them.
+        """
+        y, y1, *_ = self.state
+        out = []
+        for k in range(self.u0.size):
+            yk, rk, a, b, one, two, u0, u = (
+                e[k : k + 1] for e in (*start[:2], y, y1, *travel, self.u0[0], rate)
+            )
+            out.append([yk, rk, start[2], a, b, self.state.T, *times, one, two, u0, u])
+        return out

@@ -1,0 +1,150 @@
+"""The contact with all targets that a problem speaks of: the expected one, and one for each scenario."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from impactopt.solvers.program import Determined
+from impactopt.transcription.builder import Builder
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact import Contact
+from impactopt.transcription.elimination import Turn, determined
+from impactopt.transcription.guess import effective_mass
+from impactopt.transcription.impulse import InstantImpact
+from impactopt.transcription.layout import Array
+from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh
+from impactopt.transcription.plan import PlannedScenario
+from impactopt.transcription.rows import Index, percent
+
+
+class Hit:
+    """Takes what all collisions start from; hands them back.
+
+    elements : lengths of each phase's; none: those that the problem asks for.
+    after : whether the position after the expected target is among the variables.
+
+    Attributes
+    ----------
+    contact : what all collisions start from.
+    expected, scenarios : the collisions; all of them, the expected one first, are `collisions`.
+    elements, stages : of every collision's phases, and their collocation points.
+    guarded : the elements are given, and finer, because a plan was wrong on others: it may have pulled within
+        a phase.
+    """
+
+    def __init__(self, b: Builder, contact: Contact, elements: Elements = (), *, after: bool) -> None:
+        p, self._b, self.contact = b.problem, b, contact
+        self.guarded = bool(elements)
+        self.elements = elements or contact_elements(p)
+        self.stages = contact_mesh(p, self.elements)
+        self.scenarios: list[Collision] = []
+        self.expected: Collision | InstantImpact
+        if p.collision == "dynamics":
+            hit = [s for s in p.scenarios if not s.missing]
+            common: dict[str, Any] = {"mass": self.mass, "guarded": self.guarded}
+            labels = {"labels": b.coordinates.labels}
+            self.scenarios = [
+                Collision(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
+                for k, s in enumerate(hit, start=1)
+            ]
+            own = b.limits.of_y if after else None
+            self.expected = Collision(b, contact, self.stages, number=0, after=own, **common)
+        else:
+            self.expected = InstantImpact(b, contact)
+        self.collisions = [self.expected, *self.scenarios]
+
+    @cached_property
+    def mass(self) -> float:
+        """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+        c, p = self._b.coordinates, self._b.problem
+        y, legs = c.split(p.contact_posture)
+        return effective_mass(c, p.striker, p.normal, y, legs, np.zeros(c.ny))[0]
+
+    # ------------------------------------------------------------------ rows
+    def add_feedforward_rows(self, torque: Index) -> None:
+        """The feed-forward is the torque at the node at contact, whose outputs are given."""
+        self._b.rows.add(
+            term="feed-forward that makes the robot coast",
+            place="contact",
+            components=self._b.robot.joint_names,
+            outputs=torque,
+            affine=-self.contact.feedforward[0],
+            lower=0,
+            upper=0,
+            measure=percent("of the joint's limit off"),
+        )
+
+    def add_rows(self) -> None:
+        """One block for all collisions, each with its rows."""
+        b = self._b
+        slots: dict[str, list[Any]] = {}
+        parameters: dict[str, list[Any]] = {}
+        first: list[dict[str, int]] = []
+        for collision in self.collisions:
+            found = collision.instances()
+            first.append({name: len(slots.get(name, ())) for name in found})
+            for name, (instances, numbers) in found.items():
+                slots.setdefault(name, []).extend(instances)
+                parameters.setdefault(name, []).extend(numbers)
+        self._at = {name: b.add_block(name, slots[name], np.array(parameters[name])) for name in slots}
+        sizes = {block.name: block.n_out for block in b.blocks}
+        for collision, index in zip(self.collisions, first, strict=True):
+            collision.add_rows(
+                {name: (self._at[name] + k * sizes[name], sizes[name]) for name, k in index.items()}
+            )
+
+    def output(self, collision: int, stage: int, part: str) -> Index:
+        """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
+
+        Once rows are there, and of collisions that last.
+        """
+        size = next(block.n_out for block in self._b.blocks if block.name == "force")
+        at = self._at["force"] + (collision * len(self.stages) + stage) * size
+        return np.asarray(at + self._b.parts("force")[part])
+
+    @property
+    def deepest(self) -> Index:
+        """Number of the output that is the penetration at the end of the expected target's compression."""
+        assert isinstance(self.expected, Collision)
+        return self.output(0, self.expected.end[-2], "penetration")
+
+    def determined(self) -> list[Determined]:
+        """Of all collisions, and the feed-forward."""
+        own = determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))
+        return [*(each for c in self.collisions for each in c.determined()), own]
+
+    # ------------------------------------------------------------------ numbers
+    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """Write what a contact starts from with these coordinates and rates (ny,) and legs (nl,)."""
+        self.contact.u0.write(x, rates)
+        for collision in self.collisions:
+            collision.guess(x, y, rates, legs)
+
+    def impulse(self, x: Array) -> float:
+        """To the expected target [N s], for solver variables (n,)."""
+        return float(self.expected.impulse.evaluate(x)[0])
+
+    def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
+        """What plans and strikes say of the contact, for solver variables (n,) and the blocks' outputs."""
+        approach = float(outputs["contact"][0, 3])
+        compression, restitution = self.expected.durations(x)
+        scenarios = [
+            PlannedScenario(
+                name=other.scenario.name,
+                impulse=float(other.impulse.evaluate(x)[0]),
+                collision=other.decode(x, outputs, approach),
+            )
+            for other in self.scenarios
+            if other.scenario is not None
+        ]
+        return {
+            "compression": compression,
+            "restitution": restitution,
+            "collision": self.expected.decode(x, outputs, approach),
+            "hand_speed": approach,
+            "impulse": self.impulse(x),
+            "scenarios": tuple(scenarios),
+        }

@@ -1,0 +1,36 @@
+"""Phases of a contact: how short they may be, and what of a law needs rows of its own."""
+
+from __future__ import annotations
+
+from impactopt.contact.laws import ContactLaw
+from impactopt.problem.problem import ImpactProblem
+
+# of the shortest compression that each of the two may last which an event makes of it, and the first of them
+# where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
+SHARE, AT_ONCE = 0.1, 0.05
+OF_NATURAL, LEAST = (
+    0.15,
+    2e-3,
+)  # of a phase without a shortest time: share of the natural one, and [s] at most
+
+
+def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
+    """How long [s] each phase of the contact lasts at least; ``natural``: its last one, of a point mass."""
+    target, shortest = problem.target, problem.contact_duration[0]
+    if not shortest:  # no bound: far below what a blow takes, as rows are over these times
+        shortest = min(OF_NATURAL * natural, LEAST)
+    shares = [SHARE if target.events else 1.0] * (len(target.phases) - 1) + [1.0]
+    if target.at_once:
+        shares[0] = AT_ONCE
+    return [share * shortest for share in shares]
+
+
+def switches(law: ContactLaw) -> bool:
+    """Whether compression and restitution are branches of their own."""
+    compression, restitution, _ = law.formula()
+    return bool(compression != restitution)
+
+
+def pulls_apart(law: ContactLaw) -> bool:
+    """Whether it would pull at bodies that part fast."""
+    return float(law.branch(1e-6, -10.0, False)) < 0

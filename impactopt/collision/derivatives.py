@@ -28,6 +28,7 @@ from impactopt.collision.native.sizes import directions, shapes_out
 from impactopt.collision.native.source import least_size
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.stepped import SteppedModel
+from impactopt.errors import InputError
 from impactopt.rigid_body import RigidBody
 
 __all__ = ["differentiable"]
@@ -39,8 +40,8 @@ Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
 # differences themselves are longer, as what is left in them is divided by it once more
 _SECOND = {"collision_gradient": 1e-4, "collision_jacobian": 1e-4, "collision_differences": 1e-3}
 _TANGENTS = ("q", "v", "feedforward")
-# of the steps whose tangents are taken: those of 1e-7 are off by some 1e-6
-_OF_TANGENTS = 1e-9
+# of the steps whose tangents are taken: those of 1e-7 are off by up to 4e-6
+_OF_TANGENTS = 3e-9
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,12 @@ class _Part:
 
 
 def differentiable(
-    model: SteppedModel, whole: Any, parameters: tuple[str, ...], every: int, compiled: Compile
+    model: SteppedModel,
+    whole: Any,
+    parameters: tuple[str, ...],
+    by: tuple[str, ...] | None,
+    every: int,
+    compiled: Compile,
 ) -> Any:
     """ca.Function of q, v[, feedforward] and the settings in `parameters`, with derivatives.
 
@@ -61,22 +67,26 @@ def differentiable(
     ----------
     model : of the collision.
     whole : its compiled function, with all settings as inputs.
+    by : inputs that derivatives are by; None: all.
     every : keep every so many steps of the histories.
     compiled : (name, what, build) -> the compiled function of these, as `SymbolicModel._compiled`.
     """
     outputs = tuple(whole.name_out())
     inputs = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
     kept = {name: x for name, x in inputs.items() if name not in model.settings or name in parameters}
+    moving = tuple(kept) if by is None else by
+    if unknown := [name for name in moving if name not in kept]:
+        raise InputError(f"by {unknown[0]!r}: no input of this function; it has {', '.join(kept)}")
     unit, to_tangent = _configuration(model)
     values = {name: kept.get(name, model.settings.get(name)) for name in inputs}
     values["q"] = inputs["q"] if unit is None else unit(inputs["q"])
 
     blocks: dict[tuple[str, str], Any] = {}
-    for part in _parts(model, outputs, tuple(kept)):
+    for part in _parts(model, outputs, moving):
         function = _late(model, whole, part, every, compiled)
         found = function.call([values[name] / _size(model, name) for name in inputs])
         pairs = product(part.outputs, part.by)
-        blocks |= {pair: block for pair, block in zip(pairs, found, strict=True) if pair[1] in kept}
+        blocks |= {pair: block for pair, block in zip(pairs, found, strict=True) if pair[1] in moving}
     to_q = to_tangent(inputs["q"])
     jacobians: dict[str, Any] = {}
     for output, given in product(outputs, kept):
@@ -90,29 +100,30 @@ def differentiable(
     )
     own = {"custom_jacobian": jacobian, "jac_penalty": 0, "never_inline": True}
     own |= {"enable_forward": False, "enable_reverse": False}
+    own |= {"is_diff_in": [name in moving for name in kept]}
     return ca.Function(
         whole.name(), [*kept.values()], whole.call([*values.values()]), [*kept], [*outputs], own
     )
 
 
-def _parts(model: SteppedModel, outputs: tuple[str, ...], kept: tuple[str, ...]) -> list[_Part]:
-    """What gives which derivatives; of `separated` they are zero."""
+def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> list[_Part]:
+    """What gives which derivatives by these inputs; of `separated` they are zero."""
     outputs = tuple(name for name in outputs if name != "separated")
     refrozen = model.n_freezes > 0
     if not refrozen and len(outputs) == 1 and outputs[0] in SCALARS and outputs[0] != "step_error":
         carried, name, by = outputs, "collision_gradient", ("q", "v")
-        if "feedforward" in kept and model.stepping == "implicit":
+        if "feedforward" in inputs and model.stepping == "implicit":
             name, by = "collision_jacobian", _TANGENTS
     elif not refrozen and model.stepping == "implicit":
         carried = tuple(name for name in outputs if name in (*SCALARS, *HISTORIES))
-        name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in kept)
+        name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in inputs)
     else:
         carried, name, by = (), "", ()
-    rest = tuple(x for x in kept if x not in by)
+    rest = tuple(x for x in inputs if x not in by)
     parts = [
         _Part(name, carried, by),
         _Part("collision_differences", carried, rest),
-        _Part("collision_differences", tuple(x for x in outputs if x not in carried), kept),
+        _Part("collision_differences", tuple(x for x in outputs if x not in carried), inputs),
     ]
     return [part for part in parts if part.outputs and part.by]
 

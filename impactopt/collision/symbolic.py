@@ -50,7 +50,12 @@ class SymbolicModel(SteppedModel):
         return collision_graph(self, tuple(outputs), every=every)
 
     def function(
-        self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = (), every: int = 1
+        self,
+        outputs: tuple[str, ...] = ("impulse",),
+        *,
+        parameters: tuple[str, ...] = (),
+        by: tuple[str, ...] | None = None,
+        every: int = 1,
     ) -> Any:
         """The collision as a compiled ca.Function of what it needs, to the outputs asked for.
 
@@ -70,12 +75,13 @@ class SymbolicModel(SteppedModel):
         outputs : names out of `impactopt.collision.OUTPUTS`, which says what they are; histories have a
             column an instant, and repeat the last one after separation.
         parameters : settings that are inputs.
+        by : inputs that derivatives are by, None: all; by others they are zero, and cost nothing.
         every : keep every so many steps, and the last, of the histories.
         """
         self._check_outputs(outputs, every)
         self._check_parameters(parameters)
         return differentiable(
-            self, self._collision(tuple(outputs), every), parameters, every, self._compiled
+            self, self._collision(tuple(outputs), every), parameters, by, every, self._compiled
         )
 
     def _collision(self, outputs: tuple[str, ...], every: int = 1) -> Any:

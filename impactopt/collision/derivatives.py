@@ -1,14 +1,15 @@
 """The compiled collision as a CasADi function that can be differentiated: by the C that has its derivatives.
 
-CasADi asks an external function for derivatives by names of its own, and before it knows whether they will ever be
-needed. Here they come through a custom Jacobian, whose blocks are compiled when one of them is first evaluated:
+CasADi asks an external function for derivatives by names of its own, and before it knows whether they will
+ever be needed. Here they come through a custom Jacobian, whose blocks are compiled when one of them is first
+evaluated:
 
     `native_gradient`     the adjoint, of a single number by q and v
     `native_jacobian`     tangents, of numbers and histories by q, v and the feed-forward torque
     `native_differences`  differences of collisions with tight steps, of all else
 
-q's blocks are in the basis of v there. The chain rule to Pinocchio's q is T(q) (nv, nq) with v = T dq/dt: of the
-base R' for its position and 2 Im(conj(p) dp) for its quaternion p, ones at the joints. The function itself makes
+q's blocks are in the basis of v there. The chain rule to Pinocchio's q is T(q) (nv, nq) with v = T dq/dt: of
+the base R' for its position and 2 Im(conj(p) dp) for its quaternion p, ones at the joints. The function makes
 quaternions, and cosines and sines, unit ones first, so that it does not change along their lengths.
 """
 
@@ -41,7 +42,7 @@ Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
 _SECOND = {"collision_gradient": 1e-4, "collision_jacobian": 1e-4, "collision_differences": 1e-3}
 _TANGENTS = ("q", "v", "feedforward")
 # of the steps whose tangents are taken: those of 1e-7 are off by up to 4e-6
-_OF_TANGENTS = 3e-9
+_OF_TANGENTS = 1e-9
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,9 @@ def differentiable(
     blocks: dict[tuple[str, str], Any] = {}
     for part in _parts(model, outputs, moving):
         function = _late(model, whole, part, every, compiled)
-        found = function.call([values[name] / _size(model, name) for name in inputs])
+        found = function.call(
+            [ca.rdivide(values[name], ca.DM(size)) for name, size in function.sizes.items()]
+        )
         pairs = product(part.outputs, part.by)
         blocks |= {pair: block for pair, block in zip(pairs, found, strict=True) if pair[1] in moving}
     to_q = to_tangent(inputs["q"])
@@ -109,16 +112,19 @@ def differentiable(
 def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> list[_Part]:
     """What gives which derivatives by these inputs; of `separated` they are zero."""
     outputs = tuple(name for name in outputs if name != "separated")
-    refrozen = model.n_freezes > 0
+    refrozen, name = model.n_freezes > 0, ""
+    carried: tuple[str, ...]
+    by: tuple[str, ...]
     if not refrozen and len(outputs) == 1 and outputs[0] in SCALARS and outputs[0] != "step_error":
-        carried, name, by = outputs, "collision_gradient", ("q", "v")
+        carried, name = outputs, "collision_gradient"
+        by = tuple(x for x in ("q", "v") if x in inputs)
         if "feedforward" in inputs and model.stepping == "implicit":
-            name, by = "collision_jacobian", _TANGENTS
+            name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in inputs)
     elif not refrozen and model.stepping == "implicit":
         carried = tuple(name for name in outputs if name in (*SCALARS, *HISTORIES))
         name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in inputs)
     else:
-        carried, name, by = (), "", ()
+        carried = by = ()
     rest = tuple(x for x in inputs if x not in by)
     parts = [
         _Part(name, carried, by),
@@ -129,12 +135,13 @@ def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...
 
 
 # ---------------------------------------------------------------- compiled when needed
-# A callback has to outlive what calls it, of which CasADi says nothing: one of each model and outputs is kept.
+# A callback has to outlive what calls it, of which CasADi says nothing: one of each kind of model and its
+# outputs is kept.
 _KEPT: dict[Any, _Late] = {}
 
 
 def _late(model: SteppedModel, whole: Any, part: _Part, every: int, compiled: Compile) -> _Late:
-    key = (model._recipe, part, every)
+    key: Any = (model._recipe, part, every)
     try:
         found = _KEPT.get(key)
     except TypeError:
@@ -151,9 +158,7 @@ class _Late(ca.Callback):
     which second derivatives come, suit all of them.
     """
 
-    def __init__(
-        self, model: SteppedModel, whole: Any, part: _Part, every: int, compiled: Compile
-    ) -> None:
+    def __init__(self, model: SteppedModel, whole: Any, part: _Part, every: int, compiled: Compile) -> None:
         ca.Callback.__init__(self)
         self._in = [(name, whole.size_in(name)) for name in whole.name_in()]
         ways, shapes = directions(model), shapes_out(model, part.outputs, every)
@@ -161,13 +166,15 @@ class _Late(ca.Callback):
         self._out = [
             (int(np.prod(shapes[output])), ways[given]) for output, given in product(part.outputs, part.by)
         ]
-        self._sizes = [_size(model, name).ravel(order="F") for name, _ in self._in]
+        # of the model that it is made for first: settings of another may differ
+        self.sizes = {name: _size(model, name) for name, _ in self._in}
+        self._flat_sizes = [size.ravel(order="F") for size in self.sizes.values()]
         self._make = lambda: _compiled(model, part, every, compiled)
         self._function: Any = None
         self._room = [np.empty(rows * columns) for _, (rows, columns) in self._in]
         self._runs: dict[tuple[bool, ...], Any] = {}
         differences = {"enable_fd": True, "fd_method": "central", "fd_options": {"h": _SECOND[part.name]}}
-        self.construct(f"{part.name}_late", differences)
+        self.construct(f"{part.name}_late", differences)  # type: ignore[no-untyped-call]
 
     # ------------------------------------------------------------ what CasADi asks
     def get_n_in(self) -> int:
@@ -195,7 +202,7 @@ class _Late(ca.Callback):
         """Of null results nothing is computed."""
         if self._function is None:
             self._function = self._make()
-        for given, size, room in zip(arg, self._sizes, self._room, strict=True):
+        for given, size, room in zip(arg, self._flat_sizes, self._room, strict=True):
             if given is None:
                 room[:] = 0.0
             else:
@@ -204,7 +211,7 @@ class _Late(ca.Callback):
         if wanted not in self._runs:
             buffer, run = self._function.buffer()
             for i, room in enumerate(self._room):
-                buffer.set_arg(i, memoryview(room))
+                buffer.set_arg(i, room.data)
             self._runs[wanted] = buffer, run
         buffer, run = self._runs[wanted]
         for name, x, is_wanted in zip(self._names, res, wanted, strict=True):
@@ -232,7 +239,8 @@ def _size(model: SteppedModel, name: str) -> Array:
     """Of an input's numbers, by which the lengths of differences go."""
     shapes = {"q": (model.robot.nq,), "v": (model.robot.nv,), "feedforward": (model.robot.n,)}
     usual: Array = np.abs(model.settings[name]) if name in model.settings else np.zeros(shapes[name])
-    return np.maximum(usual, least_size(name))
+    size = np.maximum(usual, least_size(name))
+    return np.where(size > 0, size, 1.0)
 
 
 # ---------------------------------------------------------------- configurations

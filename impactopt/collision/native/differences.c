@@ -39,7 +39,8 @@ static void evaluate(const double **arg, double **res, Differences *w) {
       double h = DIFFERENCE, way[NV] = {0}, *x = w->input + direction;
       const double here = *x;
       if (!of_q) {
-        h *= fmax(fabs(here), SCALES[b]);
+        const double size = fmax(fabs(here), SCALES[b]);
+        if (size > 0.0) h *= size;
         /* what is left of it when it is added */
         volatile double ahead = here + h;
         h = ahead - here;

@@ -19,7 +19,16 @@ from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 from impactopt.collision.runge_kutta import LEFT_OUT_BY_RK4
 from impactopt.collision.stepped import SteppedModel, number_of_steps
 
-__all__ = ["directions", "names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_derivatives", "with_jacobians"]
+__all__ = [
+    "directions",
+    "names_table",
+    "shapes_in",
+    "shapes_out",
+    "shapes_table",
+    "sizes",
+    "with_derivatives",
+    "with_jacobians",
+]
 
 
 def shapes_in(collision: SteppedModel) -> dict[str, tuple[int, int]]:
@@ -55,7 +64,8 @@ def directions(collision: SteppedModel) -> dict[str, int]:
 def with_derivatives(
     shapes: dict[str, tuple[int, int]], by: Mapping[str, int], *, values: bool = False
 ) -> dict[str, tuple[int, int]]:
-    """Of each output its Jacobians by these inputs, with their numbers of directions; after the output itself?"""
+    """Of each output, after itself if with `values`, its Jacobians by inputs, of which `by` has the number of
+    directions."""
     made: dict[str, tuple[int, int]] = {}
     for name, (rows, columns) in shapes.items():
         made |= {name: (rows, columns)} if values else {}

@@ -46,12 +46,13 @@ _TREE = (
     + files(__package__).joinpath("angles.h").read_text(encoding="utf-8"),
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
-_OF_DIFFERENCES = 1e-11
-# length of differences by method, of an input's size: what implicit steps leave out changes from one collision to the
-# next, and Runge-Kutta's do not, but end in whole numbers
-_DIFFERENCE = {"implicit": 1e-4, "rk4": 1e-6}
-# least size of an input that outputs are nearly linear in, and that may well be zero; of others 1
-_LEAST_SIZES = {"feedforward": 1e1, "reference": 1e2, "viscous": 1e1, "coulomb": 1e1}
+_OF_DIFFERENCES = 1e-12
+# length of differences by method, of an input's size: what implicit steps leave out changes between collisions;
+# Runge-Kutta's do not, but end in whole numbers
+_DIFFERENCE = {"implicit": 5e-5, "rk4": 1e-6}
+# least size of an input that may well be zero, or nearly; others have their own, or 1 where they are zero
+_LEAST_SIZES = {"q": 1.0, "v": 1.0, "normal": 1.0, "feedforward": 1e1, "reference": 1e2}
+_LEAST_SIZES |= {"viscous": 1e1, "coulomb": 1e1}
 _NEEDS_COMPILER = (
     "{}: derivatives need a C compiler that works: install gcc or clang, or name one in "
     "the environment variable CC{}"
@@ -106,15 +107,15 @@ def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every:
 
 
 def least_size(name: str) -> float:
-    """Of an input's numbers, below which differences by it go by this."""
-    return _LEAST_SIZES.get(name, 1.0)
+    """Of an input's numbers, for the length of differences: where they are smaller; 0: 1 if they are zero."""
+    return _LEAST_SIZES.get(name, 0.0)
 
 
 def native_differences(
     collision: SteppedModel, outputs: tuple[str, ...], by: tuple[str, ...], *, every: int = 1
 ) -> NativeCode:
-    """C code of a function with the inputs of `native_collision`, to `<output>_by_<input>` (number of its entries,
-    the input's numbers, of q nv) of each output and each input of `by`; for any model."""
+    """C code of a function with the inputs of `native_collision`, to `<output>_by_<input>` (number of its
+    entries, the input's numbers, of q nv) of each output and each input of `by`; for any model."""
 
     def none() -> Any:
         raise InputError(_NEEDS_COMPILER.format("function", "; or differentiate what `graph` gives"))

@@ -174,7 +174,7 @@ class _Late(ca.Callback):
         self._room = [np.empty(rows * columns) for _, (rows, columns) in self._in]
         self._runs: dict[tuple[bool, ...], Any] = {}
         differences = {"enable_fd": True, "fd_method": "central", "fd_options": {"h": _SECOND[part.name]}}
-        self.construct(f"{part.name}_late", differences)  # type: ignore[no-untyped-call]
+        self.construct(f"{part.name}_late", differences)
 
     # ------------------------------------------------------------ what CasADi asks
     def get_n_in(self) -> int:
@@ -201,7 +201,7 @@ class _Late(ca.Callback):
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
         """Of null results nothing is computed."""
         if self._function is None:
-            self._function = self._make()
+            self._function = self._make()  # type: ignore[no-untyped-call]
         for given, size, room in zip(arg, self._flat_sizes, self._room, strict=True):
             if given is None:
                 room[:] = 0.0

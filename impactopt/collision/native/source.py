@@ -47,7 +47,7 @@ _TREE = (
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
 _OF_DIFFERENCES = 1e-12
-# length of differences by method, of an input's size: what implicit steps leave out changes between collisions;
+# length of differences by method, of an input's size: what implicit steps leave out changes between two;
 # Runge-Kutta's do not, but end in whole numbers
 _DIFFERENCE = {"implicit": 5e-5, "rk4": 1e-6}
 # least size of an input that may well be zero, or nearly; others have their own, or 1 where they are zero

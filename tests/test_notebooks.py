@@ -43,8 +43,8 @@ def unknown(tree: ast.AST) -> list[str]:
     return found
 
 
-def test_there_are_eight_in_order() -> None:
-    assert [file.name.split("_")[0] for file in NOTEBOOKS] == list("12345678")
+def test_there_are_nine_in_order() -> None:
+    assert [file.name.split("_")[0] for file in NOTEBOOKS] == list("123456789")
 
 
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)

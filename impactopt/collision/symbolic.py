@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.cache import cached
 from impactopt.collision.batch import Batch
 from impactopt.collision.checks import breaks, check_course, check_finite, left_out_by_breaking
+from impactopt.collision.derivatives import differentiable
 from impactopt.collision.describe import Description, describe
 from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
 from impactopt.collision.graph import collision_graph, target_yield
@@ -49,23 +50,39 @@ class SymbolicModel(SteppedModel):
         return collision_graph(self, tuple(outputs), every=every)
 
     def function(
-        self, outputs: tuple[str, ...] = ("impulse",), *, parameters: tuple[str, ...] = (), every: int = 1
+        self,
+        outputs: tuple[str, ...] = ("impulse",),
+        *,
+        parameters: tuple[str, ...] = (),
+        by: tuple[str, ...] | None = None,
+        every: int = 1,
     ) -> Any:
         """The collision as a compiled ca.Function of what it needs, to the outputs asked for.
 
         Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with terms.feedforward; then the settings
         that `parameters` name (any of `settings`), the others being fixed. It does not contain what no
-        output needs, and has no derivatives. Where an input is NaN, so are all outputs, `separated` too.
+        output needs. Where an input is NaN, so are all outputs, `separated` too.
+
+        CasADi can differentiate it by all of its inputs: jacobian, forward, reverse; twice by differences.
+        What this takes is compiled when it is first evaluated. One number has its adjoint; numbers and
+        histories have tangents, by q, v and feedforward. The others come from differences of collisions with
+        tight steps, two for each number of the input: by settings, and all with freezes on the way, with
+        "rk4" and of configuration, velocity and the target's results. q's quaternion may have any length:
+        it counts as the unit one along it, so that derivatives along its length are zero.
 
         Parameters
         ----------
         outputs : names out of `impactopt.collision.OUTPUTS`, which says what they are; histories have a
             column an instant, and repeat the last one after separation.
         parameters : settings that are inputs.
+        by : inputs that derivatives are by, None: all; by others they are zero, and cost nothing.
         every : keep every so many steps, and the last, of the histories.
         """
         self._check_outputs(outputs, every)
-        return self._with_parameters(self._collision(tuple(outputs), every), parameters)
+        self._check_parameters(parameters)
+        return differentiable(
+            self, self._collision(tuple(outputs), every), parameters, by, every, self._compiled
+        )
 
     def _collision(self, outputs: tuple[str, ...], every: int = 1) -> Any:
         """With all settings as inputs, in C written by hand where there is a compiler."""
@@ -109,7 +126,11 @@ class SymbolicModel(SteppedModel):
         """
         self._check_outputs(outputs, every)
         check_jacobian(outputs, self.stepping, self.n_freezes)
-        return self._with_parameters(self._jacobian(tuple(outputs), every), parameters)
+        whole = self._with_parameters(self._jacobian(tuple(outputs), every), parameters)
+        inputs = [ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()]
+        found = dict(zip(whole.name_out(), whole.call(inputs), strict=True))
+        kept = {name: x for name, x in found.items() if not name.endswith("_by_feedforward")}
+        return ca.Function(whole.name(), inputs, [*kept.values()], whole.name_in(), [*kept])
 
     def _jacobian(self, outputs: tuple[str, ...], every: int) -> Any:
         """Likewise, with all settings as inputs."""
@@ -181,9 +202,12 @@ class SymbolicModel(SteppedModel):
             self._functions[key] = functions[name]
         return self._functions[key]
 
-    def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
+    def _check_parameters(self, parameters: tuple[str, ...]) -> None:
         for name in parameters:
             self.settings.override({name: self.settings.get(name, 0.0)})
+
+    def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
+        self._check_parameters(parameters)
         inputs = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
         kept = {name: x for name, x in inputs.items() if name not in self.settings or name in parameters}
         values = [kept.get(name, self.settings.get(name)) for name in inputs]

@@ -4,7 +4,7 @@ typedef struct {
   Linear linear;
   SeriesTangent series;
   StateTangent column;
-  StateTangent states[2];
+  StateTangent states[KINDS];
 } ForwardRoom;
 
 static void linear_of(const Data *d, const FrozenTangent *t, const State *y, const Instant *now, const Resolvent *r,
@@ -22,9 +22,10 @@ static void linear_of(const Data *d, const FrozenTangent *t, const State *y, con
   }
 }
 
-/* tangents of all columns, and of the state at separation, from the steps on the tape; P as in freeze.h */
+/* tangents of the columns, and of the state at separation, from the steps on the tape, of the kinds that are wanted; P as in
+   freeze.h */
 static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V], const Tape *tape,
-                        const RecordTangent *record, ForwardRoom *w) {
+                        const RecordTangent *record, const int *wanted, ForwardRoom *w) {
   const Frozen *F = d->frozen;
   const int last = N_COLUMNS[0] - 1;
   Resolvent r = {.h = 0.0};
@@ -34,10 +35,13 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
   Bend bend;
   Contact c;
   Linear *l = &w->linear;
-  int column = 0, next = 0;
+  int column = 0, next;
   /* time of the columns within steps stays */
   memset(w->states, 0, sizeof w->states);
   memset(&w->column, 0, sizeof w->column);
+#if FEEDFORWARD
+  FOR(i, N) *lane(w->states[BY_FEEDFORWARD].demand[i], i) = 1.0;
+#endif
   FOR(step, tape->made) {
     const State *y = &tape->states[step];
     const double h = tape->lengths[step], theta = tape->parts[step];
@@ -50,7 +54,9 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
     settle(d, y, &now, &r, &s, &bend);
 #endif
     linear_of(d, t, y, &now, &r, &s, &bend, l);
-    FOR(kind, 2) {
+    int after = column;
+    FOR(kind, KINDS) {
+      if (!wanted[kind]) continue;
       StateTangent *dy = &w->states[kind];
       vec moved[VD], back[VD];
       rates_forward(t, kind, &r.contact, dy);
@@ -67,6 +73,7 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
         const double force = call(contact_force, &then.penetration, &at.rate, d->law);
         write_tangent(d, t, F, P, kind, &at, force, &w->column, record, next);
       }
+      after = next;
       FOR_EACH(k) moved[k] = either(e->kind || theta == 1.0, (vec){0}, back[k]);
       if (e->kind && e->at > 0.0) event_forward(l, kind, e, &w->series, moved);
 #if PEAK
@@ -75,7 +82,7 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
       state_forward(l, theta, moved, &w->series, 0, dy);
       FOR_EACH(k) dy->time[k] += h * moved[k];
     }
-    column = next;
+    column = after;
   }
   if (!record) return;
 
@@ -86,7 +93,8 @@ static void run_forward(const Data *d, const FrozenTangent *t, const vec (*P)[V]
   contact_here(d, y, &now, 0.0, ((const double *)F->Q[N])[N], &r.contact);
   if (!now.contact) r.contact.k = r.contact.d = 0.0;
   const double force = call(contact_force, &y->penetration, &now.rate, d->law);
-  FOR(kind, 2) {
+  FOR(kind, KINDS) {
+    if (!wanted[kind]) continue;
     rates_forward(t, kind, &r.contact, &w->states[kind]);
     write_tangent(d, t, F, P, kind, &now, force, &w->states[kind], record, column);
   }

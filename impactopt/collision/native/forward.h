@@ -1,5 +1,6 @@
-/* Tangents: what moves with q and v, a direction a lane. The directions of q, in v's basis, are one kind and those of
-   v another; what is frozen of the inertia moves with q alone. Symbols as in freeze.h and implicit.h. */
+/* Tangents: what moves with q, v and the feed-forward torque, a direction a lane. The directions of q, in v's basis,
+   are one kind, those of v another, and those of the torque, which moves nothing that is frozen, a third; what is
+   frozen of the inertia moves with q alone. Symbols as in freeze.h and implicit.h. */
 
 /* vectors of directions of a kind, VD; products take as many of them at once, WIDE, with as many rows, HIGH, as
    registers hold, so that some numbers of vectors are filled up */
@@ -17,7 +18,9 @@
 #define HIGH (LANES < 4 ? LANES : 4)
 /* joints and hand, and what fills the last vector of them */
 #define ROWS_OF_V (V * LANES)
-enum { BY_Q, BY_V };
+enum { BY_Q, BY_V, BY_FEEDFORWARD };
+#define KINDS (2 + FEEDFORWARD)
+#define WAYS(kind) ((kind) == BY_FEEDFORWARD ? N : NV)
 
 #define FOR_EACH(k) FOR(k, VD)
 
@@ -25,7 +28,7 @@ typedef struct {
   vec Q[ROWS_OF_V][N + 1][VD]; /* with q, as P and the soles */
   vec P[C1][N + 1][VD];
   vec soles[AT_LEAST_1(3 * SOLES)][VD];
-  vec drift[2][ROWS_OF_V][VD], L_0[2][C1][VD], hand_speed[2][VD], unmodelled[2][6][VD];
+  vec drift[KINDS][ROWS_OF_V][VD], L_0[KINDS][C1][VD], hand_speed[KINDS][VD], unmodelled[KINDS][6][VD];
 } FrozenTangent;
 
 /* out += A x: A has a row of vectors for each of `count` rows of x, which like those of `out` are `width` vectors */

@@ -36,6 +36,7 @@ static void roots_forward(const double *q, const double *v, const double *normal
   memset(w->identity, 0, sizeof w->identity);
   memset(w->none, 0, sizeof w->none);
   memset(t->unmodelled, 0, sizeof t->unmodelled);
+  memset(t->hand_speed, 0, sizeof t->hand_speed);
   FOR(i, NV) *lane(w->identity[i], i) = 1.0;
   const double *in[] = {q, v, normal};
   double *parts[] = {w->parts};

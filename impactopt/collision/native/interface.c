@@ -5,11 +5,12 @@
 
      collision           value: the outputs asked for (collision.c); collision_batch beside it runs many (batch.c)
      collision_gradient  adjoint: a scalar output, d/dq (nv), d/dv (nv) (gradient.c); a null result is not computed
-     collision_jacobian  tangents: of each output its value, d/dq and d/dv (entries, nv) (jacobian.c); likewise
+     collision_jacobian  tangents: of each output its value, d/dq and d/dv (entries, nv)[, d/dfeedforward (entries, n)]
+                         (jacobian.c); likewise
+     collision_differences  of each output d/d of some inputs (entries, numbers) (differences.c); likewise
 
-   Derivatives by q are in the basis of v: d/dq (nq) is its tangent map's transposed times them. To wrap them as one
-   differentiable function: `reverse` from the gradient, `forward` and the Jacobian from the tangents. Derivatives by
-   feedforward and settings are not there. */
+   Derivatives by q are in the basis of v: d/dq (nv) is its tangent map's transposed times them. Wrapped as one
+   differentiable function: collision/derivatives.py. */
 
 #ifndef ROOM
 #define ROOM Work

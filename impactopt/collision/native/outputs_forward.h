@@ -1,7 +1,7 @@
 /* Tangents of the histories, a column an instant; see outputs.h. */
 
 typedef struct {
-  double **by[2]; /* where each output's derivatives go: a column a direction, with the output column by column */
+  double **by[KINDS]; /* where each output's derivatives go: a column a direction, with the output column by column */
 } RecordTangent;
 
 #if FRICTION || defined(OUT_joint_velocity)
@@ -16,11 +16,11 @@ typedef struct {
   vec impulse[VD], penetration[VD], time[VD], peak[VD], rate[VD], force[VD], target_speed[VD];
 } StateTangent;
 
-INLINE void put(const vec (*x)[VD], int rows, int columns, int column, double *to) {
-  FOR(way, NV) FOR(i, rows) to[(long)way * rows * columns + (long)rows * column + i] = ((const double *)x[i])[way];
+INLINE void put(const vec (*x)[VD], int ways, int rows, int columns, int column, double *to) {
+  FOR(way, ways) FOR(i, rows) to[(long)way * rows * columns + (long)rows * column + i] = ((const double *)x[i])[way];
 }
 #define PUT(name, rows, x) \
-  if (by[OUT_##name]) put((const vec(*)[VD])(x), rows, N_COLUMNS[0], column, by[OUT_##name])
+  if (by[OUT_##name]) put((const vec(*)[VD])(x), WAYS(kind), rows, N_COLUMNS[0], column, by[OUT_##name])
 
 static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F, const vec (*P)[V], int kind,
                           const Instant *at, double force, const StateTangent *x, const RecordTangent *record,
@@ -127,11 +127,11 @@ static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F
 
 /* the columns after `column` repeat it */
 static void repeat_tangent(const RecordTangent *record, int column) {
-  FOR(kind, 2) FOR(i, N_VALUES) {
+  FOR(kind, KINDS) FOR(i, N_VALUES) {
     const long rows = ROWS[i], size = rows * N_COLUMNS[0];
     double *to = record->by[kind][i];
     if (!rows || !to) continue;
-    FOR(way, NV) for (int k = column + 1; k < N_COLUMNS[0]; k++)
+    FOR(way, WAYS(kind)) for (int k = column + 1; k < N_COLUMNS[0]; k++)
       memcpy(to + way * size + rows * k, to + way * size + rows * column, rows * sizeof(double));
   }
 }

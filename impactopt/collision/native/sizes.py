@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +19,16 @@ from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 from impactopt.collision.runge_kutta import LEFT_OUT_BY_RK4
 from impactopt.collision.stepped import SteppedModel, number_of_steps
 
-__all__ = ["names_table", "shapes_in", "shapes_out", "shapes_table", "sizes", "with_jacobians"]
+__all__ = [
+    "directions",
+    "names_table",
+    "shapes_in",
+    "shapes_out",
+    "shapes_table",
+    "sizes",
+    "with_derivatives",
+    "with_jacobians",
+]
 
 
 def shapes_in(collision: SteppedModel) -> dict[str, tuple[int, int]]:
@@ -46,13 +55,28 @@ def shapes_out(collision: SteppedModel, outputs: tuple[str, ...], every: int) ->
     return {name: shapes[name] for name in outputs}
 
 
-def with_jacobians(shapes: dict[str, tuple[int, int]], nv: int) -> dict[str, tuple[int, int]]:
-    """Each followed by its Jacobians by q and v."""
+def directions(collision: SteppedModel) -> dict[str, int]:
+    """Of each input by name, in how many directions it moves: q in as many as v."""
+    shapes = {name: rows * columns for name, (rows, columns) in shapes_in(collision).items()}
+    return {**shapes, "q": collision.robot.nv}
+
+
+def with_derivatives(
+    shapes: dict[str, tuple[int, int]], by: Mapping[str, int], *, values: bool = False
+) -> dict[str, tuple[int, int]]:
+    """Of each output, after itself if with `values`, its Jacobians by inputs, of which `by` has the number of
+    directions."""
     made: dict[str, tuple[int, int]] = {}
     for name, (rows, columns) in shapes.items():
-        made[name] = (rows, columns)
-        made |= dict.fromkeys((f"{name}_by_q", f"{name}_by_v"), (rows * columns, nv))
+        made |= {name: (rows, columns)} if values else {}
+        made |= {f"{name}_by_{given}": (rows * columns, count) for given, count in by.items()}
     return made
+
+
+def with_jacobians(shapes: dict[str, tuple[int, int]], by: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    """Each output followed by its Jacobians by what tangents carry."""
+    carried = {name: by[name] for name in ("q", "v", "feedforward") if name in by}
+    return with_derivatives(shapes, carried, values=True)
 
 
 def _rows(collision: SteppedModel, history: str) -> int:

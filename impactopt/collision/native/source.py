@@ -19,11 +19,20 @@ from impactopt.collision.native.generated import (
     tree_functions,
 )
 from impactopt.collision.native.lanes import tree_in_lanes
-from impactopt.collision.native.sizes import names_table, shapes_out, shapes_table, sizes, with_jacobians
+from impactopt.collision.native.sizes import (
+    directions,
+    names_table,
+    shapes_in,
+    shapes_out,
+    shapes_table,
+    sizes,
+    with_derivatives,
+    with_jacobians,
+)
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 
-__all__ = ["native_collision", "native_gradient", "native_jacobian"]
+__all__ = ["least_size", "native_collision", "native_differences", "native_gradient", "native_jacobian"]
 
 # the kernel's files of the steps, and of the way back
 _IMPLICIT = ("implicit", *(f"implicit_{part}" for part in ("factor", "step", "bend", "events", "run")))
@@ -37,7 +46,13 @@ _TREE = (
     + files(__package__).joinpath("angles.h").read_text(encoding="utf-8"),
     "#undef sin\n#undef cos\n#pragma GCC pop_options\n",
 )
-_OF_DIFFERENCES = 1e-11
+_OF_DIFFERENCES = 1e-12
+# length of differences by method, of an input's size: what implicit steps leave out changes between two;
+# Runge-Kutta's do not, but end in whole numbers
+_DIFFERENCE = {"implicit": 5e-5, "rk4": 1e-6}
+# least size of an input that may well be zero, or nearly; others have their own, or 1 where they are zero
+_LEAST_SIZES = {"q": 1.0, "v": 1.0, "normal": 1.0, "feedforward": 1e1, "reference": 1e2}
+_LEAST_SIZES |= {"viscous": 1e1, "coulomb": 1e1}
 _NEEDS_COMPILER = (
     "{}: derivatives need a C compiler that works: install gcc or clang, or name one in "
     "the environment variable CC{}"
@@ -91,6 +106,24 @@ def native_jacobian(collision: SteppedModel, outputs: tuple[str, ...], *, every:
     )
 
 
+def least_size(name: str) -> float:
+    """Of an input's numbers, for the length of differences: where they are smaller; 0: 1 if they are zero."""
+    return _LEAST_SIZES.get(name, 0.0)
+
+
+def native_differences(
+    collision: SteppedModel, outputs: tuple[str, ...], by: tuple[str, ...], *, every: int = 1
+) -> NativeCode:
+    """C code of a function with the inputs of `native_collision`, to `<output>_by_<input>` (number of its
+    entries, the input's numbers, of q nv) of each output and each input of `by`; for any model."""
+
+    def none() -> Any:
+        raise InputError(_NEEDS_COMPILER.format("function", "; or differentiate what `graph` gives"))
+
+    code = _code(collision, "collision_differences", outputs, every, by)
+    return NativeCode(name="collision_differences", code=code, graph=none)
+
+
 def _no_nan(graph: ca.Function) -> ca.Function:
     """A function that gives no numbers where an input is none, as C code does."""
     inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
@@ -100,7 +133,9 @@ def _no_nan(graph: ca.Function) -> ca.Function:
     return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 
-def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: int) -> str:
+def _code(
+    collision: SteppedModel, name: str, outputs: tuple[str, ...], every: int, by: tuple[str, ...] = ()
+) -> str:
     frozen, gradient = frozen_dynamics(collision), name == "collision_gradient"
     jacobian = name == "collision_jacobian"
     ground = bool({"ground_wrench", "zmp"} & {*outputs})
@@ -108,24 +143,35 @@ def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: i
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     scalars = scalar_functions(model, method=collision.stepping)
     shapes, of_tree = shapes_out(collision, outputs, every), tree.functions
+    differs = name == "collision_differences"
+    if differs or (gradient and collision.n_freezes):
+        # differences are of collisions with steps that do not count beside them
+        collision = replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
+    of_differences: list[str] = []
     if gradient:
-        # several freezes have differences of collisions with steps that do not count beside them
-        collision = (
-            replace(collision, tolerance=min(collision.tolerance, _OF_DIFFERENCES))
-            if collision.n_freezes
-            else collision
-        )
         of_tree = [*of_tree, *backwards(of_tree), tangent_back(frozen)]
         scalars += backwards(scalars)
-        by = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
-        shapes |= dict.fromkeys(by, (collision.robot.nv, 1))
+        by_both = (f"{outputs[0]}_by_q", f"{outputs[0]}_by_v")
+        shapes |= dict.fromkeys(by_both, (collision.robot.nv, 1))
     lanes: list[str] = []
     if jacobian:
         moved = tree_in_lanes(frozen, tree, ground=ground)
         of_tree = [*of_tree, *[parts for parts, _ in moved]]
         lanes = [_LANES[0], *[code for _, code in moved], _LANES[1]]
         scalars += backwards([f for f in scalars if f.name() == "target_energy"])
-        shapes = with_jacobians(shapes, collision.robot.nv)
+        shapes = with_jacobians(shapes, directions(collision))
+    if differs:
+        entries = [rows * columns for rows, columns in shapes.values()]
+        inputs = shapes_in(collision)
+        of_differences = [
+            f"#define DIFFERENCE {_DIFFERENCE[collision.stepping]}\n#define N_BY {len(by)}",
+            f"#define ENTRIES {sum(entries) + 1}",
+            f"#define LONGEST {max(rows * columns for rows, columns in inputs.values())}",
+            f"static const int SIZES[] = {{{', '.join(map(str, entries))}}};",
+            f"static const int BY[] = {{{', '.join(f'ARG_{name}' for name in by)}}};",
+            f"static const double SCALES[] = {{{', '.join(str(least_size(name)) for name in by)}}};",
+        ]
+        shapes = with_derivatives(shapes, {name: directions(collision)[name] for name in by})
     folder = files(__package__)
 
     def text(*names: str) -> list[str]:
@@ -145,6 +191,7 @@ def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: i
         names_table("NAMES_OUT", shapes),
         shapes_table("SHAPES_OUT", shapes.values()),
         f"#define N_OUT {len(shapes)}",
+        *of_differences,
     ]
     method = collision.stepping
     files_used = ["freeze.h", "instant.h", "outputs.h", *_STEPS[method], "course.h"]
@@ -156,5 +203,5 @@ def _code(collision: SteppedModel, name: str, outputs: tuple[str, ...], every: i
         forward = ["forward.h", *(f"{name}_forward.h" for name in parts_of_way)]
         files_used += ["results.h", *forward, "jacobian.c"]
     else:
-        files_used += ["results.h", "collision.c"]
+        files_used += ["results.h", "differences.c" if differs else "collision.c"]
     return "\n".join([*parts, *text(*files_used, "interface.c")])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
+from support.small_plans import OPTIONS, Planned, arm_problem, biped_problem, planned, transcribed
 
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.planner import solve

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from rooms import NUMERIC, PACKAGE, ROOMS, ROOMS_IN_ORDER
+from support.rooms import NUMERIC, PACKAGE, ROOMS, ROOMS_IN_ORDER
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from docs_blocks import BASE, PAGES, ROOT, check_line, languages, run_page, whole
+from support.docs_blocks import BASE, PAGES, ROOT, check_line, languages, run_page, whole
 
 from impactopt import InputError
 

@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from browser import Job, visit
+from support.browser import Job, visit
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -6,7 +6,7 @@ import ast
 from pathlib import Path
 
 import pytest
-from rooms import (
+from support.rooms import (
     ENGINE,
     FILES,
     MODULES,

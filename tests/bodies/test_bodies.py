@@ -1,0 +1,644 @@
+"""Bodies of robots and of the world: what stands for them, against exact geometry and closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from support.small_plans import arm_problem, biped_problem
+
+from impactopt import KeepOut, TargetBody, load_problem
+from impactopt.bodies.clearance import FAR, MISSED, Bodies, Places
+from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface_points
+from impactopt.bodies.pieces import convex, inertia_box, pieces_of
+from impactopt.bodies.robot_bodies import bodies_of, distance
+from impactopt.bodies.shapes import Obstacle, face_axes
+from impactopt.bodies.world import BEHIND, WorldBody, ground, obstacle_bodies, target_bodies
+from impactopt.contact import Board, FreeMass, Nail, RigidWall
+from impactopt.errors import InputError
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.presets import g1, planar_arm, standin, talos
+from impactopt.robots.robot import Robot, Tool
+
+Array = NDArray[np.float64]
+EXACT = 1e-6  # [m] of coal's distances
+IDENTITY = coal.Transform3s.Identity()
+
+
+def at(place: Array) -> Any:
+    return coal.Transform3s(np.eye(3), np.asarray(place, dtype=float))
+
+
+def told(planes: Planes, points: Array) -> Array:
+    """How far (k,) [m] points (k, 3) are from a body, as its planes say."""
+    return np.asarray((points @ planes.normal.T - planes.offset).max(axis=1))
+
+
+def directions(count: int, seed: int = 0) -> Array:
+    ways = np.random.default_rng(seed).standard_normal((count, 3))
+    return np.asarray(ways / np.linalg.norm(ways, axis=1, keepdims=True))
+
+
+# ---- spheres and planes
+
+
+@dataclasses.dataclass
+class Case:
+    """A hull, its surface as points and as coal has it."""
+
+    hull: ConvexHull
+    vertices: Array
+    triangles: NDArray[np.intp]
+    surface: Array
+    spacing: float
+
+    @property
+    def shape(self) -> Any:
+        return convex(self.vertices, self.triangles)
+
+    def random_surface(self, count: int, seed: int = 0) -> Array:
+        """Points on its triangles."""
+        rng = np.random.default_rng(seed)
+        weight = rng.dirichlet(np.ones(3), count)
+        corners = self.vertices[self.triangles[rng.integers(len(self.triangles), size=count)]]
+        return np.asarray((weight[:, :, None] * corners).sum(axis=1))
+
+
+@st.composite
+def hulls(draw: st.DrawFn) -> Case:
+    """From pebbles to torsos, flat and long ones too."""
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    sides = np.array(draw(st.tuples(*[st.floats(0.01, 0.5)] * 3)))
+    points = rng.uniform(-0.5, 0.5, (draw(st.integers(6, 40)), 3)) * sides + rng.uniform(-0.2, 0.2, 3)
+    hull = ConvexHull(points)
+    vertices = points[hull.vertices]
+    place = np.full(len(points), -1)
+    place[hull.vertices] = np.arange(len(vertices))
+    triangles = place[hull.simplices]
+    spacing = max(float(np.ptp(points, axis=0).max()) / 20, 0.003)
+    return Case(hull, vertices, triangles, surface_points(vertices, triangles, spacing), spacing)
+
+
+QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@QUICK
+@given(case=hulls())
+def test_spheres_cover_a_hull_and_stick_out_no_further_than_they_say(case: Case) -> None:
+    spheres = fill(case.hull, case.surface)
+    assert 1 <= len(spheres.radius) <= 16 and (spheres.radius > 0).all()
+    assert 0 <= spheres.short <= 2e-3
+
+    def left_out(points: Array) -> Array:
+        away = np.linalg.norm(points[:, None] - spheres.centre, axis=2) - spheres.radius
+        return np.asarray(away.min(axis=1))
+
+    assert left_out(case.surface[:3000]).max() <= spheres.short + 1e-12
+    # between the points that were looked at by no more than the way to the next one
+    others = case.random_surface(300)
+    way = np.linalg.norm(others[:, None] - case.surface, axis=2).min(axis=1)
+    assert (left_out(others) <= spheres.short + way + 1e-12).all()
+    skin = (spheres.centre[:, None] + spheres.radius[:, None, None] * directions(60)).reshape(-1, 3)
+    point, shape = coal.Sphere(1e-9), case.shape
+    out = max(distance(point, at(x), shape, IDENTITY) for x in skin)
+    assert out <= spheres.out + EXACT
+
+
+@QUICK
+@given(case=hulls(), radius=st.sampled_from([0.0, 0.03]))
+def test_planes_never_say_that_a_body_is_farther_than_it_is(case: Case, radius: float) -> None:
+    planes = enclose(case.vertices, case.hull.equations[:, :3], radius)
+    assert planes.normal.shape == (PLANES, 3)
+    np.testing.assert_allclose(np.linalg.norm(planes.normal, axis=1), 1.0, atol=1e-12)
+    support = (planes.normal @ case.vertices.T).max(axis=1) + radius
+    np.testing.assert_allclose(planes.offset, support, atol=1e-12)
+    rng = np.random.default_rng(0)
+    points = case.vertices.mean(axis=0) + rng.uniform(-1, 1, (80, 3)) * np.ptp(case.vertices, axis=0)
+    point, shape = coal.Sphere(1e-9), case.shape
+    exact = np.array([distance(point, at(x), shape, IDENTITY) for x in points]) - radius
+    outside = exact > 0
+    assert (told(planes, points)[outside] <= exact[outside] + EXACT).all()
+    inside = rng.dirichlet(np.ones(len(case.vertices)), 50) @ case.vertices
+    assert (told(planes, inside) <= -radius + 1e-12).all()
+    # a body that they surround on all sides
+    assert (told(planes, case.vertices.mean(axis=0) + 2 * directions(100)) > 0).all()
+
+
+def test_planes_about_a_box_are_its_faces_where_they_are_next() -> None:
+    half = np.array([0.1, 0.2, 0.3])
+    corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    planes = enclose(corners, np.concatenate([np.eye(3), -np.eye(3)]))
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            before = np.zeros((1, 3))
+            before[0, axis] = sign * (half[axis] + 0.07)
+            assert told(planes, before) == pytest.approx(0.07, abs=1e-12)
+    assert planes.out < 0.01
+
+
+def test_a_known_plane_takes_the_place_of_the_one_most_like_it() -> None:
+    body = WorldBody(name="box", half=np.full(3, 0.1), place=np.zeros(3), rotation=np.eye(3))
+    plain, facing = body.planes.with_facing(None), body.planes.with_facing((0.0, 0.6, 0.8, 0.25))
+    assert plain.shape == facing.shape == (4 * PLANES,)
+    changed = np.flatnonzero((plain != facing)[: 3 * PLANES].reshape(-1, 3).any(axis=1))
+    assert len(changed) <= 1
+    k = int((body.planes.normal @ [0.0, 0.6, 0.8]).argmax())
+    np.testing.assert_array_equal(facing[3 * k : 3 * k + 3], [0.0, 0.6, 0.8])
+    assert facing[3 * PLANES + k] == 0.25
+    assert np.array_equal(body.planes.with_facing(None), plain), "it stays as it was"
+
+
+def test_points_on_a_surface_are_on_it_and_near_each_other() -> None:
+    body = np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
+    hull = ConvexHull(body)
+    points = surface_points(body, hull.simplices, 0.01)
+    depth = (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
+    np.testing.assert_allclose(depth, 0.0, atol=1e-12)
+    case = Case(hull, body, hull.simplices, points, 0.01)
+    nearest = np.linalg.norm(case.random_surface(500)[:, None] - points, axis=2).min(axis=1)
+    assert nearest.max() < 0.01
+
+
+def test_what_is_nearly_flat_has_one_sphere_about_it() -> None:
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-2.0, 2.0, (30, 2)), rng.uniform(-1e-4, 1e-4, 30)])
+    spheres = fill(ConvexHull(flat), flat)
+    assert len(spheres.radius) == 1
+    assert np.linalg.norm(flat - spheres.centre[0], axis=1).max() <= spheres.radius[0] + 1e-12
+    assert spheres.out >= spheres.radius[0] - 1e-3
+
+
+# ---- pieces
+
+
+@pytest.mark.parametrize("make", [g1, talos])
+def test_hulls_are_about_what_pinocchio_reads(make: Callable[[], Robot]) -> None:
+    """Between shapes there is never less than between their hulls, but where polygons stand for circles."""
+    robot = make()
+    assert robot.urdf is not None
+    folders = [str(folder) for folder in Path(robot.urdf).resolve().parents]
+    geometry = pin.buildGeomFromUrdf(
+        robot.model, robot.urdf, pin.GeometryType.COLLISION, package_dirs=folders
+    )
+    pieces, source = pieces_of(robot)
+    assert "collision" in source
+    model, data = robot.model, robot.model.createData()
+    by_link: dict[str, list[Any]] = {}
+    for piece in pieces:
+        by_link.setdefault(piece.link, []).append(piece)
+    theirs: dict[str, list[Any]] = {}
+    for thing in geometry.geometryObjects:
+        theirs.setdefault(model.frames[thing.parentFrame].name, []).append(thing)
+    shared = [link for link in theirs if link in by_link]
+    assert len(shared) >= 0.9 * len(theirs)
+    for link in shared:
+        assert {p.joint for p in by_link[link]} == {t.parentJoint for t in theirs[link]}
+    rng, looked = np.random.default_rng(0), 0
+    while looked < 25:
+        q = pin.randomConfiguration(model, *_box(robot))
+        pin.forwardKinematics(model, data, q)
+        one, two = rng.choice(shared, 2, replace=False)
+        if by_link[one][0].joint == by_link[two][0].joint:
+            continue
+        hulls = min(
+            distance(a.shape, _placed(data, a.joint), b.shape, _placed(data, b.joint))
+            for a in by_link[one]
+            for b in by_link[two]
+        )
+        exact = min(
+            distance(
+                a.geometry,
+                _coal(data.oMi[a.parentJoint] * a.placement),
+                b.geometry,
+                _coal(data.oMi[b.parentJoint] * b.placement),
+            )
+            + _sagitta(a.geometry)
+            + _sagitta(b.geometry)
+            for a in theirs[one]
+            for b in theirs[two]
+        )
+        if hulls > 0:
+            assert exact >= hulls - EXACT, (one, two)
+        looked += 1
+
+
+def _sagitta(shape: Any) -> float:
+    """How far [m] a cylinder of 20 sides, or a sphere of 16 and 8, is inside the round one."""
+    if isinstance(shape, coal.Cylinder):
+        return float(shape.radius * (1 - np.cos(np.pi / 20)))
+    return float(shape.radius * (1 - np.cos(np.pi / 16) ** 2)) if isinstance(shape, coal.Sphere) else 0.0
+
+
+def _box(robot: Robot) -> tuple[Array, Array]:
+    """Ranges of configurations, a free base within a metre."""
+    low, high = np.array(robot.model.lowerPositionLimit), np.array(robot.model.upperPositionLimit)
+    if robot.floating:
+        low[:7], high[:7] = -1.0, 1.0
+    return np.maximum(low, -3.0), np.minimum(high, 3.0)
+
+
+def _coal(place: Any) -> Any:
+    return coal.Transform3s(np.array(place.rotation), np.array(place.translation))
+
+
+def _placed(data: Any, joint: int) -> Any:
+    return _coal(data.oMi[joint])
+
+
+def test_a_robot_without_shapes_has_boxes_of_inertia() -> None:
+    robot = standin()
+    pieces, source = pieces_of(robot)
+    assert "inertia" in source and {p.joint for p in pieces} == set(range(1, robot.model.njoints))
+    for piece in pieces:
+        assert piece.link == robot.model.names[piece.joint]
+
+
+@pytest.mark.parametrize("sides", [(0.1, 0.2, 0.3), (0.3, 0.29, 0.05), (0.02, 0.5, 0.1)])
+def test_the_box_of_inertia_is_the_box_that_has_it(sides: tuple[float, float, float]) -> None:
+    turn = pin.rpy.rpyToMatrix(0.3, -0.2, 0.5)
+    body = pin.SE3(turn, np.array([0.1, 0.2, 0.3])).act(pin.Inertia.FromBox(2.0, *sides))
+    local = (inertia_box(body).vertices - body.lever) @ turn
+    np.testing.assert_allclose(local.max(axis=0), np.array(sides) / 2, rtol=1e-6)
+    np.testing.assert_allclose(local.min(axis=0), -np.array(sides) / 2, rtol=1e-6)
+
+
+def test_a_tool_is_a_rod_to_its_head() -> None:
+    bare, tool = planar_arm(), Tool.hammer(frame="elbow", name="second")
+    robot = bare.with_tool(tool)
+    for link in ("elbow", "wrist"):  # whose boxes are without it
+        (with_it,), (without,) = ([p for p in pieces_of(r)[0] if p.link == link] for r in (robot, bare))
+        np.testing.assert_allclose(with_it.vertices, without.vertices, atol=1e-9)
+    rod = next(p for p in pieces_of(robot)[0] if p.link == tool.name)
+    frame = robot.model.frames[robot.model.getFrameId(tool.frame)]
+    assert rod.joint == frame.parentJoint
+    ends = np.array([frame.placement.translation, frame.placement.act(np.array(tool.head))])
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    reach = (rod.vertices - ends[0]) @ along
+    assert reach.min() == pytest.approx(0.0, abs=1e-9)
+    assert reach.max() == pytest.approx(np.linalg.norm(ends[1] - ends[0]), abs=1e-9)
+    off = rod.vertices - ends[0] - np.outer(reach, along)
+    assert np.linalg.norm(off, axis=1).max() == pytest.approx(0.012, abs=1e-9)
+
+
+# ---- how far all are apart
+
+
+def scenes() -> dict[str, Callable[[], ImpactProblem]]:
+    return {
+        "arm": arm_problem,
+        "biped": biped_problem,
+        "punch": lambda: load_problem("punch"),
+        "one foot": lambda: load_problem("punch_one_foot"),
+    }
+
+
+def random_places(problem: ImpactProblem, count: int) -> Places:
+    """Half of them near the start, all within limits."""
+    robot, rng = problem.robot, np.random.default_rng(0)
+    low, high = _box(robot)
+    start = problem.start_posture
+    q = []
+    for k in range(count):
+        if k % 2:
+            q.append(pin.integrate(robot.model, start, 0.3 * rng.standard_normal(robot.model.nv)))
+        else:
+            q.append(pin.randomConfiguration(robot.model, low, high))
+    phase = rng.integers(0, 3, count)
+    return Places.of(robot, np.array(q), 0.01 * (phase == 2), phase)
+
+
+@pytest.mark.parametrize("name", scenes())
+def test_lower_bounds_are_no_more_than_exact_distances(name: str) -> None:
+    """But for what spheres leave out of a surface, between the points too where that was looked at."""
+    problem = scenes()[name]()
+    bodies = problem.bodies
+    places, within = random_places(problem, 16), 0.15
+    found: dict[tuple[int, Any], float] = {}
+    slack = bodies.slack + 1e-3
+    assert slack <= 3e-3
+    for bound, k, pair in bodies.lower_bounds(places, within):
+        assert (k, pair) not in found
+        found[k, pair] = bound
+    assert len(found) > 5
+    for (k, pair), bound in found.items():
+        exact = bodies.exact(places, k, pair)
+        if exact > 0:
+            assert bound <= exact + slack, (k, bodies.names(pair))
+        else:  # how deep they are is not what a single sphere tells
+            assert bound <= slack, (k, bodies.names(pair))
+    # and what is not among them is not near
+    rest = [(k, pair) for k in range(len(places)) for pair in all_pairs(bodies, places, k)]
+    rest = [key for key in rest if key not in found]
+    for n in np.random.default_rng(1).permutation(len(rest))[:150]:
+        k, pair = rest[n]
+        assert bodies.exact(places, k, pair) > within - slack, bodies.names(pair)
+
+
+def all_pairs(bodies: Bodies, places: Places, k: int) -> list[tuple[int, int]]:
+    return [*bodies.pairs] + [
+        (j, -1 - w) for j, w in bodies.world_pairs if bodies.present(bodies.world[w], places)[k]
+    ]
+
+
+@pytest.mark.parametrize("name", ["arm", "one foot"])
+def test_the_nearest_of_all_is_the_nearest(name: str) -> None:
+    problem = scenes()[name]()
+    bodies, places = problem.bodies, random_places(problem, 5)
+    found = bodies.survey(np.arange(len(places), dtype=float), places, within=0.3)
+    least, when = found.clearance, int(found.time)
+    exact = {
+        (k, pair): bodies.exact(places, k, pair)
+        for k in range(len(places))
+        for pair in all_pairs(bodies, places, k)
+    }
+    (which,) = {pair for (k, pair) in exact if k == when and bodies.names(pair) == found.nearest}
+    assert least == pytest.approx(min(exact.values()), abs=1e-9)
+    assert exact[when, which] == pytest.approx(least, abs=1e-9)
+    deep = {key for key, apart in exact.items() if apart < -1e-5}
+    touches = found.touches
+    assert len(touches) == len({pair for _, pair in deep})
+    assert [t.depth for t in touches] == sorted((t.depth for t in touches), reverse=True)
+    if touches:
+        assert touches[0].depth == pytest.approx(-min(exact.values()), abs=1e-9)
+
+
+def test_far_from_all_nothing_is_near() -> None:
+    problem = dataclasses.replace(arm_problem(), body=TargetBody(shape="none"))
+    bodies = problem.bodies
+    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    assert bodies.survey(np.zeros(1), start, within=1e-3) == (FAR, 0.0, (), ())
+
+
+def test_what_touches_in_the_start_posture_may_touch() -> None:
+    problem = load_problem("punch")
+    bodies = problem.bodies
+    start = Places.of(problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
+    assert bodies.survey(np.zeros(1), start).touches == ()
+    assert min(bodies.exact(start, 0, pair) for pair in all_pairs(bodies, start, 0)) > 0
+    model = problem.robot.model
+    for a, b in bodies.pairs:
+        assert model.parents[a] != b and model.parents[b] != a
+
+
+def test_links_that_may_pass_through_each_other_are_no_pair() -> None:
+    problem = arm_problem()
+    names = problem.bodies.links.name
+    (a, b), *rest = problem.bodies.pairs
+    robot = dataclasses.replace(problem.robot, disable_collisions=((names(b), names(a)),))
+    assert list(dataclasses.replace(problem, robot=robot).bodies.pairs) == rest
+
+
+def test_the_target_comes_goes_and_moves() -> None:
+    problem = dataclasses.replace(arm_problem(), target=Board(mass=0.3, stiffness=1e5, breaking_force=900.0))
+    bodies = problem.bodies
+    q = np.tile(problem.start_posture, (4, 1))
+    places = Places.of(problem.robot, q, np.array([0.0, 0.0, 0.2, 0.0]), np.array([0, 1, 2, MISSED]))
+    there = {body.name: bodies.present(body, places).tolist() for body in bodies.world}
+    assert there["ground"] == [True] * 4
+    assert there["target"] == [True, False, False, False], "a board is broken"
+    assert there["target's support"] == [True, True, True, False]
+    free = arm_problem().bodies
+    w = next(k for k, body in enumerate(free.world) if body.name == "target")
+    (_, before), (_, after) = (free.placement(places, k, -1 - w) for k in (0, 2))
+    np.testing.assert_allclose(after - before, 0.2 * free.normal, atol=1e-12)
+    assert free.present(free.world[w], places).tolist() == [True, True, True, False]
+
+
+# ---- the world
+
+POINT, NORMAL = np.array([0.6, 0.1, 1.1]), np.array([1.0, 0.0, 0.0])
+
+
+def corners(body: WorldBody) -> Array:
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return np.asarray(body.place + (signs * body.half) @ body.rotation.T)
+
+
+def spans(body: WorldBody) -> Array:
+    """(3, 2) from the point along normal, across and up [m]."""
+    way = (corners(body) - POINT) @ face_axes(NORMAL).T
+    return np.column_stack([way.min(axis=0), way.max(axis=0)])
+
+
+def bodies_at(target: Any, body: TargetBody | None = None) -> dict[str, list[WorldBody]]:
+    out: dict[str, list[WorldBody]] = {}
+    for found in target_bodies(body or TargetBody(), target, POINT, NORMAL):
+        assert found.of_target
+        out.setdefault(found.name, []).append(found)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("target", "size", "given"),
+    [
+        (FreeMass(mass=1.0), (0.18, 0.18, 0.18), None),
+        (FreeMass(mass=1.0), (0.2, 0.3, 0.1), (0.2, 0.3, 0.1)),
+        (RigidWall(), (1.5, 1.5, 0.1), None),
+    ],
+)
+def test_a_boxs_face_has_the_point_in_its_middle(
+    target: Any, size: tuple[float, float, float], given: tuple[float, ...] | None
+) -> None:
+    found = bodies_at(target, TargetBody(size=given))
+    (main,), (core,) = found["target"], found["target from behind"]
+    across, up, deep = size
+    expected = [[0.0, deep], [-across / 2, across / 2], [-up / 2, up / 2]]
+    np.testing.assert_allclose(spans(main), expected, atol=1e-12)
+    assert main.strikable and not main.before
+    assert main.moves == (not isinstance(target, RigidWall))
+    np.testing.assert_allclose(spans(core)[0, 0], BEHIND, atol=1e-12)
+    np.testing.assert_allclose(spans(core)[1:], expected[1:], atol=1e-12)
+    assert core.core and core.before and not core.strikable and not core.moves
+
+
+def test_a_ball_begins_at_the_point() -> None:
+    (ball,) = bodies_at(FreeMass(mass=1.0), TargetBody(shape="ball", size=(0.1,)))["target"]
+    np.testing.assert_allclose(ball.place, POINT + 0.05 * NORMAL)
+    assert isinstance(ball.shape, coal.Sphere) and ball.shape.radius == 0.05
+    away = told(ball.planes, 0.12 * directions(50))
+    assert (away <= 0.07 + 1e-12).all() and away.min() > 0.05
+
+
+def test_a_target_may_have_no_body() -> None:
+    assert bodies_at(FreeMass(mass=1.0), TargetBody(shape="none")) == {}
+
+
+def test_a_board_lies_on_two_supports() -> None:
+    found = bodies_at(Board(mass=0.3, stiffness=1e5, breaking_force=900.0))
+    (board,) = found["target"]
+    np.testing.assert_allclose(spans(board), [[0, 0.02], [-0.15, 0.15], [-0.12, 0.12]], atol=1e-12)
+    assert board.before and board.moves and board.strikable
+    left, right = sorted(found["target's support"], key=lambda b: spans(b)[1, 0])
+    np.testing.assert_allclose(spans(left), [[0.02, 0.14], [-0.15, -0.11], [-0.12, 0.12]], atol=1e-12)
+    np.testing.assert_allclose(spans(right), [[0.02, 0.14], [0.11, 0.15], [-0.12, 0.12]], atol=1e-12)
+    assert not (left.before or left.moves or left.strikable)
+
+
+def test_a_nail_stands_out_of_its_block() -> None:
+    found = bodies_at(Nail(mass=0.1, resistance=300.0, depth=0.02))
+    (shank,), (block,) = found["target"], found["target's block"]
+    assert isinstance(shank.shape, coal.Capsule)
+    ends = [shank.place + sign * shank.half[2] * shank.rotation[:, 2] for sign in (-1, 1)]
+    np.testing.assert_allclose(ends, [POINT + 0.004 * NORMAL, POINT + 0.046 * NORMAL], atol=1e-12)
+    assert shank.shape.radius == 0.004 and 2 * shank.shape.halfLength == pytest.approx(0.042)
+    np.testing.assert_allclose(spans(block), [[0.05, 0.11], [-0.1, 0.1], [-0.1, 0.1]], atol=1e-12)
+    assert shank.moves and not block.moves
+    deep = bodies_at(Nail(mass=0.1, resistance=300.0, depth=0.065))
+    assert list(deep) == ["target's block"]
+    np.testing.assert_allclose(spans(deep["target's block"][0])[0, 0], 0.005, atol=1e-12)
+
+
+def test_the_ground_is_what_is_below() -> None:
+    floor = ground()
+    assert distance(coal.Sphere(0.1), at(np.array([1.0, 2.0, 0.3])), floor.shape, at(floor.place)) == (
+        pytest.approx(0.2, abs=1e-9)
+    )
+    above = np.array([[0.3, -2.0, 0.25], [0.0, 0.0, -0.01]])
+    np.testing.assert_allclose(told(floor.planes, above - floor.place), [0.25, -0.01], atol=1e-9)
+
+
+def test_obstacles_are_where_they_are_said_to_be() -> None:
+    box, bar, ball = obstacle_bodies(
+        (
+            Obstacle(name="box", size=(0.2, 0.4, 0.6), position=(1, 2, 3), rpy=(0.1, -0.2, 0.3)),
+            Obstacle(name="bar", start=(0, 0, 1), end=(0.3, 0.4, 1), radius=0.05),
+            Obstacle(name="ball", start=(1, 1, 1), radius=0.2),
+        )
+    )
+    np.testing.assert_allclose(box.rotation, pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), atol=1e-12)
+    np.testing.assert_allclose(box.place, [1, 2, 3])
+    np.testing.assert_allclose(2 * box.half, [0.2, 0.4, 0.6])
+    ends = [bar.place + sign * bar.half[2] * bar.rotation[:, 2] for sign in (-1, 1)]
+    np.testing.assert_allclose(ends, [[0, 0, 1], [0.3, 0.4, 1]], atol=1e-12)
+    np.testing.assert_allclose(bar.rotation.T @ bar.rotation, np.eye(3), atol=1e-12)
+    assert np.linalg.det(bar.rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(ball.place, [1, 1, 1])
+    assert isinstance(ball.shape, coal.Sphere)
+    assert not any(b.of_target or b.moves or b.strikable for b in (box, bar, ball))
+    rng = np.random.default_rng(0)
+    for body, exact in (
+        (bar, lambda x: _from_line(x, np.array([0, 0, 1.0]), np.array([0.3, 0.4, 1.0])) - 0.05),
+        (ball, lambda x: np.linalg.norm(x - 1.0) - 0.2),
+    ):
+        for x in rng.uniform(-1, 2, (20, 3)):
+            place = coal.Transform3s(body.rotation, body.place)
+            assert distance(coal.Sphere(1e-9), at(x), body.shape, place) == pytest.approx(exact(x), abs=1e-6)
+            assert told(body.planes, ((x - body.place) @ body.rotation)[None]) <= exact(x) + 1e-9
+
+
+def _from_line(x: Array, a: Array, b: Array) -> float:
+    s = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+    return float(np.linalg.norm(x - a - s * (b - a)))
+
+
+# ---- what makes no sense
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: TargetBody(shape="bal"), "did you mean 'ball'"),
+        (lambda: TargetBody(size=(0.1, 0.1)), "TargetBody.size"),
+        (lambda: TargetBody(shape="ball", size=(0.1, 0.1, 0.1)), "TargetBody.size"),
+        (lambda: TargetBody(size=(0.1, 0.0, 0.1)), "lengths > 0"),
+        (lambda: TargetBody(shape="none", size=(0.1, 0.1, 0.1)), "none of shape 'none'"),
+        (lambda: Obstacle(name="it"), "either size, of a box"),
+        (lambda: Obstacle(name="it", size=(1, 1, 1), start=(0, 0, 0)), "either size, of a box"),
+        (lambda: Obstacle(name="it", size=(1, -1, 1)), "lengths > 0"),
+        (lambda: Obstacle(name="it", size=(1, 1, 1), radius=0.1), "no end and no radius"),
+        (lambda: Obstacle(name="it", size=(1, 1)), "'it': size"),
+        (lambda: Obstacle(name="it", start=(0, 0, 0)), "radius > 0"),
+        (lambda: Obstacle(name="it", start=(0, 0, 0), radius=float("nan")), "radius > 0"),
+        (lambda: Obstacle(name="it", start=(0, 0, 0), radius=0.1, position=(1, 0, 0)), "no position"),
+        (lambda: Obstacle(name="", size=(1, 1, 1)), "give a word"),
+    ],
+)
+def test_bodies_that_make_no_sense_are_refused(make: Callable[[], Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_a_world_that_makes_no_sense_is_refused() -> None:
+    problem = arm_problem()
+    ball = Obstacle(name="ball", start=(3, 3, 3), radius=0.1)
+    for changes, words in (
+        ({"obstacles": (ball, ball)}, "two obstacles are called 'ball'"),
+        ({"obstacles": ("ball",)}, "a tuple of Obstacle"),
+        ({"body": "box"}, "a TargetBody"),
+    ):
+        with pytest.raises(InputError, match=words):
+            dataclasses.replace(problem, **changes)
+
+
+def test_a_start_in_something_is_refused() -> None:
+    problem = arm_problem()
+    model, data = problem.robot.model, problem.robot.model.createData()
+    pin.forwardKinematics(model, data, problem.start_posture)
+    elbow = tuple(data.oMi[3].translation.tolist())
+    post = Obstacle(name="post", start=elbow, radius=0.05)
+    inside = dataclasses.replace(problem, obstacles=(post,))
+    with pytest.raises(InputError, match=r"at the start the link '\w+' is in the body 'post'"):
+        _ = inside.bodies
+    free = dataclasses.replace(inside, terms=(KeepOut(enabled=False),))
+    assert len(free.bodies.world) == len(inside.obstacles) + 3, "who switches it off is not told"
+    large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)))
+    moved = dataclasses.replace(large, point=np.array(problem.point) - np.array([0.0, 0.4, 0.0]))
+    with pytest.raises(InputError, match="is in the body 'target"):
+        _ = moved.bodies
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        ((("elbow", "wirst"),), "no frame 'wirst'.*did you mean 'wrist'"),
+        ((("elbow",),), "no pair of links' names"),
+        ((("elbow", 3),), "no pair of links' names"),
+    ],
+)
+def test_pairs_of_links_that_there_are_not_are_refused(pairs: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        planar_arm(disable_collisions=pairs)
+
+
+def test_an_srdf_says_which_links_may_touch_but_for_what_it_sampled(tmp_path: Path) -> None:
+    from support.problem_texts import ARM, write
+
+    urdf = write(tmp_path, ARM, "arm.urdf")
+    srdf = write(
+        tmp_path,
+        """<robot name="two links">
+  <rotor_params> <joint name="turn" mass="1e-5" gear_ratio="100.0"/> </rotor_params>
+  <disable_collisions link1="upper" link2="lower" reason="Adjacent"/>
+  <disable_collisions link1="upper" link2="fist" reason="Never"/>
+  <disable_collisions link1="ground" link2="fist" reason="User"/>
+</robot>""",
+        "arm.srdf",
+    )
+    robot = Robot.from_urdf(
+        urdf, srdf=srdf, floating=False, armature=0.05, disable_collisions=[("lower", "ground")]
+    )
+    assert robot.disable_collisions == (("upper", "lower"), ("ground", "fist"), ("lower", "ground"))
+
+
+def test_a_robots_bodies_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = planar_arm()
+    found = bodies_of(robot)
+    assert bodies_of(robot) is found
+    again = bodies_of(dataclasses.replace(robot))
+    np.testing.assert_array_equal(again.centre, found.centre)
+    assert [len(again.planes[j].normal) for j in again.joints] == [PLANES] * len(again.joints)
+    with io.BytesIO() as file:
+        np.savez(file, out=np.array(list(found.out.values())))
+    assert all(isinstance(s, float) for s in (*found.out.values(), *found.short.values()))
+    assert isinstance(Spheres(centre=found.centre, radius=found.radius, out=0.0, short=0.0), Spheres)

@@ -1,0 +1,192 @@
+"""`impactopt validate`: a result on disk is replayed, described and drawn; what does not fit is said so."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.fake_solution import still_problem, still_solution
+from typer.testing import CliRunner
+
+from impactopt.cli.app import app
+from impactopt.cli.validate import validate
+from impactopt.errors import InputError
+from impactopt.files.output import Record, load_record, record_of, save_record
+from impactopt.files.replay import Planned, Replay, load_planned, replay
+from impactopt.pictures.animation import AROUND, FPS, SLOW, _Stage, save_animation, shown_times
+from impactopt.planning.solution import Solution
+from impactopt.simulation import Conditions
+from impactopt.simulation.result import REPORT
+
+FLAT = REPORT[:13]  # numbers for the whole motion; after them, what is by phase or by sole
+PUNCH = Path(__file__).resolve().parents[2] / "problems" / "punch.toml"
+QUICK = ("--step", "5e-4", "--settle", "1.0")
+
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def saved(punch: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `impactopt solve` leaves, without its replays."""
+    directory = tmp_path_factory.mktemp("results") / "punch"
+    save_record(record_of(punch, problem=PUNCH.read_text("utf-8"), problem_path=PUNCH), directory)
+    return directory
+
+
+def resaved(saved: Path, directory: Path, **changes: Any) -> Path:
+    save_record(dataclasses.replace(load_record(saved), **changes), directory)
+    return directory
+
+
+def run(*arguments: object, code: int = 0) -> tuple[str, str]:
+    """stdout and stderr of `validate`, whose exit code is checked."""
+    result = runner.invoke(app, ["validate", *(str(a) for a in arguments)])
+    assert result.exit_code == code, result.output
+    assert "Traceback" not in result.output
+    return result.stdout, result.stderr
+
+
+def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -> None:
+    out, _ = run(saved, "--json", "--out", tmp_path / "new" / "place", *QUICK)
+    report = json.loads(out)
+    assert tuple(report) == REPORT
+    assert report["engine"] == "mujoco" and report["standing"] is True and report["reason"] == ""
+    for name in FLAT[3:]:
+        assert np.isfinite(report[name]), name
+    assert report["impulse_error_pct"] == pytest.approx(100 * (report["impulse_Ns"] / punch.impulse - 1))
+    assert report["zmp_margin_m"] == min(report["zmp_margin_by_phase_m"].values())
+    assert report["torque_ratio"] == max(report["torque_ratio_by_phase"].values())
+    assert report["sole_cop_margin_m"].keys() == {"left", "right"}
+    written = {path.name for path in (tmp_path / "new" / "place").iterdir()}
+    assert written == {"replay.json", "replay.png"}
+    assert json.loads((tmp_path / "new" / "place" / "replay.json").read_text()) == report
+
+
+def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
+    out, _ = run(saved / "solution.npz", "--engine", "pinocchio", "--json", "--step", "5e-4")
+    report = json.loads(out)
+    assert report["standing"] is None and "held" in report["reason"]
+    assert abs(report["impulse_error_pct"]) < 2
+
+
+def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
+    out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", code=1)
+    assert "stands at the end" in out and "! no" in out
+    out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", "--json", code=1)
+    report = json.loads(out)
+    assert report["reason"].startswith("fell: ") and " at t = " in report["reason"]
+    assert report["impulse_Ns"] == 0 and report["standing"] is False
+
+
+def test_every_condition_is_an_option_with_its_default() -> None:
+    options = inspect.signature(validate).parameters
+    for f in dataclasses.fields(Conditions):
+        assert options[f.name].default == f.default, f.name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--friction", "-1"], ["friction is -1"]),
+        (["--engine", "pinocchio", "--missing"], ["pinocchio", "take engine 'mujoco'"]),
+        (["--step", "0"], ["step [s]: 0"]),
+        (["--animation", "punch.mp4", "--step", "1e-3", "--settle", "0"], ["punch.mp4", ".gif"]),
+    ],
+)
+def test_bad_options_are_one_message_and_exit_2(saved: Path, arguments: list[str], parts: list[str]) -> None:
+    out, err = run(saved, *arguments, code=2)
+    assert out == "" and err.count("error:") == 1
+    assert [part for part in parts if part not in err] == []
+
+
+def test_a_result_that_is_not_there(tmp_path: Path) -> None:
+    _, err = run(tmp_path, code=2)
+    assert "solution.npz" in err and "impactopt solve" in err
+
+
+def test_a_result_without_its_problem_file_asks_for_it(saved: Path, tmp_path: Path) -> None:
+    lonely = resaved(saved, tmp_path / "lonely", problem="", problem_path=None)
+    with pytest.raises(InputError, match="holds no problem file: give it with --problem FILE"):
+        load_planned(lonely)
+    planned = load_planned(lonely, problem_file=PUNCH)
+    assert planned.problem.robot.name == "talos"
+    np.testing.assert_array_equal(planned.reference.q, load_record(saved).arrays["reference_q"])
+
+
+def test_a_urdf_that_has_moved_is_one_clear_error(saved: Path, tmp_path: Path) -> None:
+    text = PUNCH.read_text("utf-8").replace('robot = "talos"', "#") + '\n[robot]\nurdf = "gone.urdf"\n'
+    moved = resaved(saved, tmp_path / "results", problem=text, problem_path=tmp_path / "problems" / "my.toml")
+    with pytest.raises(InputError, match=r"problems/gone\.urdf(.|\n)*--problem FILE"):
+        load_planned(moved)
+
+
+def test_a_plan_of_another_robot_is_refused(saved: Path, tmp_path: Path) -> None:
+    arrays = dict(load_record(saved).arrays)
+    arrays["joints"] = arrays["joints"][::-1]
+    other = resaved(saved, tmp_path / "other", arrays=arrays)
+    with pytest.raises(InputError, match="planned for another robot than 'talos'"):
+        load_planned(other)
+
+
+def test_a_result_without_a_motion_has_nothing_to_replay(tmp_path: Path) -> None:
+    save_record(Record(summary={"note": "stopped early"}), tmp_path)
+    with pytest.raises(InputError, match="no motion to replay: stopped early"):
+        load_planned(tmp_path)
+
+
+# ---- pictures
+
+
+@pytest.fixture(scope="module")
+def still() -> Replay:
+    """The small biped stands still before a target that is pushed into its fist."""
+    problem = still_problem()
+    solution = still_solution(problem=problem)
+    planned = Planned(record=record_of(solution), problem=problem, reference=solution.trajectory)
+    return replay(planned, conditions=Conditions(distance=-0.001), step=5e-4, settle=0.05)
+
+
+def test_a_replay_takes_the_place_of_an_older_one(still: Replay) -> None:
+    assert still.record.replayed and not still.planned.record.replayed
+    assert still.record.summary["replayed"] == still.report
+    assert list(still.record.arrays["replayed_soles"]) == ["left", "right"]
+
+
+def test_the_animation_draws_the_world_where_the_replay_has_it(still: Replay) -> None:
+    problem = still.planned.problem
+    (target,) = _Stage(still).look(0).world
+    ahead = np.sort((target - problem.point) @ problem.normal)
+    assert ahead == pytest.approx(np.repeat([-0.001, 0.179], 4)), "1 mm nearer, 18 cm deep"
+    gone = dataclasses.replace(still, conditions=Conditions(missing=True))
+    assert _Stage(gone).look(0).world == []
+
+
+def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path) -> None:
+    sim = still.simulation
+    assert sim.contact_start == 0 and still.report["hand_speed_m_s"] is not None
+    path = save_animation(still, tmp_path / "still.gif")
+    times, _ = shown_times(sim.contact_start, sim.contact_end, float(sim.time[-1]))
+    with Image.open(path) as picture:
+        # pictures that are alike are one that stays longer
+        assert 2 <= picture.n_frames <= len(times) + 1
+        durations = []
+        for k in range(picture.n_frames):
+            picture.seek(k)
+            durations.append(picture.info["duration"])
+    assert sum(durations) >= len(times) * 1000 // FPS
+    assert path.stat().st_size < 1_000_000
+
+
+def test_time_runs_slower_around_contact() -> None:
+    times, paces = shown_times(0.8, 0.86, 2.0)
+    slow = (times >= 0.8 - AROUND) & (times < 0.86 + AROUND)
+    np.testing.assert_array_equal(paces, np.where(slow, SLOW, 1))
+    np.testing.assert_allclose(np.diff(times), 1 / FPS / paces[:-1])
+    times, paces = shown_times(np.nan, np.nan, 0.99)
+    assert (paces == 1).all() and len(times) == FPS

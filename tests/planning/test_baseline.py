@@ -1,0 +1,83 @@
+"""The minimum-jerk baseline: inside the limits, true to its profile, as fast as it can be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.small_robots import arm, biped, striking_point
+
+from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
+from impactopt.errors import InputError
+from impactopt.kinematics.stance import FixedBase
+from impactopt.planning.baseline import _holds, _profile, _wrenches_exist, minimum_jerk_baseline
+from impactopt.problem.problem import ImpactProblem, Phase
+from impactopt.problem.terms import TorqueLimit
+
+LAW = SpringDamper(stiffness=1e4, damping=300.0)
+
+
+def reach_of(robot: Any, posture: str, striker: str, **options: Any) -> ImpactProblem:
+    return ImpactProblem(
+        robot=robot,
+        striker=striker,
+        start=posture,
+        point=striking_point(robot, posture, striker) + np.array([0.05, 0.03, 0.03]),
+        normal=[1.0, 0.0, 0.0],
+        law=LAW,
+        target=FreeMass(mass=3.0),
+        swing=Phase(duration=0.6, intervals=6),
+        follow=Phase(duration=0.8, intervals=6),
+        **options,
+    )
+
+
+def test_the_profile_is_the_quintic_with_its_ends_and_derivatives() -> None:
+    rng = np.random.default_rng(0)
+    ends = tuple(rng.standard_normal((4, 3)))
+    duration, h = 0.7, 1e-5
+    time = np.linspace(h, duration - h, 50)
+    y, yd, ydd = _profile(duration, ends, time)  # type: ignore[arg-type]
+    before, after = (_profile(duration, ends, time + s)[0] for s in (-h, h))  # type: ignore[arg-type]
+    np.testing.assert_allclose(yd, (after - before) / (2 * h), atol=1e-7)
+    np.testing.assert_allclose(ydd, (after - 2 * y + before) / h**2, atol=1e-3)
+    first, last = (_profile(duration, ends, np.array([t])) for t in (0.0, duration))  # type: ignore[arg-type]
+    for (got, rate, acc), (place, speed) in zip((first, last), (ends[:2], ends[2:]), strict=True):
+        np.testing.assert_allclose(got[0], place, atol=1e-12)
+        np.testing.assert_allclose(rate[0], speed, atol=1e-11)
+        np.testing.assert_allclose(acc[0], 0.0, atol=1e-9)
+
+
+def test_it_is_inside_the_limits_and_a_little_faster_is_not() -> None:
+    problem = reach_of(arm(), "start", "hand", stance=FixedBase())
+    found = minimum_jerk_baseline(problem, tolerance=0.05)
+    assert found.impulse == pytest.approx(3.0 * found.simulation.target_speed[-1])
+    assert found.impulse > 0
+    assert found.summary["hand_speed_m_s"] == pytest.approx(found.speed, rel=0.03)
+    assert max(found.summary["torque_ratio"].values()) <= 1.0
+    assert _holds(problem, found.duration, found.speed)
+    assert not _holds(problem, found.duration, 20 * found.speed)
+    assert found.describe()["impulse_Ns"] == found.impulse
+
+
+def test_wrenches_exist_only_for_what_soles_can_push() -> None:
+    robot = biped()
+    problem = reach_of(robot, "half_sitting", "fist")
+    q, zero = problem.start_posture, np.zeros(robot.nv)
+    assert _wrenches_exist(problem, q, zero, zero)
+    for axis, acceleration in (
+        (2, -20.0),
+        (1, 10.0),
+        (0, -10.0),
+    ):  # down: they would pull; aside: they would slip
+        moving = zero.copy()
+        moving[axis] = acceleration
+        assert not _wrenches_exist(problem, q, zero, moving)
+
+
+def test_limits_that_do_not_let_it_stand_are_said() -> None:
+    problem = reach_of(arm(), "start", "hand", stance=FixedBase(), terms=(TorqueLimit(fraction=1e-3),))
+    with pytest.raises(InputError, match=r"minimum-jerk reach that hits at 0\.01 m/s"):
+        minimum_jerk_baseline(problem)

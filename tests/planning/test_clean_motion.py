@@ -1,0 +1,56 @@
+"""A motion whose bodies keep apart, by someone else's reading of the robot: exact meshes of its URDF, not
+our hulls.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.small_plans import BODILESS
+
+from impactopt import Solution, load_problem, solve
+from impactopt.simulation.reference.meshes import Meshes
+
+
+def test_no_mesh_is_in_another_from_start_to_rest_or_after_a_miss(punch: Solution) -> None:
+    assert punch.status.usable, punch.result.message
+    meshes = Meshes(punch.problem.robot, punch.problem.start_posture)
+    assert meshes.known
+    for missed in (False, True):
+        assert meshes.touching(punch.plan.motion(1e-3, missed=missed).q) == []
+
+
+def test_the_meshes_know_what_is_in_each_other(punch: Solution) -> None:
+    """A forearm turned through the pelvis is found: what never fails would say nothing."""
+    robot, q = punch.problem.robot, punch.problem.start_posture.copy()
+    for joint in ("arm_left_4_joint", "arm_left_2_joint"):
+        q[robot.model.joints[robot.model.getJointId(joint)].idx_q] = 0.0
+    meshes = Meshes(robot, punch.problem.start_posture)
+    assert any("arm_left" in one or "arm_left" in two for one, two in meshes.touching(q[None]))
+
+
+@pytest.mark.parametrize("name", ["door", "chop", "nailing", "kick_g1"])
+def test_nor_in_other_problems(name: str) -> None:
+    solution = solve(load_problem(name))
+    assert solution.status.usable, solution.result.message
+    meshes = Meshes(solution.problem.robot, solution.problem.start_posture)
+    assert meshes.known
+    for missed in (False, True) if solution.plan.brake is not None else (False,):
+        assert meshes.touching(solution.plan.motion(1e-3, missed=missed).q) == []
+
+
+def test_the_summary_says_so(punch: Solution) -> None:
+    said = punch.clearance()
+    assert said["contacts_besides"] == [] and said["clearance_mm"] > 0 and " and " in said["nearest"]
+    assert np.isfinite(said["clearance_mm"]) and len(punch.apart) > 0
+
+
+def test_what_is_switched_off_is_told(punch: Solution) -> None:
+    """The same punch without these terms: another's count of the pairs that pass through each other was
+    29.
+    """
+    said = solve(dataclasses.replace(punch.problem, terms=(*punch.problem.terms, *BODILESS))).clearance()
+    assert said["clearance_mm"] < -50
+    assert len({(touch["one"], touch["other"]) for touch in said["contacts_besides"]}) > 20

@@ -1,0 +1,289 @@
+"""Replays of every law and target: closed forms, independent integration, and plans of the small robots."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from support.small_motions import reference, scene
+from support.small_plans import BODILESS, arm_problem, transcribed
+from support.small_robots import arm, slider
+
+from impactopt.contact import (
+    Board,
+    ContactLaw,
+    CustomLaw,
+    FreeMass,
+    HertzDamped,
+    HuntCrossley,
+    KelvinVoigt,
+    Nail,
+    RigidWall,
+    SpringDamper,
+    Target,
+)
+from impactopt.errors import InputError
+from impactopt.report.console import replay_table
+from impactopt.robots.robot import Robot
+from impactopt.simulation import (
+    Conditions,
+    Scene,
+    Simulation,
+    robustness,
+    simulate,
+    simulate_mujoco,
+    simulate_pinocchio,
+)
+from impactopt.simulation.accuracy import check_steps, with_step_error
+from impactopt.simulation.robustness import Spread
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.solvers.program import Status
+from impactopt.transcription.start import first_iterate
+
+Array = NDArray[np.float64]
+Engine = Callable[..., Simulation]
+ENGINES = pytest.mark.parametrize("engine", [simulate_pinocchio, simulate_mujoco], ids=["held", "free"])
+MASS, SPEED, PUSH = 2.0, 1.5, 0.05  # [kg], [m/s], [s] of the hammer; how long it is pushed
+STEP, BLOW = 4e-5, 0.02  # [s]; how long the blow is watched
+NAIL = Nail(mass=0.1, resistance=300.0, hardening=1e4, depth=0.005)
+BOARD = Board(mass=0.3, stiffness=1e5, breaking_force=400.0, damping=5.0)
+FINE = ((0.1, 0.2, 0.3, 0.4), (0.25, 0.25, 0.5))
+
+
+def hammer(target: Target, law: ContactLaw) -> tuple[Robot, Any, Scene]:
+    """A point mass that is pushed to its speed and let go hits: robot, reference, scene."""
+    force = MASS * SPEED / PUSH
+    torque = [[force], [force], [0.0], [0.0]]
+    ref = reference([0.0, PUSH, PUSH, PUSH + 0.002 + BLOW], np.zeros(1), torque=torque, nv=1, n=1)
+    point = np.array([0.5 * SPEED * PUSH + SPEED * 0.002, 0.0, 0.0])
+    return slider(MASS), ref, scene(point=point, law=law, target=target)
+
+
+def blow(
+    engine: Engine, law: ContactLaw, target: Target, *, step: float = STEP, **options: Any
+) -> Simulation:
+    return engine(*hammer(target, law), step=step, settle=0.0, **options)
+
+
+@functools.cache
+def integrated(law: ContactLaw, target: Target) -> tuple[float, Array]:
+    """Impulse and the target's state, of the same two bodies by SciPy."""
+
+    def rates(_t: float, z: Array) -> list[float]:
+        x, v, travel = z[:3]
+        speed = float(target.velocity(z[4:]))
+        force = float(law.force(x - travel, v - speed)) if x > travel else 0.0
+        return [v, -force / MASS, speed, force, *target.derivative(z[4:], force)]
+
+    start = [0.0, SPEED, 0.0, 0.0, *np.zeros(target.n_states)]
+    # no step is longer than what could hide a switch
+    run = solve_ivp(rates, (0.0, BLOW), start, method="RK45", rtol=1e-7, atol=1e-10, max_step=4e-5)
+    return float(run.y[3, -1]), run.y[4:, -1]
+
+
+# ---- a point mass
+
+
+@ENGINES
+@pytest.mark.parametrize("damping", [0.0, 100.0])
+def test_a_wall_gives_back_what_the_damper_leaves(engine: Engine, damping: float) -> None:
+    """zeta = d / (2 sqrt(k m)): e = exp(-2 zeta acos(zeta) / sqrt(1 - zeta^2)), a force of zero ends it."""
+    k = 1e5
+    sim = blow(engine, KelvinVoigt(stiffness=k, damping=damping), RigidWall())
+    zeta = damping / (2 * np.sqrt(k * MASS))
+    e = np.exp(-2 * zeta * np.arccos(zeta) / np.sqrt(1 - zeta**2))
+    # the step of the first touch misses some of the damper's force, which jumps there
+    assert sim.impulse == pytest.approx(MASS * SPEED * (1 + e), rel=2e-5, abs=damping * SPEED * STEP)
+    assert sim.hand_speed[-1] == pytest.approx(SPEED - sim.impulse / MASS, rel=1e-9)
+    wd = np.sqrt(k / MASS * (1 - zeta**2))
+    separation = 2 * np.arccos(zeta) / wd if damping else np.pi / wd
+    assert sim.contact_end - sim.contact_start == pytest.approx(separation, abs=2.1 * STEP)
+    assert (sim.target_speed == 0).all() and sim.outcome == {}
+    assert (sim.force >= 0).all()
+
+
+@ENGINES
+@pytest.mark.parametrize(
+    ("law", "target"),
+    [
+        (KelvinVoigt(stiffness=1e5, damping=50.0), FreeMass(mass=1.0)),
+        (HuntCrossley(stiffness=3e6, dissipation=0.1), FreeMass(mass=1.0)),
+        (HertzDamped(stiffness=3e6, damping=1000.0), RigidWall()),
+        (CustomLaw(compression=lambda x, _rate, k: k * ca.fmax(x, 2 * x - 1e-3), k=5e4), FreeMass(mass=1.0)),
+        (HuntCrossley(stiffness=3e6, dissipation=0.1), NAIL),
+        (SpringDamper(stiffness=1e5, damping=50.0), NAIL),
+        (HuntCrossley(stiffness=3e6, dissipation=0.1), BOARD),
+        (SpringDamper(stiffness=1e5, damping=50.0), BOARD),
+        (SpringDamper(stiffness=1e5, damping=50.0), dataclasses.replace(BOARD, breaking_force=4e3)),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_the_blow_is_that_of_an_independent_integration(
+    engine: Engine, law: ContactLaw, target: Target
+) -> None:
+    sim = blow(engine, law, target)
+    impulse, state = integrated(law, target)
+    missed = float(law.force(1e-12, SPEED)) * STEP
+    assert sim.impulse == pytest.approx(impulse, rel=1e-3, abs=missed)
+    assert sim.outcome.keys() == target.outcome(state).keys()
+    for name, value in target.outcome(state).items():
+        assert sim.outcome[name] == pytest.approx(value, rel=4e-3), name
+    assert sim.hand_speed[-1] == pytest.approx(SPEED - sim.impulse / MASS, rel=1e-9)
+
+
+@ENGINES
+def test_switches_cost_no_accuracy(engine: Engine) -> None:
+    """A nail slips and sticks, a board breaks, within steps of the engine: the contact has its own."""
+    law = HuntCrossley(stiffness=3e6, dissipation=0.1)
+    for target in (NAIL, BOARD):
+        exact, _ = integrated(law, target)
+        for step in (1e-4, 2.5e-5):
+            assert blow(engine, law, target, step=step).impulse == pytest.approx(exact, rel=1e-4), target
+
+
+# ---- targets that move a thousand times within a step
+
+
+@ENGINES
+@pytest.mark.parametrize("mass", [1e-5, 1e-3, 0.1, 10.0, 1e4])
+def test_light_and_heavy_targets_of_steel_are_those_of_an_independent_integration(
+    engine: Engine, mass: float
+) -> None:
+    for law in (SpringDamper(stiffness=5e6, damping=200.0), KelvinVoigt(stiffness=5e5, damping=20.0)):
+        exact, state = integrated(law, FreeMass(mass=mass))
+        sim = blow(engine, law, FreeMass(mass=mass), step=1e-4)
+        assert sim.impulse == pytest.approx(exact, rel=1e-3)
+        assert sim.outcome["speed_m_s"] == pytest.approx(state[0], rel=1e-3)
+        # hammer and target move on for good
+        assert len(sim.touches) == 1 and sim.touches[0][2] == pytest.approx(exact, rel=1e-3)
+
+
+@ENGINES
+@pytest.mark.parametrize("mass", [1e-4, 5e-3])
+def test_a_light_nail_is_driven_as_by_an_independent_integration(engine: Engine, mass: float) -> None:
+    law, nail = KelvinVoigt(stiffness=5e5, damping=200.0), Nail(mass=mass, resistance=600.0, hardening=1e4)
+    exact, state = integrated(law, nail)
+    sim = blow(engine, law, nail, step=2e-4)
+    assert sim.impulse == pytest.approx(exact, rel=1e-2)
+    assert sim.outcome["depth_m"] == pytest.approx(state[1], rel=1e-2)
+
+
+@ENGINES
+def test_steps_that_leave_the_impulse_uncertain_are_found_out(engine: Engine) -> None:
+    there = hammer(FreeMass(mass=1e-3), SpringDamper(stiffness=5e5, damping=20.0))
+    fine = with_step_error(engine, *there, settle=0.0)
+    assert 0 <= fine.step_error < 1e-2
+    check_steps(fine, None)
+    assert fine.impulse == pytest.approx(integrated(there[2].law, there[2].target)[0], rel=1e-2)
+    with pytest.raises(InputError, match="longer than its motion"):
+        with_step_error(engine, *there, settle=0.0, step=1.0)
+    coarse = with_step_error(engine, *there, settle=0.0, step=0.06)  # one step, away over the contact
+    assert coarse.step_error > 1e-2
+    with pytest.raises(InputError, match=r"steps of 0\.06 s leave .* % of its impulse, .* uncertain"):
+        check_steps(coarse, 0.06)
+
+
+def test_draws_whose_steps_leave_the_impulse_uncertain_have_no_result() -> None:
+    """As in `validate`: a step of 60 ms goes over the whole blow, those of half a millisecond are halved."""
+    law, target = SpringDamper(stiffness=5e5, damping=20.0), FreeMass(mass=1e-3)
+    robot, motion, world = hammer(target, law)
+    shared = robustness.Shared(robot=robot, reference=motion, scene=world, step=robustness.STEP)
+    trusted = robustness.replay(shared, Conditions())
+    assert trusted.impulse == pytest.approx(integrated(law, target)[0], rel=1e-2)
+    doubtful = robustness.replay(dataclasses.replace(shared, step=0.06), Conditions())
+    assert not doubtful.standing and np.isnan(doubtful.impulse)
+    assert "not to be trusted: steps of 0.06 s" in doubtful.reason
+
+
+@ENGINES
+def test_a_nail_goes_as_deep_as_the_work_on_its_head_lasts(engine: Engine) -> None:
+    """R z + hardening z^2 / 2, and nothing pulls it out again."""
+    sim = blow(engine, KelvinVoigt(stiffness=1e5, damping=50.0), NAIL, record=1)
+    work = STEP * float(sim.force @ sim.target_speed)
+    depth = sim.outcome["depth_m"]
+    assert sim.target_speed[-1] == 0
+    start = NAIL.resistance + NAIL.hardening * NAIL.depth
+    assert start * depth + NAIL.hardening * depth**2 / 2 == pytest.approx(work, rel=1e-2)
+    assert depth == pytest.approx(STEP * float(sim.target_speed.sum()), rel=5e-3)
+    assert depth > 3e-3 and (sim.target_speed >= 0).all()
+
+
+# ---- conditions
+
+
+def test_conditions_change_numbers_that_there_are() -> None:
+    there = scene(law=KelvinVoigt(stiffness=1e4, damping=10.0), target=BOARD)
+    other = Conditions(mass=2.0, stiffness=3.0, damping=0.5).scene(there)
+    assert other.law == KelvinVoigt(stiffness=3e4, damping=5.0)
+    assert other.target == dataclasses.replace(BOARD, mass=0.6)
+    wall = scene(law=HuntCrossley(stiffness=1e6, dissipation=0.1), target=RigidWall())
+    assert Conditions(stiffness=2.0).scene(wall).law == HuntCrossley(stiffness=2e6, dissipation=0.1)
+    with pytest.raises(InputError, match="conditions: the target RigidWall has no mass; leave it out"):
+        Conditions(mass=2.0).scene(wall)
+    with pytest.raises(InputError, match="conditions: the law HuntCrossley has no damping"):
+        Conditions(damping=2.0).scene(wall)
+
+
+def test_what_a_target_does_not_have_is_not_drawn() -> None:
+    wall = Spread(mass=(0.5, 2.0)).of(scene(target=RigidWall()))
+    assert wall == dataclasses.replace(Spread(), mass=(1.0, 1.0))
+    assert Spread().of(scene(target=NAIL)) == Spread()
+
+
+def test_a_nail_that_is_not_there_stays_as_it_was() -> None:
+    law = SpringDamper(stiffness=1e5, damping=50.0)
+    sim = blow(simulate_mujoco, law, NAIL, step=2e-4, conditions=Conditions(missing=True))
+    assert sim.impulse == 0 and sim.outcome == {"depth_m": 0.0} and np.isnan(sim.contact_start)
+
+
+# ---- plans
+
+
+@pytest.mark.parametrize(
+    ("target", "changes"),
+    [
+        (Nail(mass=0.1, resistance=150.0, hardening=1e3), {"collision_elements": FINE}),
+        (Board(mass=0.3, stiffness=2e4, breaking_force=50.0), {}),
+        (RigidWall(), {"contact_duration": (1e-3, 0.03)}),
+    ],
+    ids=lambda x: type(x).__name__ if isinstance(x, Target) else "",
+)
+def test_a_plan_is_replayed_with_what_it_promises(target: Target, changes: dict[str, Any]) -> None:
+    """An arm: impulse, force, duration, depth. Its elbow goes where the target's body is.
+
+    MuJoCo's steps are of first order, and a contact that ends with hardly any force ends a little early: by
+    0.42, 0.32, 0.22 ms with steps of 100, 50, 25 us.
+    """
+    law = KelvinVoigt(stiffness=5e4, damping=100.0)
+    robot = arm(kp=300.0, kd=10.0)
+    problem = dataclasses.replace(
+        arm_problem(), robot=robot, law=law, target=target, terms=BODILESS, **changes
+    )
+    transcription = transcribed(problem)
+    result = solve_ipopt(transcription.program, first_iterate(transcription))
+    assert result.status is Status.SOLVED, result.message
+    plan = transcription.decode(result.x)
+    motion = dataclasses.replace(plan.trajectory(), end=plan.contact_end + 0.01)  # the blow is what counts
+    for engine, step in (("pinocchio", 1e-4), ("mujoco", 2.5e-5)):
+        sim = simulate(problem, motion, engine=engine, step=step, settle=0.0)
+        missed = law.damping * plan.hand_speed * step
+        assert sim.impulse == pytest.approx(plan.impulse, rel=5e-3, abs=missed), engine
+        assert sim.force.max() == pytest.approx(plan.collision.force.max(), rel=0.03)
+        assert sim.contact_end - sim.contact_start == pytest.approx(
+            plan.compression + plan.restitution, rel=0.01, abs=2.1 * step
+        )
+        assert sim.outcome == pytest.approx(plan.collision.outcome, rel=0.02)
+        known = {"torque_limit": robot.torque_limit, "polygon": plan.polygon}
+        report = sim.report(**known, planned_impulse=plan.impulse)
+        assert report["target"] == sim.outcome
+        summary = {"target": plan.collision.outcome, "impulse_Ns": plan.impulse}
+        labels = " ".join(map(str, replay_table({**report, "engine": engine}, summary).columns[0].cells))
+        assert ("driven into the wood" in labels) == isinstance(target, Nail)
+        assert ("the board breaks" in labels) == isinstance(target, Board)

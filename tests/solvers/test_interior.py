@@ -1,0 +1,105 @@
+"""How the interior-point way of the SQP gets on where a row, a crawl or a failure is in its way."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.small_plans import changed, transcribed
+from support.textbook import CASES, INF, Textbook, assert_optimal
+
+from impactopt import load_problem
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import SQPOptions, interior, search, solve_sqp
+from impactopt.transcription.start import first_iterate
+
+
+def projection(wanted):
+    """The point of the positive orthant, which is rows, next to the one that is wanted."""
+    return Textbook(
+        len(wanted),
+        lambda *x: ca.sumsqr(ca.vertcat(*x) - wanted) / 2,
+        lambda *x: [(0.0, each, INF) for each in x],
+    )
+
+
+def test_a_slack_that_stops_a_step_alone_stops_alone():
+    """Row 0 is next to its bound and drawn far beyond it; all other rows have a way to go."""
+    wanted = np.array([-50.0, *np.full(19, 5.0)])
+    start = np.array([0.02, *np.ones(19)])
+    program = projection(wanted)
+    distances = []
+    result = solve_sqp(program, start, callback=lambda r: distances.append(r.step))
+    assert result.status is Status.SOLVED
+    assert "bent" in result.history[1].note
+    assert distances[1] > 1.0  # as without row 0; along the straight step it would be 0.1
+    np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-5)
+    assert_optimal(program, result)
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=25, deadline=None)
+def test_bent_steps_lead_to_the_same_optimum(seed):
+    """Of a convex program, which has one."""
+    rng = np.random.default_rng(seed)
+    wanted, start = rng.normal(size=12), 0.02 + rng.random(12)
+    # near a bound that all but holds, the barrier leaves a distance of the root of this
+    result = solve_sqp(projection(wanted), start, options=SQPOptions(complementarity_tolerance=1e-10))
+    assert result.status is Status.SOLVED
+    np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-4)
+
+
+def test_rows_far_off_are_not_bent():
+    """Where a row is off by more than one, a step is as straight as ever."""
+    wanted = np.array([-1.0, *np.full(19, 5.0)])
+    start = np.array([-3.0, *np.ones(19)])
+    result = solve_sqp(projection(wanted), start)
+    assert result.status is Status.SOLVED
+    assert "bent" not in result.history[1].note
+
+
+def test_steps_that_crawl_give_way(monkeypatch):
+    """Every step counts as a crawl here: after a few of them the rows become elastic."""
+    monkeypatch.setattr(search, "_CRAWL", 2.0)
+    monkeypatch.setattr(search, "_PATIENCE", 2)
+    case = CASES["HS71"]
+    result = solve_sqp(case.build(), case.x0)
+    assert next(k for k, r in enumerate(result.history) if r.note == "rows become elastic") == 3
+
+
+def test_what_fails_begins_again_from_the_best_iterate(monkeypatch):
+    case = CASES["HS71"]
+    advance, calls = interior.InteriorRun._advance, []
+
+    def failing(self, residual):
+        calls.append(self.point.x)
+        return Status.FAILED if len(calls) == 4 else advance(self, residual)
+
+    monkeypatch.setattr(interior.InteriorRun, "_advance", failing)
+    program = case.build()
+    result = solve_sqp(program, case.x0)
+    assert result.status is Status.SOLVED
+    assert result.objective == pytest.approx(case.optimum, rel=1e-5)
+    assert [r.note for r in result.history].count("again from the best iterate") == 1
+
+
+def test_what_goes_on_failing_is_said_to_fail(monkeypatch):
+    monkeypatch.setattr(interior.InteriorRun, "_advance", lambda self, residual: Status.FAILED)
+    case = CASES["HS71"]
+    result = solve_sqp(case.build(), case.x0)
+    assert result.status is Status.FAILED
+    assert len(result.history) <= 3
+
+
+def test_elastic_rows_that_are_met_do_not_keep_it_from_an_end():
+    """Nails in woods of which the first two ended at the iteration limit, with rows elastic and met."""
+    problem = load_problem("arm_planar")
+    base = transcribed(problem)
+    for resistance in (568.1043576449156, 569.6147318929434, 789.978655):
+        t = changed(base, target=dataclasses.replace(problem.target, resistance=resistance))
+        result = solve_sqp(t.program, first_iterate(t))
+        assert result.status is Status.SOLVED and result.iterations < 200, resistance

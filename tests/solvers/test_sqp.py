@@ -1,0 +1,293 @@
+"""The SQP on textbook programs, and what it does when things go wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.textbook import CASES, INF, Textbook, assert_optimal, infeasible
+
+from impactopt.errors import InputError
+from impactopt.solvers.program import Status
+from impactopt.solvers.sqp import QP_SOLVERS, QPSolution, QPStatus, SQPOptions, solve_sqp
+from impactopt.solvers.sqp.hessian import ActiveRows, ExactHessian, is_positive_definite
+from impactopt.solvers.sqp.merit import Filter
+from impactopt.solvers.sqp.point import TimedProgram
+from impactopt.solvers.sqp.subproblem import normal_step
+
+WAYS = {
+    "default": SQPOptions(),
+    "active_set": SQPOptions(qp_solver="active_set"),
+    "osqp": SQPOptions(qp_solver="osqp"),
+    "daqp": SQPOptions(qp_solver="daqp"),
+    "piqp": SQPOptions(qp_solver="piqp"),
+    "as if large": SQPOptions(qp_solver="osqp", dense_limit=0),
+    "bfgs": SQPOptions(qp_solver="active_set", hessian="bfgs"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", CASES)
+def test_textbook_programs(name, way):
+    case = CASES[name]
+    program = case.build()
+    result = solve_sqp(program, case.x0, options=WAYS[way])
+    # HS26 has a singular Hessian at its optimum: quasi-Newton creeps
+    singular = name == "HS26" and way == "bfgs"
+    assert result.status is Status.SOLVED or (singular and result.status is Status.ACCEPTABLE)
+    assert result.objective == pytest.approx(case.optimum, rel=1e-5, abs=1e-5)
+    assert_optimal(program, result, tolerance=1e-4 if singular else 1e-5)
+    assert result.objective == program.objective(result.x)
+    assert result.iterations == len(result.history) - 1
+    if way != "bfgs":
+        assert result.iterations <= 30
+    else:
+        assert program.evaluations["hessian"] == 0
+
+
+def test_iterates_stay_within_the_variables_bounds():
+    # log x is not defined left of its bound, and the unbounded step leads there
+    program = Textbook(1, lambda x: x - 1e-3 * ca.log(x), lower=1e-6)
+    result = solve_sqp(program, [10.0])
+    assert result.status is Status.SOLVED
+    assert result.x[0] == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_steps_to_where_functions_are_not_finite_are_shortened():
+    program = Textbook(1, lambda x: x - ca.log(x))  # nan at x <= 0
+    result = solve_sqp(program, [8.0], options=SQPOptions(radius=50.0))
+    assert result.status is Status.SOLVED
+    assert result.x[0] == pytest.approx(1, abs=1e-5)
+
+
+def test_arithmetic_errors_count_as_not_finite_and_others_surface():
+    class Fussy(Textbook):
+        def objective(self, x):
+            if x[0] <= 0:
+                raise ZeroDivisionError
+            return super().objective(x)
+
+    program = Fussy(1, lambda x: x - ca.log(x))
+    assert solve_sqp(program, [8.0], options=SQPOptions(radius=50.0)).status is Status.SOLVED
+    assert solve_sqp(program, [-1.0]).status is Status.FAILED
+
+    class Broken(Textbook):
+        def hessian(self, x, sigma, multipliers):
+            raise ValueError("a bug")
+
+    with pytest.raises(ValueError, match="a bug"):
+        solve_sqp(Broken(1, lambda x: x**2), [1.0])
+
+
+def test_second_order_correction_cures_the_maratos_effect():
+    case = CASES["Maratos"]
+    options = SQPOptions(qp_solver="active_set", radius=0.5)
+    full = solve_sqp(case.build(), case.x0, options=options)
+    without = solve_sqp(
+        case.build(), case.x0, options=dataclasses.replace(options, second_order_correction=False)
+    )
+    assert full.status is without.status is Status.SOLVED
+    assert any("corrected" in record.note for record in full.history)
+    assert full.iterations < without.iterations
+
+
+def test_rows_come_in_only_when_they_are_needed():
+    # the farthest point of a polygon of 300 sides in a direction: a corner, found with few of the rows
+    angles = np.linspace(0, 2 * np.pi, 300, endpoint=False)
+    program = Textbook(
+        2,
+        lambda x, y: -x - 0.3 * y + 1e-3 * (x**2 + y**2),
+        lambda x, y: [(-INF, np.cos(a) * x + np.sin(a) * y, 1) for a in angles],
+    )
+    result = solve_sqp(program, [0.1, 0.2], options=SQPOptions(qp_solver="active_set"))
+    assert result.status is Status.SOLVED
+    assert_optimal(program, result)
+    assert all(int(record.note.split("rows ")[1].split()[0]) < 100 for record in result.history[1:])
+
+
+def test_infeasible_programs_name_the_rows():
+    program, x0 = infeasible()
+    for options in WAYS.values():
+        result = solve_sqp(program, x0, options=options)
+        assert result.status is Status.INFEASIBLE
+        assert "row 1: by" in result.message
+        assert "row 2: by" in result.message
+        assert "row 3" not in result.message
+        assert result.max_violation == pytest.approx(min(record.max_violation for record in result.history))
+
+
+def test_infeasible_against_bounds():
+    program = Textbook(2, lambda x, y: x**2, lambda x, y: [(4, x * y, INF)], lower=0, upper=1)
+    result = solve_sqp(program, [0.5, 0.5])
+    assert result.status is Status.INFEASIBLE
+    assert "row 1: by 3" in result.message
+    np.testing.assert_allclose(result.x, 1, atol=1e-6)
+
+
+def test_a_low_price_still_finds_the_feasible_region():
+    case = CASES["HS40"]
+    result = solve_sqp(case.build(), case.x0, options=SQPOptions(price=1e-3))
+    assert result.status is Status.SOLVED
+    assert result.objective == pytest.approx(case.optimum, abs=1e-5)
+
+
+@pytest.mark.parametrize("x0", [[np.nan, 1], [1, 2, 3]])
+def test_bad_starts_are_refused(x0):
+    with pytest.raises(InputError, match="x0"):
+        solve_sqp(CASES["HS6"].build(), x0)
+
+
+def test_bad_options_are_refused_when_written():
+    with pytest.raises(InputError, match=r"'exakt' \(did you mean 'exact'\?\)"):
+        SQPOptions(hessian="exakt")
+    with pytest.raises(InputError, match="qp_solver"):
+        SQPOptions(qp_solver="qpoases")
+    with pytest.raises(InputError, match="kkt_tolerance"):
+        SQPOptions(kkt_tolerance=0.0)
+    with pytest.raises(InputError, match="radius"):
+        SQPOptions(radius=2.0, radius_max=1.0)
+    with pytest.raises(TypeError):
+        SQPOptions(max_iter=3)
+
+
+@pytest.mark.parametrize("how", ["raise", "return"])
+def test_interruption_leaves_the_best_iterate(how):
+    case = CASES["HS100"]
+    program, seen = case.build(), []
+
+    def callback(record):
+        seen.append(record)
+        if record.iteration == 3:
+            if how == "raise":
+                raise KeyboardInterrupt
+            return True
+        return None
+
+    result = solve_sqp(program, case.x0, callback=callback)
+    assert result.status is Status.INTERRUPTED
+    assert result.iterations == 3
+    best = min(seen, key=lambda record: (max(record.max_violation, 1e-6), record.objective))
+    assert result.objective == best.objective
+    assert result.max_violation == best.max_violation
+
+
+def test_interruption_within_a_function():
+    case = CASES["HS100"]
+
+    class Interrupted(Textbook):
+        def jacobian(self, x):
+            if self.evaluations["jacobian"] == self.after:
+                self.evaluations["jacobian"] += 1
+                raise KeyboardInterrupt
+            return super().jacobian(x)
+
+    for after in (0, 3):
+        program = case.build()
+        program.__class__, program.after = Interrupted, after
+        result = solve_sqp(program, case.x0)
+        assert result.status is Status.INTERRUPTED
+        assert np.isfinite(result.x).all()
+
+
+def test_limits():
+    case = CASES["HS100"]
+    result = solve_sqp(case.build(), case.x0, options=SQPOptions(max_iterations=2))
+    assert (result.status, result.iterations) == (Status.ITERATION_LIMIT, 2)
+    result = solve_sqp(case.build(), case.x0, options=SQPOptions(max_iterations=0))
+    assert (result.status, result.iterations) == (Status.ITERATION_LIMIT, 0)
+    np.testing.assert_array_equal(result.x, case.x0)
+    result = solve_sqp(case.build(), case.x0, options=SQPOptions(time_limit=1e-9))
+    assert (result.status, result.iterations) == (Status.TIME_LIMIT, 0)
+
+
+def test_functions_not_finite_at_the_start_are_said_so():
+    result = solve_sqp(Textbook(1, lambda x: ca.log(x), lambda x: [(0, ca.sqrt(x), 1)]), [-1.0])
+    assert result.status is Status.FAILED
+    assert "not finite" in result.message
+
+
+def test_solutions_start_the_next_solve():
+    case = CASES["HS71"]
+    first = solve_sqp(case.build(), case.x0)
+    again = solve_sqp(
+        case.build(), first.x, multipliers=first.multipliers, bound_multipliers=first.bound_multipliers
+    )
+    assert again.iterations == 0
+    with pytest.raises(InputError, match="multipliers"):
+        solve_sqp(case.build(), case.x0, multipliers=[1.0])
+
+
+def test_own_qp_solvers_can_be_added_and_may_fail():
+    class Hopeless:
+        def solve(self, qp, *, start=None, time_limit=None):
+            zero = np.zeros(qp.n)
+            return QPSolution(x=zero, y=np.zeros(qp.m), z=zero, status=QPStatus.FAILED, iterations=0)
+
+    QP_SOLVERS["hopeless"] = lambda tolerance: Hopeless()
+    try:
+        case = CASES["HS71"]
+        result = solve_sqp(case.build(), case.x0, options=SQPOptions(qp_solver="hopeless"))
+    finally:
+        del QP_SOLVERS["hopeless"]
+    assert result.status is Status.FAILED
+    np.testing.assert_array_equal(result.x, case.x0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 12), shift=st.floats(-3, 3))
+def test_positive_definiteness_agrees_with_the_eigenvalues(seed, n, shift):
+    F = np.random.default_rng(seed).normal(size=(n, n)) * (np.random.default_rng(seed).random((n, n)) < 0.5)
+    B = F + F.T + shift * np.eye(n)
+    least = np.linalg.eigvalsh(B)[0]
+    if abs(least) > 1e-8:
+        assert is_positive_definite(sp.csc_array(B)) == (least > 0)
+
+
+@pytest.mark.parametrize("dense_limit", [0, 300])
+def test_made_convex_where_the_active_rows_do_not(dense_limit):
+    # f = -x^2 + y^2 with x held by the row: convex on y without any change
+    program = TimedProgram(Textbook(2, lambda x, y: -(x**2) + y**2, lambda x, y: [(1, x, 1)]))
+    point = program.point(np.array([0.5, 0.5]))
+    rule = ExactHessian(program, SQPOptions(dense_limit=dense_limit))
+    active = ActiveRows(A=point.jacobian, r=np.array([0.5]))
+    model = rule.model(point, 1.0, np.zeros(1), active)
+    assert is_positive_definite(model.B)
+    d = np.array([0.5, -0.25])  # meets the row
+    exact = point.gradient @ d + 0.5 * d @ np.diag([-2.0, 2.0]) @ d
+    assert model.change(d) == pytest.approx(exact, abs=1e-5)
+    # without the row the curvature has to be lifted
+    free = rule.model(point, 1.0, np.zeros(1), ActiveRows(A=sp.csc_array((0, 2)), r=np.zeros(0)))
+    assert is_positive_definite(free.B)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_normal_steps_meet_the_violated_rows(seed):
+    rng = np.random.default_rng(seed)
+    J = rng.normal(size=(3, 6))
+    lower, upper = np.array([0.1, -INF, -1.0]), np.array([INF, -0.2, 1.0])
+    box = np.full(6, 10.0)
+    d = normal_step(sp.csc_array(J), lower, upper, np.full(3, 1e-9), -box, box)
+    assert (J @ d)[:2] == pytest.approx([0.1, -0.2], abs=1e-6)
+    assert (
+        np.abs(normal_step(sp.csc_array(J), lower, upper, np.full(3, 1e-9), -box / 1e3, box / 1e3)).max()
+        <= 0.01
+    )
+
+
+def test_the_filter_wants_progress_in_one_of_the_two():
+    program = TimedProgram(Textbook(2, lambda x, y: x, lambda x, y: [(0, y, 0)]))
+    at = lambda f, v: program.point(np.array([f, v], float))  # noqa: E731
+    kept = Filter()
+    kept.add(at(1, 1))
+    assert kept.passes(at(2, 0.5))
+    assert kept.passes(at(0, 2))
+    assert not kept.passes(at(1, 1))
+    assert not kept.passes(at(2, 0.99))
+    kept.add(at(0, 0.5))  # dominates the first
+    assert kept.pairs == [(0.5, 0.0)]

@@ -1,0 +1,1 @@
+"""What several tests share: small robots and plans, cases, references, checks."""

@@ -1,0 +1,306 @@
+"""Collisions by the million: the same numbers as one by one, states that hold what they say, reasons."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.fake_solution import strike_record
+from support.small_robots import arm, biped
+
+from impactopt.collision import SDC
+from impactopt.contact import FreeMass, SpringDamper
+from impactopt.errors import InputError
+from impactopt.files.output import save_record
+from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.kinematics.held import holding_torque, striking_velocity
+from impactopt.kinematics.stance import BothSoles, FixedBase
+from impactopt.kinematics.support import margin
+from impactopt.robots.presets import load_robot
+from impactopt.sweeps.collisions import Collisions, collide_many
+from impactopt.sweeps.states import ContactStates, Posture
+
+POINT, NORMAL = [0.7, 0.0, 0.75], np.array([0.0, 0.0, -1.0])
+
+
+def arm_file(**problem: Any) -> ProblemFile:
+    """A planar arm of three joints that strikes a mass downwards."""
+    given = {"robot": "planar_arm", "striker": "hammer", "start": "ready", "point_m": POINT}
+    data = {
+        "problem": {**given, "normal": NORMAL.tolist(), **problem},
+        "target": {"mass_kg": 0.5},
+        "contact": {"stiffness_N_m": 2e4, "damping_N_s_m": 50.0},
+    }
+    return problem_file_from_data(data, where="arm.toml")
+
+
+def standin_file() -> ProblemFile:
+    data = {
+        "problem": {
+            "robot": "standin",
+            "striker": "right_hand",
+            "point_m": [0.4, -0.2, 0.9],
+            "normal": [1.0, 0.0, 0.0],
+        },
+        "target": {"mass_kg": 5.0},
+        "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 300.0},
+    }
+    return problem_file_from_data(data, where="standin.toml")
+
+
+def drawn(count: int, **ranges: tuple[float, float]) -> dict[str, Any]:
+    rng = np.random.default_rng(1)
+    return {key.replace("__", "."): rng.uniform(*ends, count) for key, ends in ranges.items()}
+
+
+# ---------------------------------------------------------------- the same numbers as one by one
+def test_rows_are_single_collisions() -> None:
+    columns = drawn(
+        5,
+        target__mass=(0.2, 2.0),
+        contact__stiffness=(5e3, 5e4),
+        contact__damping=(0.0, 100.0),
+        at_contact__speed=(0.5, 1.5),
+        at_contact__joints__elbow=(-0.2, 0.2),
+        at_contact__kd_scale=(0.5, 2.0),
+    )
+    outputs = ("impulse_Ns", "peak_force_N", "contact_ms", "energy_J", "torque_ratio", "target_speed_m_s")
+    found = collide_many(arm_file(), columns, outputs=outputs, at_contact={"posture": "ready"})
+    robot = load_robot("planar_arm")
+    for i, mass in enumerate(columns["target.mass"]):
+        law = SpringDamper(stiffness=columns["contact.stiffness"][i], damping=columns["contact.damping"][i])
+        q = robot.posture("ready")
+        q[robot.joint_index("elbow")] += columns["at_contact.joints.elbow"][i]
+        v = striking_velocity(robot, q, "hammer", NORMAL, columns["at_contact.speed"][i])
+        one = SDC(
+            robot=robot,
+            striker="hammer",
+            normal=NORMAL,
+            law=law,
+            target=FreeMass(mass=mass),
+            kd=robot.kd * columns["at_contact.kd_scale"][i],
+        ).collide(q, v, holding_torque(robot, q, v))
+        assert found["reason"][i] == ""
+        assert one.demand is not None
+        expected = (
+            one.impulse,
+            one.peak_force,
+            1e3 * one.duration,
+            one.energy,
+            np.abs(one.demand / robot.torque_limit).max(),
+            one.target_result["speed"],
+        )
+        for name, value in zip(outputs, expected, strict=True):
+            assert found[name][i] == pytest.approx(value, rel=1e-9), name
+        # a balance that no model enters
+        assert found["impulse_Ns"][i] == pytest.approx(mass * found["target_speed_m_s"][i], rel=1e-9)
+
+
+def test_of_a_robot_on_soles_with_its_margins() -> None:
+    columns = drawn(
+        3, target__mass=(3.0, 8.0), at_contact__speed=(0.3, 1.0), at_contact__torque_limit_scale=(0.5, 1)
+    )
+    outputs = ("impulse_Ns", "zmp_margin_m", "sole_force_N", "torque_ratio", "effective_mass_kg")
+    found = collide_many(standin_file(), columns, outputs=outputs, at_contact={"posture": "half_sitting"})
+    robot = load_robot("standin")
+    q = robot.posture("half_sitting")
+    model = SDC(
+        robot=robot,
+        striker="right_hand",
+        normal=[1.0, 0.0, 0.0],
+        law=SpringDamper(stiffness=1e4, damping=300.0),
+        target=FreeMass(mass=5.0),
+    )
+    whole = Collisions(standin_file(), {"posture": "half_sitting", "speed_m_s": 1.0}, outputs)
+    polygon = whole._scene({}).posture()
+    assert isinstance(polygon, Posture)
+    for i, mass in enumerate(columns["target.mass"]):
+        v = striking_velocity(robot, q, "right_hand", np.array([1.0, 0, 0]), columns["at_contact.speed"][i])
+        limit = robot.torque_limit * columns["at_contact.torque_limit_scale"][i]
+        one = model.collide(q, v, holding_torque(robot, q, v), target_mass=mass, torque_limit=limit)
+        assert one.zmp is not None and one.sole_wrench is not None and one.demand is not None
+        assert found["impulse_Ns"][i] == pytest.approx(one.impulse, rel=1e-9)
+        assert found["zmp_margin_m"][i] == pytest.approx(margin(polygon.polygon, one.zmp).min(), rel=1e-7)
+        assert found["sole_force_N"][i] == pytest.approx(one.sole_wrench[..., 2].min(), rel=1e-7)
+        assert found["torque_ratio"][i] == pytest.approx(np.abs(one.demand / limit).max(), rel=1e-9)
+
+
+def test_structure_may_differ_from_row_to_row() -> None:
+    models = ["sdc", "virtual mass", "paper's sdc", "sdc"]
+    columns = {"at_contact.model": models, "target.mass": [0.5, 0.5, 0.5, 2.0], "at_contact.speed": [1.0]}
+    found = collide_many(arm_file(), columns)["impulse_Ns"]
+    for i, name in enumerate(models):
+        alone = {"model": name, "speed_m_s": 1.0}
+        one = collide_many(arm_file(), {"target.mass": columns["target.mass"][i : i + 1]}, at_contact=alone)
+        assert found[i] == one["impulse_Ns"][0]
+    assert len({*found}) == 4
+
+
+def test_freezes_come_near_the_full_dynamics() -> None:
+    given = {"posture": "ready", "speed_m_s": 1.5, "horizon_s": 0.1}
+    true = collide_many(arm_file(), {"at_contact.model": ["full dynamics"]}, at_contact=given)["impulse_Ns"]
+    near = collide_many(arm_file(), {"at_contact.freezes": [2, 4, 8]}, at_contact=given)["impulse_Ns"]
+    errors = np.abs(near / true - 1)
+    assert all(two < one for one, two in pairwise(errors))
+    assert errors[-1] < 1e-5
+
+
+def test_gains_of_one_joint_and_of_all() -> None:
+    robot, given = load_robot("planar_arm"), {"posture": "ready", "speed_m_s": 1.0}
+    stiff = float(2 * robot.kd[0])
+    found = [
+        collide_many(arm_file(), {key: [value]}, at_contact=given)["impulse_Ns"][0]
+        for key, value in (("robot.kd", stiff), ("robot.kd.elbow", stiff), ("at_contact.kd_scale", 1.0))
+    ]
+    q = robot.posture("ready")
+    v = striking_velocity(robot, q, "hammer", NORMAL, 1.0)
+    one = robot.kd.copy()
+    one[robot.joint_index("elbow")] = stiff
+    law = SpringDamper(stiffness=2e4, damping=50.0)
+    model = SDC(robot=robot, striker="hammer", normal=NORMAL, law=law, target=FreeMass(mass=0.5))
+    for impulse, kd in zip(found, (stiff, one, robot.kd), strict=True):
+        assert impulse == pytest.approx(
+            model.collide(q, v, holding_torque(robot, q, v), kd=kd).impulse, rel=1e-9
+        )
+
+
+# ---------------------------------------------------------------- states
+@pytest.mark.parametrize("velocity", ["least energy", "least rates"])
+def test_states_move_the_striking_point_and_coast(velocity: str) -> None:
+    robot, normal = biped(), np.array([0.8, 0.6, 0.0])
+    states = ContactStates(
+        robot=robot, striker="fist", stance=BothSoles(), start=robot.posture("half_sitting"), folder=Path()
+    )
+    posture = states.posture("half_sitting", None, (0.0, 0.0, 0.0))
+    assert isinstance(posture, Posture)
+    rng = np.random.default_rng(0)
+    joints = {name: rng.uniform(-0.3, 0.3, 300) for name in ("elbow", "shoulder yaw")}
+    speed = rng.uniform(0.1, 1.0, 300)
+    found = states.rows(posture, joints, speed, normal, 300, velocity=velocity)
+    for i in (0, 255, 299):  # in the first block of rows, and in what is left of the last
+        q, v = found.q[i], found.v[i]
+        data = robot.model.createData()
+        pin.computeJointJacobians(robot.model, data, q)
+        pin.updateFramePlacements(robot.model, data)
+        frames = [s.frame for s in robot.soles]
+        still = [robot.model.getFrameId(name) for name in frames]
+        hand = robot.model.getFrameId("striker:fist")
+        jac = {k: pin.getFrameJacobian(robot.model, data, k, pin.LOCAL_WORLD_ALIGNED) for k in (*still, hand)}
+        assert jac[hand][:3] @ v == pytest.approx(speed[i] * normal, abs=1e-10)
+        for k in still:
+            assert jac[k] @ v == pytest.approx(np.zeros(6), abs=1e-10)
+        assert found.torque[i] == pytest.approx(holding_torque(robot, q, v), abs=1e-8)
+        energy = striking_velocity(robot, q, "fist", normal, speed[i])
+        weight = np.concatenate([np.full(6, 1e-2), 1 / robot.velocity_limit])
+        if velocity == "least energy":
+            assert v == pytest.approx(energy, abs=1e-10)
+        else:  # any other velocity with the same hand has faster joints
+            assert np.linalg.norm(weight * v) < np.linalg.norm(weight * energy)
+            rows = np.vstack([jac[k] for k in still] + [jac[hand][:3]])
+            free = np.linalg.svd(rows)[2][np.linalg.matrix_rank(rows) :]
+            assert free @ (weight**2 * v) == pytest.approx(np.zeros(len(free)), abs=1e-10)
+
+
+def test_a_continuous_joint_turns() -> None:
+    robot = arm()
+    start = robot.posture("start")
+    states = ContactStates(robot=robot, striker="hand", stance=FixedBase(), start=start, folder=Path())
+    posture = states.posture("start", None, (0.0, 0.0, 0.0))
+    assert isinstance(posture, Posture)
+    found = states.rows(posture, {"turn": np.array([0.5, 3.0])}, np.ones(2), np.array([0.0, 1.0, 0.0]), 2)
+    turned = [robot.joint_positions(q)[0] for q in found.q]
+    assert turned == pytest.approx([0.9, 3.4 - 2 * np.pi])
+
+
+def test_the_state_of_a_result(tmp_path: Path) -> None:
+    robot = load_robot("planar_arm")
+    q = robot.posture("ready")
+    v = np.array([0.3, 1.0, 0.4])
+    torque = holding_torque(robot, q, v) + 1.0
+    save_record(strike_record(robot, q, v, torque), tmp_path)
+    law = SpringDamper(stiffness=2e4, damping=50.0)
+    model = SDC(robot=robot, striker="hammer", normal=NORMAL, law=law, target=FreeMass(mass=0.5))
+    as_saved = collide_many(
+        arm_file(), {}, at_contact={"result": str(tmp_path)}, outputs=("impulse_Ns", "hand_speed_m_s")
+    )
+    assert as_saved["impulse_Ns"][0] == pytest.approx(model.collide(q, v, torque).impulse, rel=1e-9)
+    twice = {"at_contact.speed": [2 * as_saved["hand_speed_m_s"][0]]}
+    faster = collide_many(arm_file(), twice, at_contact={"result": str(tmp_path)})
+    other = torque + holding_torque(robot, q, 2 * v) - holding_torque(robot, q, v)
+    assert faster["impulse_Ns"][0] == pytest.approx(model.collide(q, 2 * v, other).impulse, rel=1e-9)
+
+
+def test_a_reach_hits_where_it_is_told() -> None:
+    whole = Collisions(arm_file(), {"speed_m_s": 1.0}, ("impulse_Ns",))
+    scene = whole._scene({})
+    robot = scene.model.robot
+    for point in ((0.7, 0.0, 0.75), (0.6, 0.0, 0.8)):
+        posture = scene.posture(point)
+        assert isinstance(posture, Posture)
+        data = robot.model.createData()
+        pin.framesForwardKinematics(robot.model, data, posture.q)
+        at = data.oMf[robot.model.getFrameId("striker:hammer")].translation
+        assert at == pytest.approx(np.array(point), abs=1e-7)
+    columns = {"problem.point.2": [0.75, 0.8, 5.0], "problem.point.0": [0.7, 0.6, 0.6]}
+    found = collide_many(arm_file(), columns, at_contact={"speed_m_s": 1.0})
+    assert found["reason"].tolist() == ["", "", "the point is out of reach"]
+    one = collide_many(arm_file(point_m=[0.6, 0.0, 0.8]), {}, at_contact={"speed_m_s": 1.0})
+    assert found["impulse_Ns"][1] == pytest.approx(one["impulse_Ns"][0], rel=1e-12)
+
+
+# ---------------------------------------------------------------- rows that are impossible, and mistakes
+def test_what_is_impossible_says_why() -> None:
+    columns = {"at_contact.joints.elbow": [0.0, 9.0, 0.0], "at_contact.speed": [1.0, 1.0, 500.0]}
+    found = collide_many(arm_file(), columns, at_contact={"posture": "ready"})
+    assert found["reason"][0] == ""
+    assert found["reason"][1] == "elbow would be beyond its limit"
+    assert "faster than its limit" in found["reason"][2]
+    assert np.isnan(found["impulse_Ns"]).tolist() == [False, True, True]
+    short = {"posture": "ready", "speed_m_s": 1.0, "horizon_s": 2e-3}
+    found = collide_many(arm_file(), {"target.mass": [0.5, 0.001]}, at_contact=short)
+    assert "not ended" in found["reason"][0] and found["reason"][1] == ""
+
+
+@pytest.mark.parametrize(
+    ("columns", "at_contact", "says"),
+    [
+        ({"target.mas": [1.0]}, {}, "did you mean 'mass_kg'|did you mean 'mass'"),
+        ({"at_contact.sped": [1.0]}, {}, "did you mean 'speed"),
+        ({"at_contact.joints": [1.0]}, {}, "name one joint"),
+        ({"at_contact.joints.elbo": [1.0]}, {}, "did you mean 'elbow'"),
+        ({"swing.duration": [1.0]}, {}, "no collision depends on it"),
+        ({"target.mass": [1.0, -1.0]}, {}, "give a number > 0"),
+        ({"at_contact.kd_scale": [1.0, -1.0]}, {}, "give a number > 0"),
+        ({"target.mass": [1.0, 2.0], "contact.damping": [1.0, 2.0, 3.0]}, {}, "columns 3"),
+        ({"target.mass": [1.0], "target.mass_kg": [1.0]}, {}, "two columns are of one key"),
+        ({}, {"posture": "redy"}, "did you mean 'ready'"),
+        ({}, {"posture": "ready", "result": "there"}, "give one of them"),
+        ({}, {"model": "virtual mass", "freezes": 2}, "freezes"),
+    ],
+)
+def test_mistakes_are_told_before_work_starts(
+    columns: dict[str, Any], at_contact: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(InputError, match=says):
+        collide_many(arm_file(), columns, at_contact={"speed_m_s": 1.0, **at_contact})
+
+
+def test_mistakes_in_what_is_asked_for() -> None:
+    with pytest.raises(InputError, match="speed_m_s: missing"):
+        collide_many(arm_file(), {})
+    with pytest.raises(InputError, match="did you mean 'impulse_Ns'"):
+        collide_many(arm_file(), {}, outputs=("impulse",), at_contact={"speed_m_s": 1.0})
+    with pytest.raises(InputError, match="soles"):
+        collide_many(arm_file(), {}, outputs=("zmp_margin_m",), at_contact={"speed_m_s": 1.0})
+    with pytest.raises(InputError, match="which is held"):
+        given = {"speed_m_s": 1.0, "joints_rad": {standin_leg(): 0.1}}
+        collide_many(standin_file(), {}, at_contact=given)
+
+
+def standin_leg() -> str:
+    robot = load_robot("standin")
+    return robot.joint_names[robot.limb(robot.soles[0].frame)[0]]

@@ -1,0 +1,108 @@
+"""The same sweep on a Dask cluster of separate worker processes, one of which is killed in the middle."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import dask
+import distributed
+import pyarrow.parquet as pq
+import pytest
+from support.sweep_workers import unlucky
+
+from impactopt.errors import InputError
+from impactopt.sweeps import Progress, sweep, sweep_from_data
+from impactopt.sweeps.cluster import on_cluster
+from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.units import Unit, Work
+
+TIMES = ("seconds", "solve_seconds", "build_seconds")
+RESISTANCES = [500.0, 650.0, 9e3, 600.0, 800.0]
+SWEEP = {
+    "sweep": {"problem": "arm_planar", "grain": "strike"},
+    "grid": {"target.resistance": RESISTANCES},
+}
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Any]:
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
+
+
+def test_a_worker_of_the_cluster_that_is_killed_costs_nothing(tmp_path: Path, client: Any) -> None:
+    chosen = sweep_from_data(SWEEP)
+    work = Work(data=chosen.problem.data, path=chosen.problem.path, grain="strike")
+    told: list[Progress] = []
+
+    def kill_one(now: Progress) -> None:
+        told.append(now)
+        if len(told) == 1:
+            busy = next(address for address, tasks in client.processing().items() if tasks)
+            os.kill(client.run(os.getpid, workers=[busy])[busy], signal.SIGKILL)
+
+    address = client.scheduler.address
+    result = sweep(SWEEP, tmp_path / "out", scheduler=address, progress=kill_one)
+    assert (result.cases, result.done, len(told)) == (5, 5, 5)
+    for row in pq.read_table(result.table).to_pylist():
+        case = row.pop("case")
+        unit = Unit(index=0, first=0, count=1, columns={"target.resistance_N": [RESISTANCES[case]]})
+        assert row.pop("target.resistance_N") == RESISTANCES[case]
+        alone = evaluate(work, unit).columns
+        assert {n: x for n, x in row.items() if n not in TIMES} == {
+            n: x[0] for n, x in alone.items() if n not in TIMES
+        }
+    again = sweep(SWEEP, tmp_path / "out", client=client)
+    assert (again.resumed, again.done) == (5, 5)
+
+
+def test_units_that_kill_every_worker_are_rows_and_closing_forgets_the_rest(
+    tmp_path: Path, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    units = [Unit(index=k, first=k, count=2, columns={}) for k in (0, *range(2, 20))]
+    monkeypatch.setattr("impactopt.sweeps.cluster.evaluate", lethal)
+    found = on_cluster(tmp_path, units, client, print)  # type: ignore[arg-type]
+    _, result = next((u, r) for u, r in found if u.index == 0)
+    assert result.columns["status"] == ["crashed"] * 2 and "died" in result.columns["reason"][0]
+    found.close()
+    until = time.monotonic() + 10
+    while any(client.processing().values()) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(client.processing().values())
+
+
+def lethal(folder: Path, unit: Unit) -> Any:
+    unlucky(folder, unit.index)
+    time.sleep(0.1)
+    from impactopt.sweeps.units import Found
+
+    return Found(columns={"reason": ["", ""]}, peak_mb=0.0)
+
+
+def test_workers_of_another_version_are_refused(client: Any) -> None:
+    work = Work(data={}, path=Path("p"), grain="solve", version="0.0.0")
+    with pytest.raises(InputError, match=r"a worker has impactopt .*, the sweep 0\.0\.0"):
+        list(on_cluster(work, [Unit(index=0, first=0, count=1, columns={})], client, print))
+
+
+def test_what_cannot_be_used_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("impactopt.sweeps.cluster.PATIENCE", 0.5)
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        sweep(SWEEP, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(InputError, match="one of workers, scheduler and client"):
+        sweep(SWEEP, tmp_path / "out", scheduler="tcp://127.0.0.1:9", workers=2)
+    inside = SimpleNamespace(scheduler_info=lambda n_workers: {"workers": {"inproc://10.0.0.1/2": {}}})
+    with pytest.raises(InputError, match="threads of this process"):
+        sweep(SWEEP, tmp_path / "out", client=inside)

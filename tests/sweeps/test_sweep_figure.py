@@ -1,0 +1,207 @@
+"""The picture of a sweep's table: what is drawn is what the table says, and the studies that come with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.picture_checks import frowns
+from typer.testing import CliRunner
+
+from impactopt.cli.app import app
+from impactopt.errors import InputError
+from impactopt.pictures.sweep import sweep_picture
+from impactopt.pictures.sweep_columns import Columns
+from impactopt.sweeps import read_sweep_file, sweep_from_data
+from impactopt.sweeps.figure import Figure
+from impactopt.sweeps.table import read_columns, unit_of, without_unit
+
+STUDIES = sorted((Path(__file__).resolve().parents[2] / "problems" / "sweeps").glob("collision_*.toml"))
+SPEED, MASS = "at_contact.speed_m_s", "target.mass_kg"
+
+
+def picture(columns: Columns, **section: Any) -> Any:
+    drawn = sweep_picture(Figure.model_validate(section), columns)
+    assert frowns(drawn) == []
+    return drawn
+
+
+def grid_columns() -> dict[str, Any]:
+    speed, mass = (x.ravel() for x in np.meshgrid([1.0, 2.0, 3.0], [0.5, 1.0], indexing="ij"))
+    reason = np.array([""] * 6, dtype=object)
+    reason[4] = "elbow would be beyond its limit"
+    return {SPEED: speed, MASS: mass, "impulse_Ns": speed * mass, "reason": reason}
+
+
+# ---------------------------------------------------------------- names
+@pytest.mark.parametrize(
+    ("name", "bare", "unit"),
+    [
+        ("target.mass_kg", "target.mass", "kg"),
+        ("contact.stiffness_N_m", "contact.stiffness", "N/m"),
+        ("contact.damping_N_s_m", "contact.damping", "N s/m"),
+        ("robot.kd_N_m_s_rad", "robot.kd", "N m s/rad"),
+        ("problem.point_m.0", "problem.point.0", "m"),
+        ("robot.kd_N_m_s_rad.elbow", "robot.kd.elbow", "N m s/rad"),
+        ("zmp_margin_m", "zmp_margin", "m"),
+        ("impulse_Ns", "impulse", "N s"),
+        ("torque_ratio", "torque_ratio", ""),
+    ],
+)
+def test_units_come_off_names(name: str, bare: str, unit: str) -> None:
+    assert unit_of(name) == unit
+    assert without_unit(name) == bare
+
+
+def test_labels_are_words_with_units() -> None:
+    joint = "at_contact.joints_rad.arm_right_4_joint"
+    columns = {joint: [0.1, 0.2], "zmp_margin_m": [0.0, 1.0]}
+    axes = picture(columns, kind="lines", x=joint, y="zmp_margin_m").axes[0]
+    assert axes.get_xlabel() == "arm right 4 moved by [rad]"
+    assert axes.get_ylabel() == "ZMP margin [m]"
+    own = picture(columns, kind="lines", x=joint, y="zmp_margin_m", labels={joint: "elbow"}).axes[0]
+    assert own.get_xlabel() == "elbow"
+
+
+# ---------------------------------------------------------------- heatmap
+def test_a_heatmap_has_each_row_in_its_place() -> None:
+    columns = grid_columns()
+    shuffled = np.random.default_rng(0).permutation(6)
+    columns = {name: x[shuffled] for name, x in columns.items()}
+    figure = picture(columns, kind="heatmap", x=SPEED, y=MASS, colour="impulse_Ns")
+    mesh = figure.axes[0].collections[0]
+    shown = np.ma.filled(mesh.get_array(), np.nan)
+    # a row of the picture is a mass, lowest first; the impossible one is left out
+    np.testing.assert_allclose(shown, [[0.5, 1.0, np.nan], [1.0, 2.0, 3.0]])
+    assert "elbow would be beyond its limit" in figure.legends[0].get_texts()[0].get_text()
+
+
+def test_a_contour_is_where_the_level_is() -> None:
+    columns = grid_columns()
+    columns["reason"] = [""] * 6
+    columns["zmp_margin_m"] = 1.75 - columns[SPEED]
+    given = {"kind": "heatmap", "x": SPEED, "y": MASS, "colour": "impulse_Ns"}
+    axes = picture(columns, **given, contour={"zmp_margin_m": 0.0}).axes[0]
+    path = axes.collections[-1].get_paths()[0].vertices
+    np.testing.assert_allclose(path[:, 0], 1.75)
+
+
+def test_a_heatmap_needs_a_grid() -> None:
+    columns = {name: x[:5] for name, x in grid_columns().items()}
+    with pytest.raises(InputError, match="take a scatter"):
+        picture(columns, kind="heatmap", x=SPEED, y=MASS, colour="impulse_Ns")
+
+
+# ---------------------------------------------------------------- lines
+def test_lines_are_in_the_order_of_x_and_apart_by_colour() -> None:
+    columns = {
+        SPEED: [3.0, 1.0, 2.0, 1.0, 2.0, 3.0],
+        "problem.robot": ["a", "a", "a", "b", "b", "b"],
+        "impulse_Ns": [9.0, 1.0, 4.0, 2.0, None, 6.0],
+    }
+    figure = picture(columns, kind="lines", x=SPEED, y="impulse_Ns", colour="problem.robot")
+    first, second = figure.axes[0].lines
+    np.testing.assert_allclose(first.get_xydata(), [[1, 1], [2, 4], [3, 9]])
+    np.testing.assert_allclose(second.get_xydata(), [[1, 2], [2, np.nan], [3, 6]])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
+
+
+def test_errors_are_against_the_row_with_the_same_rest() -> None:
+    models = ["sdc", "sdc", "full", "full", "sdc", "full"]
+    columns = {
+        SPEED: [1.0, 2.0, 1.0, 2.0, 1.0, 1.0],
+        MASS: [1.0, 1.0, 1.0, 1.0, 4.0, 4.0],
+        "at_contact.model": models,
+        "impulse_Ns": [1.1, 1.8, 1.0, 2.0, 3.0, 4.0],
+    }
+    given: dict[str, Any] = {"kind": "lines", "x": SPEED, "y": "impulse_Ns", "colour": "at_contact.model"}
+    given |= {"panel": MASS, "against": {"at_contact.model": "full"}}
+    one, four = picture(columns, **given).axes
+    np.testing.assert_allclose(one.lines[0].get_xydata(), [[1, 10], [2, -10]])
+    np.testing.assert_allclose(four.lines[0].get_xydata(), [[1, -25]])
+    assert [axes.get_title(loc="left") for axes in (one, four)] == ["target mass 1 kg", "target mass 4 kg"]
+    assert len(one.lines) == len(four.lines) == 1  # not the rows that the others are held against
+    sizes = picture(columns, **given, log=["y"]).axes[0].lines[0].get_ydata()
+    np.testing.assert_allclose(sizes, [10, 10])
+    with pytest.raises(InputError, match="no row has"):
+        picture(columns, **{**given, "against": {"at_contact.model": "fuller"}})
+
+
+# ---------------------------------------------------------------- scatter
+def test_a_scatter_shows_rows_with_their_colours() -> None:
+    figure = picture(grid_columns(), kind="scatter", x=SPEED, y="impulse_Ns", colour=MASS)
+    marks = figure.axes[0].collections[0]
+    np.testing.assert_allclose(marks.get_offsets(), [[1, 0.5], [1, 1], [2, 1], [2, 2], [3, 3]])
+    np.testing.assert_allclose(marks.get_array(), [0.5, 1.0, 0.5, 1.0, 1.0])
+
+
+def test_text_is_no_number() -> None:
+    with pytest.raises(InputError, match="no column of numbers"):
+        picture(
+            {"problem.robot": ["a", "b"], "impulse_Ns": [1.0, 2.0]},
+            kind="lines",
+            x="problem.robot",
+            y="impulse_Ns",
+        )
+
+
+# ---------------------------------------------------------------- sweep files
+def collisions_data(**figure: Any) -> dict[str, Any]:
+    return {
+        "sweep": {"problem": "arm7", "grain": "collision", "outputs": ["impulse_Ns"]},
+        "grid": {"at_contact.speed": {"from": 0.1, "to": 0.5, "count": 3}, "target.mass": [0.1, 0.2]},
+        "figure": {"kind": "heatmap", "x": "at_contact.speed", "y": "target.mass", **figure},
+    }
+
+
+def test_a_figure_names_keys_without_units() -> None:
+    found = sweep_from_data(collisions_data(colour="impulse_Ns", labels={"target.mass": "m"}))
+    assert found.figure is not None
+    assert found.figure.columns == (SPEED, MASS, "impulse_Ns")
+    assert found.figure.labels == {MASS: "m"}
+
+
+def test_what_a_figure_names_has_to_be_there() -> None:
+    with pytest.raises(InputError, match=r"\[figure\].*did you mean 'impulse_Ns'"):
+        sweep_from_data(collisions_data(colour="impulse_N"))
+    with pytest.raises(InputError, match="heatmap"):
+        sweep_from_data(collisions_data(kind="heat map"))
+
+
+def test_a_sweep_is_the_same_with_another_figure() -> None:
+    assert sweep_from_data(collisions_data()).hash == sweep_from_data(collisions_data(title="new")).hash
+
+
+def test_the_command_draws(tmp_path: Path) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text(
+        """
+        [sweep]
+        problem = "arm7"
+        grain = "collision"
+        [grid]
+        at_contact.speed = {from = 0.1, to = 0.5, count = 3}
+        target.mass = [0.1, 0.2]
+        [figure]
+        kind = "lines"
+        x = "at_contact.speed"
+        y = "impulse_Ns"
+        colour = "target.mass"
+        """,
+        encoding="utf-8",
+    )
+    result = CliRunner().invoke(app, ["sweep", str(file), "--out", str(tmp_path / "out"), "--workers", "1"])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "out" / "figure.png").read_bytes().startswith(b"\x89PNG")
+    table = tmp_path / "out" / "table.parquet"
+    assert len(read_columns(table, ["impulse_Ns"])["impulse_Ns"]) == 6
+    with pytest.raises(InputError, match="did you mean 'impulse_Ns'"):
+        read_columns(table, ["impulse_N"])
+
+
+@pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
+def test_studies_are_sound(file: Path) -> None:
+    study = read_sweep_file(file)
+    assert study.grain == "collision" and study.figure is not None

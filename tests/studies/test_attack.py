@@ -157,6 +157,23 @@ def test_a_board_that_breaks_within_a_step_is_followed_or_refused() -> None:
     assert shorter.batch(**given, **rows)["impulse"] == pytest.approx([alone.impulse], rel=1e-9)
 
 
+def test_a_hand_that_is_pulled_back_leaves_where_the_force_is_zero_and_not_where_the_surface_is() -> None:
+    """Found by seed 707: 0.3 % of the impulse, as Hunt and Crossley's force is zero at a speed, too."""
+    model = model_of("planar_arm", "Hunt-Crossley", "mass")
+    numbers = {"target_mass": 0.03081, "contact_stiffness": 2330.0, "contact_dissipation": 0.54}
+    servo = {"kp": np.array([55.27, 2095.9, 595.2]), "kd": np.array([96.12, 86.42, 2.801])}
+    blow = Blow(
+        q=np.array([0.5952, 1.6772, -0.0076]),
+        v=np.array([-0.5487, -4.1724, -2.0411]),
+        torque=np.array([-105.77, 19.107, -17.212]),
+        numbers={**numbers, "contact_exponent": 2.0, **servo},
+    )
+    true = truth(model, blow)
+    found = model.collide(blow.q, blow.v, blow.torque, **blow.numbers)
+    assert found.impulse == pytest.approx(true.impulse, rel=1e-5)
+    assert found.duration == pytest.approx(true.duration, rel=1e-5)
+
+
 def test_a_row_whose_steps_are_used_up_has_no_number_as_alone() -> None:
     # found by this seed: a nail that rattles; alone it is refused
     found = strike("arm7", "spring-damper", "nail", 10, 405)

@@ -170,7 +170,7 @@ BLOCKS = ARCHITECTURE.split("```")[1::2]
 INLINE = CODE.findall("".join(ARCHITECTURE.split("```")[::2]) + text_of("extending.md"))
 NAMED = {name for name in INLINE if re.fullmatch(r"[\w/.]+(\.(py|md|toml)|/)", name)}
 FOLDERS = ("impactopt/", "tests/", "docs/", "problems/")
-TEST_LAYERS = ROOT / "tests" / "rooms.py"
+TEST_LAYERS = ROOT / "tests" / "support" / "rooms.py"
 
 
 @pytest.mark.parametrize("name", sorted(NAMED))

@@ -219,7 +219,7 @@ def test_other_models_are_refused(options, output, why):
 def test_tangents_stay_within_the_bounds_of_their_arrays(tmp_path: Path) -> None:
     """Under the compiler's sanitizer of undefined behaviour, which ends the process."""
     script = (
-        "import small_robots, numpy as np\n"
+        "import numpy as np\nfrom support import small_robots\n"
         "from impactopt.collision import SDC\n"
         "from impactopt.contact import FreeMass, SpringDamper\n"
         "law = SpringDamper(stiffness=1e4, damping=300.0)\n"

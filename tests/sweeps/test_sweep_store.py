@@ -54,7 +54,8 @@ ADDING = """
 import sys
 import zlib
 from pathlib import Path
-from support.sweep_entries import Journal, entry
+from impactopt.sweeps.journal import Journal
+from support.sweep_entries import entry
 journal = Journal(Path(sys.argv[1]))
 for unit in range(10**9):
     journal.add(entry(unit))

@@ -133,9 +133,7 @@ class Batch:
         whole = np.concatenate([np.broadcast_to(x, (count, x.shape[1])) for x in flat], axis=1)
         _, first, back = np.unique(whole, axis=0, return_index=True, return_inverse=True)
         parts = [
-            self._stability.unstable(
-                {name: x if len(x) == 1 else x[some] for name, x in own.items()}, self.model.step_length
-            )
+            self._stability.unstable({name: x if len(x) == 1 else x[some] for name, x in own.items()})
             for some in np.split(first, range(_TOGETHER, len(first), _TOGETHER))
         ]
         unstable = np.concatenate(parts)[back.ravel()]

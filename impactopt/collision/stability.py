@@ -128,9 +128,9 @@ class Stability:
             data |= {"d": np.zeros(self._collision.robot.n), "e": 0.0}
         return longest_stable_step(self._model, self._slope, data)
 
-    def unstable(self, given: Mapping[str, Array], step: float) -> NDArray[np.bool_]:
-        """(N) rows of a batch that explicit steps [s] are unstable of, or that rounding spoils; inputs by
-        name have a first axis of N or 1."""
+    def unstable(self, given: Mapping[str, Array]) -> NDArray[np.bool_]:
+        """(N) rows of a batch that the model's steps are unstable of, or that rounding spoils; inputs by name
+        have a first axis of N or 1."""
         collision, count = self._collision, len(given["q"])
         inputs = (given["q"], np.zeros((1, collision.robot.nv)), given["normal"], np.zeros((1, 1)))
         columns = [np.broadcast_to(x, (count, x.shape[1])).T for x in inputs]
@@ -140,4 +140,5 @@ class Stability:
         if collision.terms.bias or collision.terms.jdot:
             data |= {"d": np.zeros((1, collision.robot.n)), "e": np.zeros((1, 1))}
         own = {name: x for name, x in data.items() if name in self._model.data}
+        step = collision.step_length
         return np.asarray(unstable_rows(self._model, self._slope, own, step) | spoiled(frozen))

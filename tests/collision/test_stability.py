@@ -154,5 +154,5 @@ def test_a_bound_of_the_rates_only_spares_eigenvalues() -> None:
     given = {name: x.reshape(1, -1) for name, x in sdc.settings.items()}
     given |= {"q": np.zeros((40, 1)), "contact_stiffness": stiffness[:, None]}
     alone = [sdc.stable_step([0.0], contact_stiffness=k) <= sdc.step_length for k in stiffness]
-    assert sdc._stability.unstable(given, sdc.step_length).tolist() == alone
+    assert sdc._stability.unstable(given).tolist() == alone
     assert {*alone} == {True, False}

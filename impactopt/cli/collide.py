@@ -77,7 +77,7 @@ def collide(
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.report.console import Progress
+        from impactopt.report.console import SolveConsole
         from impactopt.sweeps.single import collide_once, problem_of_result
 
         check_loudness(quiet, verbose)
@@ -96,7 +96,7 @@ def collide(
         at_contact |= {} if freezes is None else {"freezes": freezes}
         at_contact |= {"result": str(what.resolve())} if saved else {}
         at_contact |= {} if posture is None else {"posture": posture}
-        with Progress(console, quiet=quiet) as progress:
+        with SolveConsole(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; colliding (compiles for a minute the first time)")
             at_contact |= {} if speed is None else {"speed_m_s": speed}
             found = collide_once(read, at_contact, accuracy=accuracy / 100)

@@ -43,12 +43,12 @@ def drive(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_series, set_aside
         from impactopt.planning.nail_driving import drive_nail
-        from impactopt.report.console import Progress, blows_table
+        from impactopt.report.console import SolveConsole, blows_table
 
         check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))
         directory = None if out is None else make_directory(out)
-        with Progress(console, quiet=quiet) as progress:
+        with SolveConsole(console, quiet=quiet) as progress:
             series = drive_nail(
                 read.build(),
                 depth=depth,

@@ -53,12 +53,12 @@ Settings = Annotated[
 ]
 
 
-class Solver(str, enum.Enum):
+class SolverChoice(str, enum.Enum):
     ipopt = "ipopt"
     sqp = "sqp"
 
 
-SolverName = Annotated[Solver | None, typer.Option(help="Instead of the one that the file names.")]
+SolverName = Annotated[SolverChoice | None, typer.Option(help="Instead of the one that the file names.")]
 TimeLimit = Annotated[
     float | None, typer.Option(metavar="SECONDS", help="Stop the solver then; keep its best iterate.")
 ]

@@ -70,12 +70,12 @@ def validate(
         from impactopt.files.output import make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
-        from impactopt.report.console import Progress
-        from impactopt.simulation import Conditions
+        from impactopt.report.console import SolveConsole
+        from impactopt.simulation import Perturbation
 
         check_loudness(quiet, verbose)
 
-        world = Conditions(
+        world = Perturbation(
             mass=mass,
             stiffness=stiffness,
             damping=damping,
@@ -95,10 +95,10 @@ def validate(
             make_directory(animation.parent)
         options = {name: value for name, value in (("step", step), ("settle", settle)) if value is not None}
         changes, written = parse_settings(settings or ()), []
-        with Progress(stderr, quiet=quiet, verbose=verbose) as progress:
+        with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
             planned = load_planned(result, problem_file=problem, settings=changes)
             progress.say(f"{result} is read; replaying it in {engine.value}")
-            done = replay(planned, engine=engine.value, conditions=world, **options)
+            done = replay(planned, engine=engine.value, perturbation=world, **options)
             if directory is not None:
                 from impactopt.pictures import save_pictures
 

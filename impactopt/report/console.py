@@ -25,7 +25,7 @@ from impactopt.report.result_rows import (
 from impactopt.solvers.program import IterationRecord
 
 __all__ = [
-    "Progress",
+    "SolveConsole",
     "blows_table",
     "collision_table",
     "replay_table",
@@ -46,7 +46,7 @@ def _plain(text: str) -> str:
     return escape(printable(text))
 
 
-class Progress:
+class SolveConsole:
     """Lines about what is being done, and a live line about the iterations.
 
     Where there is no terminal, iterations are plain lines, one a second at most; `verbose`: all of them.
@@ -58,7 +58,7 @@ class Progress:
         self._last = -QUIET_BETWEEN
         self._start = time.perf_counter()
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> SolveConsole:
         if self._console.is_terminal and not self._quiet:
             self._live = self._console.status("starting")
             self._live.start()

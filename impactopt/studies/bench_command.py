@@ -27,7 +27,7 @@ Out = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep numbers and pictures there.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn conditions.")]
+Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn perturbations.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
 Compilers = Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from impactopt.files.problem_file.section import Section, optional, required
-from impactopt.sweeps.dotted import flat
+from impactopt.sweeps.key_paths import flat
 
 __all__ = ["Figure"]
 

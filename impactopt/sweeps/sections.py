@@ -11,9 +11,9 @@ from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import Positive
 from impactopt.sweeps.figure import Figure
 
-__all__ = ["File", "Grain", "SpanSection", "of_other_grains"]
+__all__ = ["CaseKind", "File", "SpanSection", "of_other_kinds"]
 
-Grain = Literal["solve", "strike", "collision"]
+CaseKind = Literal["solve", "strike", "collision"]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0)]
 
@@ -23,7 +23,9 @@ class SweepSection(Section):
 
     problem: str = required("a problem's name, or a file beside this one")
     name: str = Field(default="", description="what reports call the sweep")
-    grain: Grain = Field(default="solve", description="a whole motion, the blow alone, or one collision")
+    case_kind: CaseKind = Field(
+        default="solve", description="a whole motion, the blow alone, or one collision"
+    )
     seed: Seed = Field(default=0, description="of the draws, and of solves from several starts")
     start: Literal["reach", "strike"] = Field(default="reach", description="of solves: where they start from")
     starts: AtLeastOne = Field(default=1, description="of solves and strikes: so many, the best is kept")
@@ -66,10 +68,10 @@ class File(Section):
     figure: Figure | None = optional("the picture of the table")
 
 
-def of_other_grains(content: File) -> list[Mistake]:
-    """What the file says and the sweep's grain has no use for."""
+def of_other_kinds(content: File) -> list[Mistake]:
+    """What the file says and the sweep's kind of case has no use for."""
     given, found = content.sweep, list[Mistake]()
-    collisions = given.grain == "collision"
+    collisions = given.case_kind == "collision"
     for name in sorted(given.model_fields_set):
         key = SweepSection.model_fields[name].alias or name
         if collisions and name in ("start", "starts", "time_limit", "trajectories"):
@@ -78,5 +80,5 @@ def of_other_grains(content: File) -> list[Mistake]:
             text = "of collisions only; all numbers of a solve are kept"
             found.append(Mistake(place=("sweep", key), sections=1, text=text))
     if content.at_contact and not collisions:
-        found.append(Mistake(place=("at_contact",), sections=1, text='of grain = "collision" only'))
+        found.append(Mistake(place=("at_contact",), sections=1, text='of case_kind = "collision" only'))
     return found

@@ -23,7 +23,7 @@ from impactopt.pictures.style import STYLE
 from impactopt.robots.presets import standin
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench import clock, collision, scaling, skip
-from impactopt.studies.bench.scene import Scene
+from impactopt.studies.bench.setup import Scene
 from impactopt.studies.registry import run_bench
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -321,15 +321,15 @@ def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -
 
 
 def test_the_humanoids_of_scaling_strike_with_their_hand() -> None:
-    scenes = scaling.humanoid_scenes(scaling.HUMANOIDS, quiet)
+    scenes = scaling.humanoid_setups(scaling.HUMANOIDS, quiet)
     assert [scene.name for scene in scenes] == list(scaling.HUMANOIDS)
     for scene in scenes:
         assert len(scene.case.robot.soles) == 2 and scene.case.striker == "right_hand"
-    assert scaling.humanoid_scenes(("no such robot",), quiet) == []
+    assert scaling.humanoid_setups(("no such robot",), quiet) == []
 
 
 def test_a_hand_that_goes_away_is_frozen_and_no_more() -> None:
-    for one in (scaling.tip_scene("chain", 4), scaling.tip_scene("tree", 8)):
+    for one in (scaling.tip_setup("chain", 4), scaling.tip_setup("tree", 8)):
         model = one.model(SDC)
         case = scaling.parted(one.case)
         away = model.collide(case.q, case.v, case.torque)

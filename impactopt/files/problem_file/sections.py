@@ -22,7 +22,7 @@ from impactopt.files.problem_file.contacts import Contact, Target
 from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
-from impactopt.files.problem_file.solver_sections import Solver
+from impactopt.files.problem_file.solver_sections import SolverSection
 from impactopt.files.problem_file.term_sections import Objectives, Terms
 from impactopt.files.problem_file.values import (
     AtLeastOne,
@@ -148,7 +148,7 @@ class File(Section):
     objectives: Objectives = optional("")
     objective: Objective = optional("")
     terms: Terms = optional("")
-    solver: Solver = optional("")
+    solver: SolverSection = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset that [problem] names."""

@@ -42,7 +42,7 @@ class SolverSettings:
         return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
 
 
-class Solver(Section):
+class SolverSection(Section):
     """Which solver, and its options."""
 
     name: Literal["ipopt", "sqp"] = optional("of the solver")

@@ -129,9 +129,9 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
     def told(done: int, of: int) -> None:
         say(f"{done} of {of} parts of the attack")
 
-    alarm = workers > 1
+    watchdog = workers > 1
     parts = map_on_workers(
-        _job, (*shared, alarm), jobs, workers=workers, crashed=lambda code: None, progress=told
+        _job, (*shared, watchdog), jobs, workers=workers, crashed=lambda code: None, progress=told
     )
     found = [one for part in parts if part is not None for one in part]
     # of a part whose process has died or hung, each case in a process of its own
@@ -139,7 +139,7 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
     single = [(kind, seed, first + k, 1) for kind, seed, first, count in lost for k in range(count)]
     if single:
         again = map_on_workers(
-            _job, (*shared, alarm), single, workers=workers, crashed=lambda code: [_dead(code)]
+            _job, (*shared, watchdog), single, workers=workers, crashed=lambda code: [_dead(code)]
         )
         for job, part in zip(single, again, strict=True):
             found += [_placed(one, job) for one in part or []]
@@ -147,16 +147,16 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
 
 
 def _job(shared: Any, job: tuple[str, int, int, int]) -> list[Found] | None:
-    folder, result, program, alarm = shared
+    folder, result, program, watchdog = shared
     kind, seed, first, count = job
     found = []
     with tempfile.TemporaryDirectory(dir=folder) as own:
         for number in range(first, first + count):
-            if alarm:  # the kernel's: nothing else stops compiled code
+            if watchdog:  # the kernel's: nothing else stops compiled code
                 signal.setitimer(signal.ITIMER_REAL, HUNG)
             one = case(kind, seed, number, folder=Path(own), result=result, program=program)
             found.append(_placed(one, (kind, seed, number, 1)))
-    if alarm:
+    if watchdog:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     return found
 

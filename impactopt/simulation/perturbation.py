@@ -16,7 +16,7 @@ LIGHTEST = 1e-6  # [kg] of a payload that is one: MuJoCo takes no body without i
 
 
 @dataclass(frozen=True, kw_only=True)
-class Conditions:
+class Perturbation:
     """What a replay finds; the defaults are what was planned, on a floor of friction 0.9.
 
     mass, stiffness, damping : of the target, and of the contact law, as factors of the planned numbers.
@@ -55,21 +55,23 @@ class Conditions:
             if f.name == "missing":
                 if not isinstance(self.missing, (bool, np.bool_)):
                     raise InputError(
-                        f"conditions: missing is {shortened(repr(self.missing))}; give True or False"
+                        f"perturbation: missing is {shortened(repr(self.missing))}; give True or False"
                     )
                 continue
             value = float(
                 check_array(
-                    f"conditions: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
+                    f"perturbation: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
                 )
             )
             if f.name != "distance" and value < 0:
-                raise InputError(f"conditions: {f.name} is {value:g}; give a number >= 0")
+                raise InputError(f"perturbation: {f.name} is {value:g}; give a number >= 0")
         if 0 < self.payload < LIGHTEST:
-            raise InputError(f"conditions: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg")
+            raise InputError(
+                f"perturbation: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg"
+            )
         for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
             if not getattr(self, name) > 0:
-                raise InputError(f"conditions: {name} is {getattr(self, name):g}; give a number > 0")
+                raise InputError(f"perturbation: {name} is {getattr(self, name):g}; give a number > 0")
 
     def scene(self, planned: Scene) -> Scene:
         """The scene as it turns out.
@@ -80,7 +82,7 @@ class Conditions:
         """
         law, target = planned.law, planned.target
         of_law, of_target = scaled_numbers(
-            "conditions", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
+            "perturbation", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
         )
         way = self.distance * planned.normal
         solids = planned.solids.moved(way) if self.distance else planned.solids

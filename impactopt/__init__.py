@@ -38,7 +38,7 @@ _EXPORTS = {
     "StrikeSolution": "planning.strike",
     "Striker": "robots.robot",
     "TargetBody": "bodies.shapes",
-    "Terms": "collision",
+    "Effects": "collision",
     "Tool": "robots.robot",
     "Trajectory": "transcription.plan",
     "VirtualMass": "collision",

@@ -33,11 +33,12 @@ class TargetBody(Described):
     """
 
     shape: str | None = field(
-        default=None, metadata=about("left out: what fits the target's kind", choices=TARGET_SHAPES)
+        default=None,
+        metadata=about("shape; left out: the one that belongs to the target's kind", choices=TARGET_SHAPES),
     )
     size: tuple[float, ...] | None = field(
         default=None,
-        metadata=about("of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
+        metadata=about("size: of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
     )
 
     def __post_init__(self) -> None:
@@ -68,13 +69,17 @@ class Obstacle(Described):
 
     name: str = field(metadata=about("what reports call it"))
     size: Vector | None = field(default=None, metadata=about("sides of a box", unit="m"))
-    position: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("middle of the box, world", unit="m"))
-    rpy: Vector = field(
-        default=(0.0, 0.0, 0.0), metadata=about("turns of the box about x, y and z", unit="rad")
+    position: Vector = field(
+        default=(0.0, 0.0, 0.0), metadata=about("middle of the box, in the world frame", unit="m")
     )
-    start: Vector | None = field(default=None, metadata=about("of a capsule's axis, world", unit="m"))
-    end: Vector | None = field(default=None, metadata=about("of its axis; left out: a sphere", unit="m"))
-    radius: float = field(default=0.0, metadata=about("of the capsule", unit="m", above=0))
+    rpy: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("roll, pitch and yaw of the box", unit="rad"))
+    start: Vector | None = field(
+        default=None, metadata=about("start of a capsule's axis, in the world frame", unit="m")
+    )
+    end: Vector | None = field(
+        default=None, metadata=about("end of its axis; left out: the capsule is a sphere", unit="m")
+    )
+    radius: float = field(default=0.0, metadata=about("radius of the capsule", unit="m", above=0))
 
     def __post_init__(self) -> None:
         where = f"obstacle {self.name!r}"

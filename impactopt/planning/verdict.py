@@ -65,7 +65,7 @@ def with_reason(t: ContactProgram, result: SolverResult) -> SolverResult:
 def _too_stiff(t: ContactProgram) -> str:
     """The target's last event does not happen in one contact, however fast the robot is."""
     p = t.problem
-    if not isinstance(t.expected, Collision) or not p.target.events:
+    if not isinstance(t.expected, Collision) or not p.target.guards:
         return ""
     limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.builder.limits.rate_limit)
     found = parting(p.law, p.target, t.hit.mass, limit)

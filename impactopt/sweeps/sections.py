@@ -26,14 +26,18 @@ class SweepSection(Section):
     case_kind: CaseKind = Field(
         default="solve", description="a whole motion, the blow alone, or one collision"
     )
-    seed: Seed = Field(default=0, description="of the draws, and of solves from several starts")
-    start: Literal["reach", "strike"] = Field(default="reach", description="of solves: where they start from")
-    starts: AtLeastOne = Field(default=1, description="of solves and strikes: so many, the best is kept")
-    time_limit: Positive = optional("of the solver in each case [s]", "time_limit_s")
+    seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")
+    start: Literal["reach", "strike"] = Field(
+        default="reach", description="what a solve starts from: a plain reach, or the strike alone"
+    )
+    starts: AtLeastOne = Field(
+        default=1, description="starts of each solve or strike, of which the best is kept"
+    )
+    time_limit: Positive = optional("longest time of the solver in each case [s]", "time_limit_s")
     trajectories: bool = Field(default=False, description="keep the result of each case whole")
     outputs: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         default=("impulse_Ns", "peak_force_N", "freeze_error_pct"),
-        description="of collisions: the columns of the table",
+        description="columns of the table, of collisions",
     )
 
 
@@ -42,28 +46,34 @@ class SpanSection(Section):
 
     first: float = required("the first", "from")
     last: float = required("the last, included", "to")
-    count: AtLeastOne | None = optional("so many; not of those that are drawn")
-    scale: Literal["linear", "log"] = Field(default="linear", description="equal steps, or equal factors")
+    count: AtLeastOne | None = optional("how many; left out where they are drawn")
+    scale: Literal["linear", "log"] = Field(
+        default="linear", description="equal steps (linear) or equal factors (log)"
+    )
 
 
 class DrawSection(Section):
     """Points drawn over ranges."""
 
-    method: Literal["random", "sobol", "latin hypercube"] = Field(default="sobol", description="how")
-    count: AtLeastOne = required("so many")
-    over: dict[str, Any] = required("by key, a range or a list to choose from")
+    method: Literal["random", "sobol", "latin hypercube"] = Field(
+        default="sobol", description="how points are drawn"
+    )
+    count: AtLeastOne = required("how many points")
+    over: dict[str, Any] = required("by key path, a range or a list to choose from")
 
 
 class File(Section):
     """A sweep file; keys below [set], [grid], [list] and [draw.over] are the problem file's."""
 
     sweep: SweepSection
-    at_contact: dict[str, Any] = Field(
-        default_factory=dict, description="of collisions: the state at contact"
+    at_contact: dict[str, Any] = Field(default_factory=dict, description="state at contact, of collisions")
+    set: dict[str, Any] = Field(default_factory=dict, description="values that are the same in every case")
+    grid: dict[str, Any] = Field(
+        default_factory=dict, description="values of which every combination is a case"
     )
-    set: dict[str, Any] = Field(default_factory=dict, description="the same in every case")
-    grid: dict[str, Any] = Field(default_factory=dict, description="every combination")
-    list: dict[str, Any] = Field(default_factory=dict, description="read side by side")
+    list: dict[str, Any] = Field(
+        default_factory=dict, description="values of which those at the same place of each list are a case"
+    )
     draw: DrawSection = optional("what is drawn")
     figure: Figure | None = optional("the picture of the table")
 

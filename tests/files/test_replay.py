@@ -19,7 +19,7 @@ from impactopt.cli.validate import validate
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
-from impactopt.pictures.animation import AROUND, FPS, SLOW, _Stage, save_animation, shown_times
+from impactopt.pictures.animation import AROUND, FPS, SLOW, _Drawing, save_animation, shown_times
 from impactopt.planning.solution import Solution
 from impactopt.simulation import Perturbation
 from impactopt.simulation.result import REPORT
@@ -160,11 +160,11 @@ def test_a_replay_takes_the_place_of_an_older_one(still: Replay) -> None:
 
 def test_the_animation_draws_the_world_where_the_replay_has_it(still: Replay) -> None:
     problem = still.planned.problem
-    (target,) = _Stage(still).look(0).world
+    (target,) = _Drawing(still).look(0).world
     ahead = np.sort((target - problem.point) @ problem.normal)
     assert ahead == pytest.approx(np.repeat([-0.001, 0.179], 4)), "1 mm nearer, 18 cm deep"
     gone = dataclasses.replace(still, perturbation=Perturbation(missing=True))
-    assert _Stage(gone).look(0).world == []
+    assert _Drawing(gone).look(0).world == []
 
 
 def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path) -> None:

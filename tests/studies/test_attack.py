@@ -251,7 +251,7 @@ def test_the_bench_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ["files", "urdfs", "commands", "calls", "tracebacks", "slow", "unsound"]
     assert [found[name] for name in names] == [3, 3, 0, 3, 0, 0, 0]
     assert {"collisions", "off", "refused", "seconds"} <= found.keys()
-    assert {"compiler", "clang"} <= {*found["compilers"]["ways"], *found["compilers"]["absent"]}
+    assert {"compiler", "clang"} <= {*found["compilers"]["builds"], *found["compilers"]["absent"]}
     assert found["replays"] == {"replays": 0, "off": 0, "refused": 0}
 
 

@@ -13,7 +13,7 @@ from support import small_robots
 from support.native_cases import FRICTION, LAW, TARGET, sdc, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.collision.describe import independent_joints
 from impactopt.errors import InputError
 from impactopt.pictures.pareto import front, pareto_picture
@@ -55,7 +55,7 @@ def assert_one_by_one(model: Any, found: dict[str, Any], one: Any, outputs: tupl
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_batch_is_its_collisions_one_by_one(threads: int) -> None:
-    model = sdc("arm", terms=Terms(friction=True), friction=FRICTION)
+    model = sdc("arm", effects=Effects(friction=True), friction=FRICTION)
     q, v, torque = cases("arm", model, 9)
     outputs = ("impulse", "velocity", "time", "force", "torque")
     found = model.batch(q, v, torque, outputs=outputs, threads=threads)
@@ -129,7 +129,12 @@ def test_what_is_wrong_in_a_batch_is_said() -> None:
 def test_without_a_compiler_a_batch_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
     model = SDC(
-        robot=small_robots.slider(3.0), striker="tip", normal=X, law=LAW, target=TARGET, terms=Terms.none()
+        robot=small_robots.slider(3.0),
+        striker="tip",
+        normal=X,
+        law=LAW,
+        target=TARGET,
+        effects=Effects.none(),
     )
     q, v = np.zeros((2, 1)), np.array([[1.0], [2.0]])
     found = model.batch(q, v, outputs=("impulse", "force"))
@@ -139,20 +144,20 @@ def test_without_a_compiler_a_batch_takes_longer(monkeypatch: pytest.MonkeyPatch
 
 # ---------------------------------------------------------------- descriptions
 def test_a_description_says_what_is_in_and_what_is_not() -> None:
-    model = sdc("biped", terms=Terms(saturation=False, bias=False))
+    model = sdc("biped", effects=Effects(saturation=False, bias=False))
     told = model.describe(("impulse", "zmp"), parameters=("kd",))
     numbers = told.as_dict()
-    assert numbers["terms"] == ["damping", "stiffness", "feedforward", "jdot"]
+    assert numbers["effects"] == ["damping", "stiffness", "feedforward", "jdot"]
     assert len(numbers["held"]) == 2 and numbers["inputs"] == ["q", "v", "feedforward", "kd"]
     assert {"saturation", "bias", "friction", "peak force", "derivatives"} <= {*numbers["left_out"]}
     assert not {"stiffness", "histories", "wrenches and ZMP"} & {*numbers["left_out"]}
-    assert "terms.saturation is off" in str(told) and "zmp" in str(told)
+    assert "effects.saturation is off" in str(told) and "zmp" in str(told)
     json.dumps(numbers)
 
 
 def test_what_is_left_out_is_not_computed() -> None:
-    lean = sdc("biped", terms=Terms.none()).describe(("impulse",)).as_dict()["instructions"]
-    full = sdc("biped", terms=Terms(friction=True), friction=FRICTION)
+    lean = sdc("biped", effects=Effects.none()).describe(("impulse",)).as_dict()["instructions"]
+    full = sdc("biped", effects=Effects(friction=True), friction=FRICTION)
     rich = full.describe(full.available).as_dict()["instructions"]
     # of a Runge-Kutta step the four products with A stay
     assert lean["freeze"] < 0.9 * rich["freeze"] and lean["step"] < 0.7 * rich["step"]
@@ -160,7 +165,7 @@ def test_what_is_left_out_is_not_computed() -> None:
 
 def test_a_point_mass_has_no_servo() -> None:
     numbers = sdc("arm", VirtualMass).describe().as_dict()
-    assert numbers["terms"] == [] and "servo" in numbers["left_out"]
+    assert numbers["effects"] == [] and "servo" in numbers["left_out"]
     with pytest.raises(InputError, match="point mass"):
         sdc("arm", VirtualMass).describe(("torque",))
 

@@ -56,11 +56,11 @@ class Problem(Section):
 
     name: str = optional("what reports call the problem")
     robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
-    striker: str = required("what hits: one of the robot's strikers")
+    striker: str = required("name of the robot's striker that hits")
     point: Vector = required(
         "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
     )
-    normal: UnitVector = required("which way the target is pushed: a unit vector")
+    normal: UnitVector = required("direction in which the target is pushed: a unit vector")
     start: Posture = Field(
         default=ImpactProblem.start,
         description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",
@@ -84,7 +84,9 @@ class PhaseSection(Section):
     duration: Duration = required(
         "one number, or [shortest, longest] for the solver to choose [s]", "duration_s"
     )
-    intervals: int = optional("of the spline, at least 6: more make the motion freer, and the solve longer")
+    intervals: int = optional(
+        "number of the spline's intervals, at least 6; more make the motion freer and the solve longer"
+    )
     grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
 
 
@@ -102,12 +104,14 @@ class Collision(Section):
     collision: Literal["dynamics", "rigid", "virtual mass"] = optional(
         '"dynamics": the whole equation of motion; or an impact without duration, to compare with', "model"
     )
-    coefficient_of_restitution: Restitution = optional('of the model "rigid"')
+    coefficient_of_restitution: Restitution = optional(
+        'speed of separation over speed of approach, of the model "rigid"'
+    )
     contact_duration: ContactDuration = optional(
-        "[shortest, longest] of each of compression and restitution [s]; a shortest of 0 is no bound",
+        "[shortest, longest] time of compression and of restitution [s]; 0: no shortest time",
         "duration_s",
     )
-    collision_stages: Literal[2, 3] = optional("Radau IIA stages of an element", "stages")
+    collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
     compression: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
     restitution: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
 
@@ -123,9 +127,9 @@ ObstacleSection: Any = section_of(Obstacle)
 class Objective(Section):
     """Prices that only make the optimum unique, and its end natural."""
 
-    smoothness: NotNegative = optional("of accelerations [N s per (rad/s^2)^2 s]")
-    wrench_price: NotNegative = optional("of the soles' wrenches")
-    return_price: NotNegative = optional("of ending away from the start posture [N s per rad^2]")
+    smoothness: NotNegative = optional("price of accelerations [N s per (rad/s^2)^2 s]")
+    wrench_price: NotNegative = optional("price of the soles' wrenches")
+    return_price: NotNegative = optional("price of ending away from the start posture [N s per rad^2]")
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:

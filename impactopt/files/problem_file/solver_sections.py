@@ -45,8 +45,10 @@ class SolverSettings:
 class SolverSection(Section):
     """Which solver, and its options."""
 
-    name: Literal["ipopt", "sqp"] = optional("of the solver")
-    time_limit: Positive = optional("after which its best iterate is kept [s]", "time_limit_s")
+    name: Literal["ipopt", "sqp"] = optional("name of the solver")
+    time_limit: Positive = optional(
+        "longest time of the solver, after which its best iterate is kept [s]", "time_limit_s"
+    )
     ipopt: IpoptOptions = optional("IPOPT's own options by name")
     sqp: SQP = optional("")
 

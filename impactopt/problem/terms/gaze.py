@@ -29,10 +29,15 @@ class Gaze(Term):
 
     name: ClassVar[str] = "gaze"
     unit: ClassVar[str] = "rad"
-    frame: str = field(metadata=about("of the robot"))
-    axis: Vector = field(metadata=about("unit vector in the frame: the way it looks", direction=True))
-    angle: float = field(default=0.5, metadata=about("off the hit point, at most", unit="rad", above=0))
-    since: float = field(default=0.5, metadata=about("fraction of the swing from which it holds", least=0))
+    frame: str = field(metadata=about("name of the robot's frame"))
+    axis: Vector = field(metadata=about("direction of view: a unit vector in the frame", direction=True))
+    angle: float = field(
+        default=0.5,
+        metadata=about(
+            "largest angle between the axis and the direction to the hit point", unit="rad", above=0
+        ),
+    )
+    since: float = field(default=0.5, metadata=about("share of the swing after which it holds", least=0))
 
     def __post_init__(self) -> None:
         self.check_angle()

@@ -28,7 +28,9 @@ class HitCone(Term):
 
     name: ClassVar[str] = "hit cone"
     unit: ClassVar[str] = "m/s"
-    angle: float = field(default=0.1, metadata=about("between the two, at most", unit="rad", above=0))
+    angle: float = field(
+        default=0.1, metadata=about("largest angle between velocity and normal", unit="rad", above=0)
+    )
 
     def __post_init__(self) -> None:
         self.check_angle()

@@ -33,9 +33,9 @@ class HitRegion(Term):
 
     name: ClassVar[str] = "hit region"
     unit: ClassVar[str] = "m"
-    radius: float | None = field(default=None, metadata=about("of the disc", unit="m", above=0))
+    radius: float | None = field(default=None, metadata=about("radius of the disc", unit="m", above=0))
     size: tuple[float, float] | None = field(
-        default=None, metadata=about("of the rectangle, across and up", unit="m")
+        default=None, metadata=about("sides of the rectangle, across and up", unit="m")
     )
 
     def __post_init__(self) -> None:

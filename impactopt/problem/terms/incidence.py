@@ -20,5 +20,7 @@ class Incidence(Term):
     unit: ClassVar[str] = "m/s"
     speed: float = field(
         default=0.05,
-        metadata=about("along each of two tangents; inf: any", unit="m/s", least=0, endless=True),
+        metadata=about(
+            "largest speed along each of two tangents; inf: any", unit="m/s", least=0, endless=True
+        ),
     )

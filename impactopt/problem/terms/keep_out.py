@@ -18,5 +18,7 @@ class KeepOut(Term):
 
     name: ClassVar[str] = "keep out"
     unit: ClassVar[str] = "m"
-    margin: float = field(default=0.01, metadata=about("from a link to any of them", unit="m", least=0))
+    margin: float = field(
+        default=0.01, metadata=about("least distance from a link to any of them", unit="m", least=0)
+    )
     enabled: bool = field(default=True, metadata=about("false: the robot may pass through them"))

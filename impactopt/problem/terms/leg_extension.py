@@ -23,5 +23,9 @@ class LegExtension(Term):
     unit: ClassVar[str] = "of start"
     minimum: float = field(
         default=0.35,
-        metadata=about("of the start posture's leg determinant; 0 would be a straight knee", least=0, most=1),
+        metadata=about(
+            "least determinant of the leg's Jacobian over that of the start posture; 0: a straight knee",
+            least=0,
+            most=1,
+        ),
     )

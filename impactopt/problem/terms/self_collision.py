@@ -19,5 +19,5 @@ class SelfCollision(Term):
 
     name: ClassVar[str] = "self-collision"
     unit: ClassVar[str] = "m"
-    margin: float = field(default=0.01, metadata=about("between two links", unit="m", least=0))
+    margin: float = field(default=0.01, metadata=about("least distance between two links", unit="m", least=0))
     enabled: bool = field(default=True, metadata=about("false: links may pass through each other"))

@@ -16,6 +16,9 @@ class TorqueLimit(Term):
     name: ClassVar[str] = "torque limit"
     unit: ClassVar[str] = "of limit"
     fraction: float = field(
-        default=0.85, metadata=about("of the limit, in swing and follow-through", above=0, most=1)
+        default=0.85,
+        metadata=about("share of the limit that may be used in swing and follow-through", above=0, most=1),
     )
-    collision: float = field(default=0.85, metadata=about("of the limit, while in contact", above=0, most=1))
+    collision: float = field(
+        default=0.85, metadata=about("share of the limit that may be used in contact", above=0, most=1)
+    )

@@ -26,8 +26,8 @@ from impactopt.studies.bench.attack_calls import attack_call
 from impactopt.studies.bench.attack_cases import FINE, LATE, REFUSED, TRACEBACK, UNSOUND, Found, pick
 from impactopt.studies.bench.attack_collisions import FLOATING, ROBOTS, Struck, pairs_of, strike
 from impactopt.studies.bench.attack_commands import attack_command, make_result
+from impactopt.studies.bench.attack_compilers import BUILDS, Compared, builds, compare
 from impactopt.studies.bench.attack_compilers import ROBOTS as COMPILED
-from impactopt.studies.bench.attack_compilers import WAYS, Compared, compare, ways
 from impactopt.studies.bench.attack_files import attack_file, texts
 from impactopt.studies.bench.attack_replays import Replayed, replay_one
 from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
@@ -238,8 +238,8 @@ def report(
     numbers["slow"] = sum(counts[kind, LATE] for kind in NAMES)
     numbers["unsound"] = sum(counts[kind, UNSOUND] for kind in NAMES)
     numbers |= _sums(struck, "collisions")
-    absent = [way for way in WAYS if way not in ways()]
-    numbers["compilers"] = {"ways": list(ways()), "absent": absent, **_sums(compiled, "collisions")}
+    absent = [build for build in BUILDS if build not in builds()]
+    numbers["compilers"] = {"builds": list(builds()), "absent": absent, **_sums(compiled, "collisions")}
     numbers["replays"] = _sums(replayed, "replays")
     verdicts = (FINE, REFUSED, TRACEBACK, LATE, UNSOUND)
     rows = [
@@ -247,7 +247,7 @@ def report(
     ]
     tables = [make_table("attacks", ["of", "cases", *verdicts], rows)]
     heads = ["", "cases", "off", "refused", "too slow to judge", "largest error"]
-    by_compilers = f"collisions by {', '.join(ways())}; absent: {', '.join(absent) or 'none'}"
+    by_compilers = f"collisions by {', '.join(builds())}; absent: {', '.join(absent) or 'none'}"
     by_another_way: dict[str, Sequence[Any]] = {
         "collisions by an equation": struck,
         by_compilers: compiled,

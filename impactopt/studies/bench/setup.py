@@ -77,7 +77,7 @@ class Setup:
 
 def inputs(model: SymbolicModel, case: Case) -> list[Any]:
     """Of the model's functions, all settings being inputs."""
-    return [case.q, case.v, *([case.torque] if model.terms.feedforward else []), *model.settings.values()]
+    return [case.q, case.v, *([case.torque] if model.effects.feedforward else []), *model.settings.values()]
 
 
 def compiled(model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> Any:

@@ -13,7 +13,7 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.collision import SDC, JointFriction, Terms
+from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.collision.describe import independent_joints, instructions
 from impactopt.collision.graph import joint_space_model
 from impactopt.collision.outputs import HISTORIES, OF_SOLES
@@ -92,10 +92,10 @@ def variants(setup: Setup) -> list[Variant]:
     """Everything, and everything but one; then what a planner asks for."""
     case = setup.case
 
-    def model(*, terms: dict[str, bool] | None = None, **options: Any) -> SymbolicModel:
-        chosen = Terms(**{"friction": True, **(terms or {})})
+    def model(*, effects: dict[str, bool] | None = None, **options: Any) -> SymbolicModel:
+        chosen = Effects(**{"friction": True, **(effects or {})})
         friction = FRICTION if chosen.friction else None
-        made: SymbolicModel = setup.model(SDC, terms=chosen, friction=friction, **options)
+        made: SymbolicModel = setup.model(SDC, effects=chosen, friction=friction, **options)
         return made
 
     whole = model()
@@ -104,13 +104,13 @@ def variants(setup: Setup) -> list[Variant]:
     scalars = tuple(name for name in everything if name not in HISTORIES)
     out = [
         Variant(skipped=WHOLE, model=whole, case=case, outputs=everything),
-        Variant(skipped="friction", model=model(terms={"friction": False}), case=case, outputs=everything),
+        Variant(skipped="friction", model=model(effects={"friction": False}), case=case, outputs=everything),
         Variant(
-            skipped="saturation", model=model(terms={"saturation": False}), case=case, outputs=everything
+            skipped="saturation", model=model(effects={"saturation": False}), case=case, outputs=everything
         ),
         Variant(
             skipped="bias and Jdot",
-            model=model(terms={"bias": False, "jdot": False}),
+            model=model(effects={"bias": False, "jdot": False}),
             case=case,
             outputs=everything,
         ),
@@ -125,7 +125,7 @@ def variants(setup: Setup) -> list[Variant]:
     names = tuple(name for name in case.robot.joint_names if name.startswith(LOCKED))
     if names:
         out.append(without_joints(setup, names, everything))
-    bare = setup.model(SDC, terms=Terms(saturation=False))
+    bare = setup.model(SDC, effects=Effects(saturation=False))
     out.append(Variant(skipped="all but the impulse", model=bare, case=case, outputs=("impulse",)))
     return out + (on_fixed_base(setup) if names else [])
 
@@ -134,7 +134,7 @@ def without_joints(setup: Setup, names: Sequence[str], outputs: tuple[str, ...])
     """The stand-in with joints locked where they are."""
     case, small = locked(setup.case, names, floating=True)
     options = {**setup.options, "robot": small}
-    model = SDC(**options, terms=Terms(friction=True), friction=FRICTION)
+    model = SDC(**options, effects=Effects(friction=True), friction=FRICTION)
     return Variant(skipped=f"{len(names)} joints, locked", model=model, case=case, outputs=outputs)
 
 

@@ -264,7 +264,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
 
     from impactopt.errors import printable
     from impactopt.files.result_folder import set_aside
-    from impactopt.report.console import result_table, starts_table, told_touches, violation_table
+    from impactopt.report.console import result_table, multistart_table, told_touches, violation_table
 
     console, summary = Console(), record.summary
     if record.completed:
@@ -281,7 +281,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)
     if len(summary["starts"]) > 1:
-        console.print(starts_table(summary["starts"]))
+        console.print(multistart_table(summary["starts"]))
     if summary["violations"]:
         console.print(violation_table(summary["violations"]))
     console.print(

@@ -43,7 +43,7 @@ def drive(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_series, set_aside
         from impactopt.planning.nail_driving import drive_nail
-        from impactopt.report.console import SolveConsole, blows_table
+        from impactopt.report.console import SolveConsole, nail_driving_table
 
         check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))
@@ -64,7 +64,7 @@ def drive(
         else:
             from rich.console import Console
 
-            Console().print(blows_table(done))
+            Console().print(nail_driving_table(done))
             typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
             if aside := set_aside(done):
                 typer.echo(aside)

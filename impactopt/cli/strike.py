@@ -83,11 +83,11 @@ def strike(
         else:
             from rich.console import Console
 
-            from impactopt.report.console import starts_table, strike_table, violation_table
+            from impactopt.report.console import multistart_table, strike_table, violation_table
 
             shown = Console()
             shown.print(strike_table(record.summary))
-            shown.print(starts_table(record.summary["starts"]))
+            shown.print(multistart_table(record.summary["starts"]))
             if record.summary["violations"]:
                 shown.print(violation_table(record.summary["violations"]))
             for path in written:

@@ -181,7 +181,7 @@ class SymbolicModel(SteppedModel):
         -------
         Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
         frames, 6), where the last instant is repeated after separation. `separated` (N) of bool is always
-        there; it is False for a collision without finite numbers too. With "rk4" there is `step_error` (N), an
+        there; it is False too where numbers are not finite. With "rk4" there is `step_error` (N), an
         estimate of the impulse's error by its steps. Where this is above 1e-2, or the step is unstable,
         all numbers are nan. `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 

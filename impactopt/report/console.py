@@ -26,11 +26,11 @@ from impactopt.solvers.program import IterationRecord
 
 __all__ = [
     "SolveConsole",
-    "blows_table",
+    "nail_driving_table",
     "collision_table",
     "replay_table",
     "result_table",
-    "starts_table",
+    "multistart_table",
     "strike_table",
     "told_touches",
     "torques_table",
@@ -141,7 +141,7 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
     return table
 
 
-def starts_table(starts: Sequence[Mapping[str, Any]]) -> Table:
+def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     """What came of each start; `starts` as in a summary."""
     table = Table(title="starts", title_justify="left")
     for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
@@ -197,7 +197,7 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def blows_table(series: Mapping[str, Any]) -> Table:
+def nail_driving_table(series: Mapping[str, Any]) -> Table:
     """A row for each blow on a nail; `series` as in `impactopt drive --json`."""
     table = Table(title="blows on the nail", title_justify="left")
     columns = (

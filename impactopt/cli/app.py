@@ -264,7 +264,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
 
     from impactopt.errors import printable
     from impactopt.files.result_folder import set_aside
-    from impactopt.report.console import result_table, multistart_table, told_touches, violation_table
+    from impactopt.report.console import multistart_table, result_table, told_touches, violation_table
 
     console, summary = Console(), record.summary
     if record.completed:

@@ -26,11 +26,11 @@ from impactopt.solvers.program import IterationRecord
 
 __all__ = [
     "SolveConsole",
-    "nail_driving_table",
     "collision_table",
+    "multistart_table",
+    "nail_driving_table",
     "replay_table",
     "result_table",
-    "multistart_table",
     "strike_table",
     "told_touches",
     "torques_table",

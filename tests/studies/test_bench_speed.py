@@ -23,7 +23,7 @@ from impactopt.pictures.style import STYLE
 from impactopt.robots.presets import standin
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench import clock, collision, scaling, skip
-from impactopt.studies.bench.setup import Scene
+from impactopt.studies.bench.setup import Setup
 from impactopt.studies.registry import run_bench
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -195,7 +195,7 @@ def quiet(_text: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def setup() -> Setup:
     """A small arm's blow: the benches take any."""
     model = sdc("arm")
     q, v, torque = situation("arm", model, seed=3)[:3]
@@ -210,7 +210,7 @@ def scene() -> Scene:
         effective_mass=np.nan,
         speed=1.5,
     )
-    return Scene(name="arm", case=case, law=LAW, target=TARGET, horizon=0.05)
+    return Setup(name="arm", case=case, law=LAW, target=TARGET, horizon=0.05)
 
 
 def test_what_is_timed_in_turns_keeps_its_ratio() -> None:
@@ -225,8 +225,8 @@ def test_what_takes_long_is_timed_less() -> None:
 
 
 @compiled
-def test_the_bench_of_collisions_has_each_method_and_the_default_s_ratios(scene: Scene) -> None:
-    numbers = collision.run(quiet, scenes=[scene], quick=True, repeats=3).numbers
+def test_the_bench_of_collisions_has_each_method_and_the_default_s_ratios(setup: Setup) -> None:
+    numbers = collision.run(quiet, setups=[setup], quick=True, repeats=3).numbers
     rows = {(r["method"], r["setting"]): r for r in numbers["rows"]}
     keys = {"robot", "method", "setting", "time_us", "note", *collision.KEYS}
     assert all({*r} == keys for r in rows.values())
@@ -255,18 +255,18 @@ def test_a_front_is_of_what_nothing_beats() -> None:
 
 
 @compiled
-def test_a_step_that_is_unstable_has_a_row_that_says_so(scene: Scene) -> None:
+def test_a_step_that_is_unstable_has_a_row_that_says_so(setup: Setup) -> None:
     from impactopt.studies.bench import methods
 
     found, refused = [], []
-    maker = methods._ours(scene, quiet, found, refused)
-    maker("sdc", "0.01 s", lambda: scene.model(SDC, method="rk4", step=0.01, kd=1e3))
+    maker = methods._ours(setup, quiet, found, refused)
+    maker("sdc", "0.01 s", lambda: setup.model(SDC, method="rk4", step=0.01, kd=1e3))
     assert not found and "unstable" in refused[0]["note"]
 
 
 @compiled
-def test_the_bench_of_skipping_says_what_each_saves(scene: Scene) -> None:
-    numbers = skip.run(quiet, scene=scene, repeats=3).numbers
+def test_the_bench_of_skipping_says_what_each_saves(setup: Setup) -> None:
+    numbers = skip.run(quiet, setup=setup, repeats=3).numbers
     rows = {r["skipped"]: r for r in numbers["rows"]}
     whole = rows["everything"]
     assert whole["speedup"] == 1.0
@@ -299,13 +299,13 @@ def test_joints_that_are_locked_keep_their_places() -> None:
 
 
 @compiled
-def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -> None:
+def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(setup: Setup) -> None:
     numbers = scaling.run(
         quiet,
         chains=(2, 4),
         trees=(8,),
         humanoids=(),
-        scene=scene,
+        setup=setup,
         steps=(2.5e-4,),
         tolerances=(1e-3, 1e-7),
         batches=(1, 20),
@@ -326,10 +326,10 @@ def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -
 
 
 def test_the_humanoids_of_scaling_strike_with_their_hand() -> None:
-    scenes = scaling.humanoid_setups(scaling.HUMANOIDS, quiet)
-    assert [scene.name for scene in scenes] == list(scaling.HUMANOIDS)
-    for scene in scenes:
-        assert len(scene.case.robot.soles) == 2 and scene.case.striker == "right_hand"
+    setups = scaling.humanoid_setups(scaling.HUMANOIDS, quiet)
+    assert [setup.name for setup in setups] == list(scaling.HUMANOIDS)
+    for setup in setups:
+        assert len(setup.case.robot.soles) == 2 and setup.case.striker == "right_hand"
     assert scaling.humanoid_setups(("no such robot",), quiet) == []
 
 

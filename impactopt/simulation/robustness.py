@@ -31,15 +31,15 @@ LOGARITHMIC = ("mass", "stiffness", "kp", "kd")  # factors: half is as far from 
 
 @dataclass(frozen=True, kw_only=True)
 class PerturbationRanges:
-    """Between which bounds perturbations are drawn, independently; what they mean: :class:`Perturbation`.
+    """Ranges (lower, upper) from which perturbations are drawn independently; see :class:`Perturbation`.
 
     mass, stiffness, kp, kd : factors, log-uniform.  distance [m], payload [kg], friction, torque_limit
         (a factor) : uniform.
-    period [s] : of the servo, in every draw: a real servo is sampled.
+    period [s] : sampling period of the servo, the same in every draw.
 
     Raises
     ------
-    InputError : naming the range whose bounds are crossed, or that no perturbation could come from.
+    InputError : naming the range that is empty, or that has values that no perturbation can have.
     """
 
     mass: tuple[float, float] = (0.5, 2.0)
@@ -71,12 +71,12 @@ class PerturbationRanges:
         return replace(self, **none)
 
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """What is drawn, by name, with its bounds."""
+        """(lower, upper) by name, of what is drawn."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "period"}
 
 
 def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None = None) -> list[Perturbation]:
-    """n perturbations, drawn from ranges; of one seed, fewer draws are the first of more.
+    """n perturbations, drawn from ranges. With one seed, the first draws do not depend on n.
 
     Raises
     ------

@@ -71,7 +71,7 @@ def sweep(
     report: Callable[[str], None] | None = None,
     progress: Callable[[SweepProgress], None] | None = None,
 ) -> SweepResult:
-    """Do every case of a sweep and write one table; done again, it goes on where it was ended.
+    """Do every case of a sweep and write one table. If it is called again, it resumes what was not finished.
 
     source : a sweep file, its data as tables, or what :func:`impactopt.sweeps.read_sweep_file` gave.
     out : directory of the results: see `impactopt.sweeps.store`. Every finished case is on disk at once.

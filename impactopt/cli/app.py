@@ -109,7 +109,9 @@ def solve(
         typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
     ] = None,
     solver: SolverName = None,
-    start: Annotated[Start, typer.Option(help="A plain reach, or the hardest strike near it.")] = Start.reach,
+    start: Annotated[
+        Start, typer.Option(help="What to start from: a plain reach, or the hardest strike near it.")
+    ] = Start.reach,
     starts: Starts = 1,
     seed: Seed = 0,
     time_limit: TimeLimit = None,

@@ -31,7 +31,7 @@ def strike(
     file: ProblemPath,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Write numbers there."),
+        typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
     ] = None,
     starts: Starts = 4,
     seed: Seed = 0,

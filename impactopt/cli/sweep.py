@@ -30,17 +30,21 @@ def sweep(
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Where results go, and are found again.")
+        Path,
+        typer.Option("--out", "-o", metavar="DIR", help="Directory of the results; give it again to resume."),
     ],
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port: its workers do it."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="Address of a Dask scheduler, tcp://host:port, whose workers do the cases.",
+        ),
     ] = None,
     again: Annotated[
-        bool, typer.Option("--again", help="Do cases once more that crashed or ran out of time before.")
+        bool, typer.Option("--again", help="Repeat cases that crashed or ran out of time before.")
     ] = False,
     settings: Annotated[
         list[str] | None,

@@ -54,7 +54,7 @@ def figures(
             metavar="[NAME]...", help="Figures; all but the benchmarks' and the sweeps' if left out."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Where they are put.")] = FOLDER,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Directory for them.")] = FOLDER,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """The figures of the documentation, made anew.

@@ -25,11 +25,11 @@ TARGET_SHAPES = ("box", "ball", "none")
 
 @dataclass(frozen=True, kw_only=True)
 class TargetBody(Described):
-    """What the target looks like; its face's middle is the hit point.
+    """The target's shape; the hit point is the middle of its face.
 
-    To everything but the striking point. What fits the target's kind is a box of 18 cm for a free mass, a
-    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x
-    6 cm. A size is that of the board or of the nail's block; None: those.
+    All of the robot but the striking point keeps off it. By default it is a box of 18 cm for a free mass, a
+    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, or a nail of 7 cm in a block of 20 x 20 x
+    6 cm. `size` is that of the box, the board or the nail's block.
     """
 
     shape: str | None = field(
@@ -64,7 +64,7 @@ class Obstacle(Described):
     """A box or a capsule that nothing of the robot may touch.
 
     It is fixed in the world: a box of a size about a position, or a capsule of a radius from start to end.
-    Neither of them, or both, is an InputError.
+    Give one of the two.
     """
 
     name: str = field(metadata=about("what reports call it"))

@@ -1,4 +1,4 @@
-"""Collisions: a ladder of models from a point mass to the simplified dynamics computation (SDC)."""
+"""Collisions: a hierarchy of models from a point mass to the simplified dynamics computation (SDC)."""
 
 from impactopt.collision.effective_mass import effective_mass
 from impactopt.collision.effects import Effects, JointFriction

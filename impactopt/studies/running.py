@@ -1,4 +1,4 @@
-"""Reports, run one after the other: progress, tables on screen, files, JSON."""
+"""Reports, run one after the other: progress, tables on the console, files, JSON."""
 
 from __future__ import annotations
 

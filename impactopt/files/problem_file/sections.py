@@ -52,7 +52,7 @@ def _of_problem(section: type[Section]) -> dict[str, Any]:
 
 
 class Problem(Section):
-    """Who hits what, where."""
+    """The robot, its striker, and where it hits."""
 
     name: str = optional("what reports call the problem")
     robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
@@ -72,7 +72,7 @@ class Problem(Section):
 
 
 class Stance(Section):
-    """What the robot stands on."""
+    """The soles that are held."""
 
     soles: str = Field(default="both", description='"both", or the name of the sole that is held')
 
@@ -95,7 +95,7 @@ class Swing(PhaseSection):
 
 
 class Follow(PhaseSection):
-    """From the state that the impact leaves behind to rest."""
+    """From the state after the impact to rest."""
 
 
 class Collision(Section):
@@ -125,7 +125,7 @@ ObstacleSection: Any = section_of(Obstacle)
 
 
 class Objective(Section):
-    """Prices that only make the optimum unique, and its end natural."""
+    """Small prices that make the optimum unique, and bring the robot back to its start."""
 
     smoothness: NotNegative = optional("price of accelerations [N s per (rad/s^2)^2 s]")
     wrench_price: NotNegative = optional("price of the soles' wrenches")

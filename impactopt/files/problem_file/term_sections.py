@@ -14,11 +14,11 @@ _FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
 
 Terms = sections_of(
     "Terms",
-    f"What the plan must respect; of these, {_FIRST} to {_LAST} hold if left out too.",
+    f"Constraints. Those from {_FIRST} to {_LAST} hold, with their defaults, if they are left out.",
     _TERMS,
 )
 Objectives = sections_of(
     "Objectives",
-    "What is maximized; if there are any, only those that are given.",
+    "What is maximized: the impulse, or if there are sections here, only these.",
     {snake_case(kind.__name__): kind for kind in OBJECTIVES},
 )

@@ -23,10 +23,10 @@ WEIGHT = about("value of one unit of the quantity", unit="N s a unit", key="weig
 class Objective(Described):
     """Base of all objectives: ``name`` is what reports call it, ``unit`` is that of its quantity.
 
-    One has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and ``needs_torques``
-    are as of :class:`impactopt.problem.terms.Term`.
+    An objective has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and
+    ``needs_torques`` are as in :class:`impactopt.problem.terms.Term`.
 
-    weight [N s a unit] : what one unit of it is worth, or of a cost, what it takes off.
+    weight [N s a unit] : value of one unit of the quantity; for a cost, its price.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the impact may leave behind."""
+"""Balance after the impact."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class Balance(Term):
-    """What the impact may leave behind, so that the robot stays up; inf: any."""
+    """Bounds on the state after the impact, so that the robot does not fall; inf: no bound."""
 
     name: ClassVar[str] = "balance after impact"
     unit: ClassVar[str] = "m, m/s, N m s"

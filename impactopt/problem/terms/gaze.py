@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class Gaze(Term):
     """A frame, such as the head's, looks at the hit point in the swing.
 
-    From its origin at the problem's point: at the nodes of the swing from a fraction of it on, and at
-    contact.
+    It holds at the nodes of the swing after a fraction of it, and at contact, from the frame's origin to the
+    problem's point.
     """
 
     name: ClassVar[str] = "gaze"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class HandOrientation(Term):
-    """The hand looks some way at contact."""
+    """An axis of the hand points in a given direction at contact."""
 
     name: ClassVar[str] = "hand orientation"
     unit: ClassVar[str] = "rad"

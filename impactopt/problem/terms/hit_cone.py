@@ -24,7 +24,7 @@ TYPICAL = 1.0  # [m/s] of a strike
 
 @dataclass(frozen=True, kw_only=True)
 class HitCone(Term):
-    """The striking point's velocity at contact is near the normal; in place of `incidence`."""
+    """The striking point's velocity at contact lies in a cone about the normal; this replaces `incidence`."""
 
     name: ClassVar[str] = "hit cone"
     unit: ClassVar[str] = "m/s"

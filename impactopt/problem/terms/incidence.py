@@ -13,7 +13,7 @@ from impactopt.problem.terms.base import Term
 class Incidence(Term):
     """No glancing blow: the striking point's speed across the normal at contact is bounded.
 
-    :class:`impactopt.HitCone` takes its place.
+    :class:`impactopt.HitCone` replaces it.
     """
 
     name: ClassVar[str] = "incidence"

@@ -1,4 +1,4 @@
-"""How hard joints are thrown."""
+"""Bounds on joint accelerations."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class JointAcceleration(Term):
     """|joint acceleration| is bounded in the swing.
 
-    At its nodes, between which those of the arms are linear, so that they are bounded everywhere. By joint,
-    those that are not named have no bound.
+    It holds at the nodes of the swing. Accelerations of joints outside the legs are linear between nodes, so
+    they are bounded everywhere. If the limit is given by joint, joints that are not named have no bound.
     """
 
     name: ClassVar[str] = "joint acceleration"

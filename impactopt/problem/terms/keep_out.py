@@ -13,7 +13,7 @@ from impactopt.problem.terms.base import Term
 class KeepOut(Term):
     """The robot keeps off target, ground and obstacles; the link that strikes may touch the target.
 
-    It may from the side that it strikes. Held soles stand on the ground.
+    It may touch it at the face that it strikes. Held soles stand on the ground.
     """
 
     name: ClassVar[str] = "keep out"

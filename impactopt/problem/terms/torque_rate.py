@@ -18,7 +18,7 @@ from impactopt.problem.violation import Measure
 class TorqueRate(Term):
     """|d torque/dt| is bounded, from node to node of swing and follow-through.
 
-    By joint, those that are not named have no bound.
+    If the limit is given by joint, joints that are not named have no bound.
     """
 
     name: ClassVar[str] = "torque rate"

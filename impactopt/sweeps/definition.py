@@ -31,7 +31,7 @@ from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column
 from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.key_paths import flat, put
-from impactopt.sweeps.sections import CaseKind, File, of_other_kinds
+from impactopt.sweeps.sections import CaseKind, SweepFile, of_other_kinds
 from impactopt.sweeps.varied import VariedKeys, telling
 
 __all__ = ["Sweep", "parse_sweep", "read_sweep_file", "sweep_from_data"]
@@ -143,9 +143,9 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
             raise InputError(report_mistakes(str(path), lines, mistakes))
 
     try:
-        content = File.model_validate(data)
+        content = SweepFile.model_validate(data)
     except ValidationError as error:
-        mistakes += mistakes_of(error, File)
+        mistakes += mistakes_of(error, SweepFile)
     raise_if_any()
     given = content.sweep
     mistakes += of_other_kinds(content)
@@ -196,7 +196,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     )
 
 
-def _check_collisions(path: Path, base: ProblemFile, content: File, design: Design) -> None:
+def _check_collisions(path: Path, base: ProblemFile, content: SweepFile, design: Design) -> None:
     """InputError for what collisions of the first values, and of the bounds of numbers, refuse."""
     bounds = {axis.key: telling(axis.values) for axis in design.axes}
     longest = max(map(len, bounds.values()), default=1)

@@ -11,7 +11,7 @@ from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import Positive
 from impactopt.sweeps.figure import Figure
 
-__all__ = ["CaseKind", "File", "SpanSection", "of_other_kinds"]
+__all__ = ["CaseKind", "SpanSection", "SweepFile", "of_other_kinds"]
 
 CaseKind = Literal["solve", "strike", "collision"]
 AtLeastOne = Annotated[int, Field(ge=1)]
@@ -62,7 +62,7 @@ class DrawSection(Section):
     over: dict[str, Any] = required("by key path, a range or a list to choose from")
 
 
-class File(Section):
+class SweepFile(Section):
     """A sweep file; keys below [set], [grid], [list] and [draw.over] are the problem file's."""
 
     sweep: SweepSection
@@ -78,7 +78,7 @@ class File(Section):
     figure: Figure | None = optional("the picture of the table")
 
 
-def of_other_kinds(content: File) -> list[Mistake]:
+def of_other_kinds(content: SweepFile) -> list[Mistake]:
     """What the file says and the sweep's kind of case has no use for."""
     given, found = content.sweep, list[Mistake]()
     collisions = given.case_kind == "collision"

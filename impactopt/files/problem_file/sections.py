@@ -23,7 +23,7 @@ from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.solver_sections import SolverSection
-from impactopt.files.problem_file.term_sections import Objectives, Terms
+from impactopt.files.problem_file.term_sections import ObjectiveSections, TermSections
 from impactopt.files.problem_file.values import (
     AtLeastOne,
     ContactDuration,
@@ -36,8 +36,7 @@ from impactopt.files.problem_file.values import (
     UnitVector,
     Vector,
 )
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
-from impactopt.kinematics.stance import Stance as Stances
+from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Robot
@@ -51,7 +50,7 @@ def _of_problem(section: type[Section]) -> dict[str, Any]:
     return {name: known[name] for name in section.model_fields if name in known}
 
 
-class Problem(Section):
+class ProblemSection(Section):
     """The robot, its striker, and where it hits."""
 
     name: str = optional("what reports call the problem")
@@ -71,7 +70,7 @@ class Problem(Section):
         return _of_problem(cls)
 
 
-class Stance(Section):
+class StanceSection(Section):
     """The soles that are held."""
 
     soles: str = Field(default="both", description='"both", or the name of the sole that is held')
@@ -90,15 +89,15 @@ class PhaseSection(Section):
     grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
 
 
-class Swing(PhaseSection):
+class SwingSection(PhaseSection):
     """Wind-up and strike, from rest to contact."""
 
 
-class Follow(PhaseSection):
+class FollowSection(PhaseSection):
     """From the state after the impact to rest."""
 
 
-class Collision(Section):
+class CollisionSection(Section):
     """How the collision is modelled and discretized."""
 
     collision: Literal["dynamics", "rigid", "virtual mass"] = optional(
@@ -124,7 +123,7 @@ ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
 
 
-class Objective(Section):
+class ObjectiveSection(Section):
     """Small prices that make the optimum unique, and bring the robot back to its start."""
 
     smoothness: NotNegative = optional("price of accelerations [N s per (rad/s^2)^2 s]")
@@ -139,19 +138,19 @@ class Objective(Section):
 class File(Section):
     """A whole problem file; its [target] and [contact] are of a kind (`with_kinds`)."""
 
-    problem: Problem
+    problem: ProblemSection
     robot: RobotSection = optional("")
     target: Target
     contact: Contact
-    stance: Stance = optional("")
-    swing: Swing = optional("")
-    follow: Follow = optional("")
-    collision: Collision = optional("")
+    stance: StanceSection = optional("")
+    swing: SwingSection = optional("")
+    follow: FollowSection = optional("")
+    collision: CollisionSection = optional("")
     scenarios: list[ScenarioSection] = optional("")
     obstacles: list[ObstacleSection] = optional("")
-    objectives: Objectives = optional("")
-    objective: Objective = optional("")
-    terms: Terms = optional("")
+    objectives: ObjectiveSections = optional("")
+    objective: ObjectiveSection = optional("")
+    terms: TermSections = optional("")
     solver: SolverSection = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
@@ -167,15 +166,15 @@ class File(Section):
 
     def given_terms(self) -> Iterator[tuple[str, Any]]:
         """The terms that the file has, by their sections' names."""
-        for name in Terms.model_fields if self.terms is not None else ():
+        for name in TermSections.model_fields if self.terms is not None else ():
             section = getattr(self.terms, name)
             if section is not None:
                 yield name, section.build()
 
-    def make_stance(self, robot: Robot) -> Stances:
+    def make_stance(self, robot: Robot) -> Stance:
         """What [stance] says of a robot; InputError for what it cannot stand on."""
         soles = self.stance.soles if self.stance else "both"
-        stance: Stances = BothSoles() if soles == "both" else OneSole(soles)
+        stance: Stance = BothSoles() if soles == "both" else OneSole(soles)
         if not robot.floating:
             if self.stance:
                 raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")

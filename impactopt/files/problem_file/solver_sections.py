@@ -20,7 +20,7 @@ def _sqp_keys() -> dict[str, Any]:
     return {name: (hints[name], optional(said[name])) for name in hints if name != "time_limit"}
 
 
-SQP: Any = create_model("SQP", __base__=Section, __doc__="Options of the SQP.", **_sqp_keys())
+SQP: Any = create_model("SQP", __base__=Section, __doc__="Options of the default solver.", **_sqp_keys())
 SQP.kind = SQPOptions
 
 

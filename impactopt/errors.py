@@ -30,7 +30,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 class InputError(ValueError):
-    """What was asked for cannot be done; the message names the thing and the mend.
+    """Bad input. The message names what is wrong, where, and how to correct it.
 
     mistakes : each of them, where the message has several.
     """

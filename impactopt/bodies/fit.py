@@ -125,17 +125,17 @@ def enclose(vertices: Array, normals: Array, radius: float = 0.0) -> Planes:
     normals (m, 3) : of its facets. Directions are taken one by one: that which mends most of what those
     before it miss, at points about the body, against all directions together.
     """
-    ways = np.concatenate([_rounded(normals), _sphere(SPREAD)])
-    support = (ways @ vertices.T).max(axis=1)
+    directions = np.concatenate([_rounded(normals), _sphere(SPREAD)])
+    support = (directions @ vertices.T).max(axis=1)
     # points away from the body, along all directions, from its farthest vertices and from its surface
-    far = vertices[(ways @ vertices.T).argmax(axis=1)] + AWAY * ways
+    far = vertices[(directions @ vertices.T).argmax(axis=1)] + AWAY * directions
     middle = vertices.mean(axis=0)
     facing = (far - middle) / np.linalg.norm(far - middle, axis=1, keepdims=True)
-    depth = (support[None] - ways @ middle)[0]
-    along = np.maximum(facing @ ways.T, 1e-6)
+    depth = (support[None] - directions @ middle)[0]
+    along = np.maximum(facing @ directions.T, 1e-6)
     out = middle + facing * ((depth / along).min(axis=1) + AWAY)[:, None]
     points = np.concatenate([far, out])
-    told = points @ ways.T - support  # (points, ways): how far each direction says the body is
+    told = points @ directions.T - support  # (points, directions): how far each direction says the body is
     best, known = told.max(axis=1), np.full(len(points), -np.inf)
     chosen: list[int] = []
     for _ in range(PLANES):
@@ -145,7 +145,7 @@ def enclose(vertices: Array, normals: Array, radius: float = 0.0) -> Planes:
         k = int(gain.argmax())
         chosen.append(k)
         known = np.maximum(known, told[:, k])
-    return Planes(normal=ways[chosen], offset=support[chosen] + radius, out=float((best - known).max()))
+    return Planes(normal=directions[chosen], offset=support[chosen] + radius, out=float((best - known).max()))
 
 
 def _rounded(normals: Array) -> Array:

@@ -25,19 +25,20 @@ TARGET_SHAPES = ("box", "ball", "none")
 
 @dataclass(frozen=True, kw_only=True)
 class TargetBody(Described):
-    """What the target looks like; its face's middle is the hit point.
+    """The target's shape; the hit point is the middle of its face.
 
-    To everything but the striking point. What fits the target's kind is a box of 18 cm for a free mass, a
-    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, a nail of 7 cm in a block of 20 x 20 x
-    6 cm. A size is that of the board or of the nail's block; None: those.
+    All of the robot but the striking point keeps off it. By default it is a box of 18 cm for a free mass, a
+    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, or a nail of 7 cm in a block of 20 x 20 x
+    6 cm. `size` is that of the box, the board or the nail's block.
     """
 
     shape: str | None = field(
-        default=None, metadata=about("left out: what fits the target's kind", choices=TARGET_SHAPES)
+        default=None,
+        metadata=about("shape; left out: the one that belongs to the target's kind", choices=TARGET_SHAPES),
     )
     size: tuple[float, ...] | None = field(
         default=None,
-        metadata=about("of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
+        metadata=about("size: of a box [across, up, deep], of a ball [diameter]", unit="m", above=0),
     )
 
     def __post_init__(self) -> None:
@@ -63,18 +64,22 @@ class Obstacle(Described):
     """A box or a capsule that nothing of the robot may touch.
 
     It is fixed in the world: a box of a size about a position, or a capsule of a radius from start to end.
-    Neither of them, or both, is an InputError.
+    Give one of the two.
     """
 
     name: str = field(metadata=about("what reports call it"))
     size: Vector | None = field(default=None, metadata=about("sides of a box", unit="m"))
-    position: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("middle of the box, world", unit="m"))
-    rpy: Vector = field(
-        default=(0.0, 0.0, 0.0), metadata=about("turns of the box about x, y and z", unit="rad")
+    position: Vector = field(
+        default=(0.0, 0.0, 0.0), metadata=about("middle of the box, in the world frame", unit="m")
     )
-    start: Vector | None = field(default=None, metadata=about("of a capsule's axis, world", unit="m"))
-    end: Vector | None = field(default=None, metadata=about("of its axis; left out: a sphere", unit="m"))
-    radius: float = field(default=0.0, metadata=about("of the capsule", unit="m", above=0))
+    rpy: Vector = field(default=(0.0, 0.0, 0.0), metadata=about("roll, pitch and yaw of the box", unit="rad"))
+    start: Vector | None = field(
+        default=None, metadata=about("start of a capsule's axis, in the world frame", unit="m")
+    )
+    end: Vector | None = field(
+        default=None, metadata=about("end of its axis; left out: the capsule is a sphere", unit="m")
+    )
+    radius: float = field(default=0.0, metadata=about("radius of the capsule", unit="m", above=0))
 
     def __post_init__(self) -> None:
         where = f"obstacle {self.name!r}"

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from impactopt.files.problem_file import ProblemFile
     from impactopt.planning.solution import Solution
     from impactopt.problem.problem import ImpactProblem
-    from impactopt.report.console import Progress
+    from impactopt.report.console import SolveConsole
 
 __all__ = ["app", "main", "program"]
 
@@ -109,7 +109,9 @@ def solve(
         typer.Option("--out", "-o", metavar="DIR", help="Where results go (default: results/NAME)."),
     ] = None,
     solver: SolverName = None,
-    start: Annotated[Start, typer.Option(help="A plain reach, or the hardest strike near it.")] = Start.reach,
+    start: Annotated[
+        Start, typer.Option(help="What to start from: a plain reach, or the hardest strike near it.")
+    ] = Start.reach,
     starts: Starts = 1,
     seed: Seed = 0,
     time_limit: TimeLimit = None,
@@ -131,13 +133,13 @@ def solve(
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.planning.planner import solve as plan
-        from impactopt.report.console import Progress
+        from impactopt.report.console import SolveConsole
 
         check_time_limit(time_limit)
         check_loudness(quiet, verbose)
         read = read_problem_file(file, parse_settings(settings or ()))
         chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
-        with Progress(console, quiet=quiet, verbose=verbose) as progress:
+        with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
@@ -205,7 +207,7 @@ app.command(epilog=examples("impactopt problems --json"))(problems)
 app.command(epilog=examples("impactopt robots --json"))(robots)
 
 
-def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Progress) -> Record:
+def _record(solution: Solution, read: ProblemFile, validate: bool, progress: SolveConsole) -> Record:
     """The solution as numbers, with its re-simulations where there is something to simulate."""
     from impactopt.errors import InputError
     from impactopt.files.output import record_of
@@ -246,7 +248,7 @@ def _baseline(problem: ImpactProblem) -> dict[str, object]:
         return {"method": "minimum jerk", "error": str(error)}
 
 
-def _write(record: Record, directory: Path, progress: Progress) -> list[Path]:
+def _write(record: Record, directory: Path, progress: SolveConsole) -> list[Path]:
     from impactopt.files.result_folder import keep_record
 
     written = [*keep_record(record, directory)]
@@ -264,7 +266,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
 
     from impactopt.errors import printable
     from impactopt.files.result_folder import set_aside
-    from impactopt.report.console import result_table, starts_table, told_touches, violation_table
+    from impactopt.report.console import multistart_table, result_table, told_touches, violation_table
 
     console, summary = Console(), record.summary
     if record.completed:
@@ -281,7 +283,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)
     if len(summary["starts"]) > 1:
-        console.print(starts_table(summary["starts"]))
+        console.print(multistart_table(summary["starts"]))
     if summary["violations"]:
         console.print(violation_table(summary["violations"]))
     console.print(

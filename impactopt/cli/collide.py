@@ -44,40 +44,46 @@ def collide(
     ],
     speed: Annotated[
         float | None,
-        typer.Option(metavar="M/S", help="Of the striking point along the normal; a result has its own."),
+        typer.Option(
+            metavar="M/S", help="Speed of the striking point along the normal; a result has its own."
+        ),
     ] = None,
     posture: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Of the robot; left out: a reach to the problem's point."),
+        typer.Option(
+            metavar="NAME", help="A posture of the robot by name; left out: a reach to the problem's point."
+        ),
     ] = None,
-    model: Annotated[Model, typer.Option(help="Of the collision.")] = Model.sdc,
+    model: Annotated[Model, typer.Option(help="Model of the collision.")] = Model.sdc,
     freezes: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=0, help=f"Of the sdc, on the way; left out: {OFTEN} of a result, else none."
+            metavar="N", min=0, help=f"Freezes of the sdc on the way; left out: {OFTEN} for a result, else 0."
         ),
     ] = None,
     accuracy: Annotated[
         float,
-        typer.Option(metavar="PCT", help="Of the impulse: freezing that may cost more of it is told."),
+        typer.Option(
+            metavar="PCT", help="Warn if the estimated error of freezing is above this share of the impulse."
+        ),
     ] = 1.0,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Let the robot hit at a posture, or as a saved plan or strike does: the collision alone, no motion.
+    """Compute one collision, from a posture or as in a saved plan or strike, without a motion.
 
-    Impulse, peak force, duration, ZMP margin and torques; of the sdc also what freezing may have cost of the
-    impulse, and where that is more than --accuracy what to do. With a posture, the striking point moves along
-    the normal at --speed with the least kinetic energy, soles at rest, and the servo's reference keeps the
-    joint velocities. A result has a reference of its own, whose soles stay in place, and its numbers stand
-    beside the model's. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a limit, no
-    separation), 2 bad input.
+    Prints impulse, peak force, duration, ZMP margin and torques. For the sdc it also prints the estimated
+    error of freezing, and what to do if that is above --accuracy. With a posture, the striking point moves
+    along the normal at --speed with the least kinetic energy, the soles are at rest, and the servo's
+    reference keeps the joint velocities. A result has its own reference, which keeps the soles in place; its
+    planned numbers are printed too. Exit code: 0 done, 1 there is no such collision (out of reach, beyond a
+    limit, no separation), 2 bad input.
     """
     with plain_errors("interrupted before the collision was over", verbose=verbose) as console:
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.report.console import Progress
+        from impactopt.report.console import SolveConsole
         from impactopt.sweeps.single import collide_once, problem_of_result
 
         check_loudness(quiet, verbose)
@@ -96,7 +102,7 @@ def collide(
         at_contact |= {} if freezes is None else {"freezes": freezes}
         at_contact |= {"result": str(what.resolve())} if saved else {}
         at_contact |= {} if posture is None else {"posture": posture}
-        with Progress(console, quiet=quiet) as progress:
+        with SolveConsole(console, quiet=quiet) as progress:
             progress.say(f"{read.path} is read; colliding (compiles for a minute the first time)")
             at_contact |= {} if speed is None else {"speed_m_s": speed}
             found = collide_once(read, at_contact, accuracy=accuracy / 100)

@@ -23,8 +23,8 @@ NOT_IN = 1  # exit code
 
 def drive(
     problem: ProblemPath,
-    depth: Annotated[float, typer.Option(metavar="M", help="How deep the nail is to go.")] = 0.05,
-    most: Annotated[int, typer.Option(metavar="N", help="Blows at most.", min=1)] = 20,
+    depth: Annotated[float, typer.Option(metavar="M", help="Depth to which the nail is driven.")] = 0.05,
+    most: Annotated[int, typer.Option(metavar="N", help="Largest number of blows.", min=1)] = 20,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write blows.json there.")
     ] = None,
@@ -33,9 +33,9 @@ def drive(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Plan blow after blow on a nail, each where the one before has left it, until it is in, as in arm7.
+    """Plan a series of blows on a nail until it is in, each for the depth that the one before has reached.
 
-    A series that ends before that goes to DIR/failed if there is one in DIR whose nail is in. Exit code: 0 it
+    A series that ends before that is written to DIR/failed if DIR has one whose nail is in. Exit code: 0 it
     is in, 1 it is not, 2 bad input.
     """
     with plain_errors("interrupted before the nail was in", verbose=verbose) as console:
@@ -43,12 +43,12 @@ def drive(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_series, set_aside
         from impactopt.planning.nail_driving import drive_nail
-        from impactopt.report.console import Progress, blows_table
+        from impactopt.report.console import SolveConsole, nail_driving_table
 
         check_loudness(quiet, verbose)
         read = read_problem_file(problem, parse_settings(settings or ()))
         directory = None if out is None else make_directory(out)
-        with Progress(console, quiet=quiet) as progress:
+        with SolveConsole(console, quiet=quiet) as progress:
             series = drive_nail(
                 read.build(),
                 depth=depth,
@@ -64,7 +64,7 @@ def drive(
         else:
             from rich.console import Console
 
-            Console().print(blows_table(done))
+            Console().print(nail_driving_table(done))
             typer.echo(series.reason or f"the nail is in after {len(series.blows)} blows")
             if aside := set_aside(done):
                 typer.echo(aside)

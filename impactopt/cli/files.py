@@ -47,11 +47,11 @@ def new(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="[NAME]", help="Of the problem to start from.", autocompletion=complete_problem
+            metavar="[NAME]", help="Name of the problem to start from.", autocompletion=complete_problem
         ),
     ] = None,
     reference: Annotated[
-        bool, typer.Option("--reference", help="Instead: all sections and keys there are, as Markdown.")
+        bool, typer.Option("--reference", help="Print all sections and keys instead, as Markdown.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -39,7 +39,7 @@ ProblemPath = Annotated[
     Path,
     typer.Argument(
         metavar="PROBLEM",
-        help="Its name, as `impactopt problems` lists them, or its file.",
+        help="A problem's name, as `impactopt problems` lists them, or its file.",
         autocompletion=complete_problem,
     ),
 ]
@@ -48,24 +48,27 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Another value for a key of the problem file, as target.mass=8; may be repeated.",
+        help="Change a key of the problem file, as target.mass=8; may be repeated.",
     ),
 ]
 
 
-class Solver(str, enum.Enum):
+class SolverChoice(str, enum.Enum):
     ipopt = "ipopt"
     sqp = "sqp"
 
 
-SolverName = Annotated[Solver | None, typer.Option(help="Instead of the one that the file names.")]
+SolverName = Annotated[
+    SolverChoice | None, typer.Option(help="Solver, instead of the one that the file names.")
+]
 TimeLimit = Annotated[
-    float | None, typer.Option(metavar="SECONDS", help="Stop the solver then; keep its best iterate.")
+    float | None,
+    typer.Option(metavar="SECONDS", help="Time limit of the solver, whose best iterate is kept."),
 ]
 Starts = Annotated[
-    int, typer.Option(min=1, help="Solve from so many starts, drawn but for the first; keep the best.")
+    int, typer.Option(min=1, help="Multistart: number of starts, all but the first drawn; the best is kept.")
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Of the starts that are drawn.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the starts that are drawn.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[

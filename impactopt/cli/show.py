@@ -38,12 +38,13 @@ def show(
     ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     problem: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one kept in RESULT.")
+        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
     ] = None,
 ) -> None:
-    """Put a result on one page: numbers, plots, the robot's motion, how it was made. It needs no network.
+    """Write a result as one page: numbers, plots, the robot's motion, how it was made. It needs no network.
 
-    Of a robot it shows the bodies: hulls and spheres over its meshes, how well they fit, which may touch.
+    For a robot the page shows its bodies: hulls and spheres over its meshes, how well they fit, which may
+    touch.
 
     Exit code: 0 written, 2 bad input.
     """

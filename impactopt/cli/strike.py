@@ -31,7 +31,7 @@ def strike(
     file: ProblemPath,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="DIR", help="Write numbers there."),
+        typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
     ] = None,
     starts: Starts = 4,
     seed: Seed = 0,
@@ -53,13 +53,13 @@ def strike(
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.result_folder import keep_record, set_aside
         from impactopt.planning.strike import optimize_strike
-        from impactopt.report.console import Progress
+        from impactopt.report.console import SolveConsole
 
         check_time_limit(time_limit)
         check_loudness(quiet, verbose)
         read = read_problem_file(file, parse_settings(settings or ()))
         chosen = read.solver.arguments(solver.value if solver is not None else None, time_limit)
-        with Progress(console, quiet=quiet, verbose=verbose) as progress:
+        with SolveConsole(console, quiet=quiet, verbose=verbose) as progress:
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = None if out is None else make_directory(out)
@@ -83,11 +83,11 @@ def strike(
         else:
             from rich.console import Console
 
-            from impactopt.report.console import starts_table, strike_table, violation_table
+            from impactopt.report.console import multistart_table, strike_table, violation_table
 
             shown = Console()
             shown.print(strike_table(record.summary))
-            shown.print(starts_table(record.summary["starts"]))
+            shown.print(multistart_table(record.summary["starts"]))
             if record.summary["violations"]:
                 shown.print(violation_table(record.summary["violations"]))
             for path in written:

@@ -15,7 +15,7 @@ from impactopt.report.plain_errors import plain_errors
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from impactopt.sweeps import Progress, SweepResult
+    from impactopt.sweeps import SweepProgress, SweepResult
 
 BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewritten
 
@@ -30,17 +30,21 @@ def sweep(
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Where results go, and are found again.")
+        Path,
+        typer.Option("--out", "-o", metavar="DIR", help="Directory of the results; give it again to resume."),
     ],
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes on this machine (default: one a core).")
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port: its workers do it."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="Address of a Dask scheduler, tcp://host:port, whose workers do the cases.",
+        ),
     ] = None,
     again: Annotated[
-        bool, typer.Option("--again", help="Do cases once more that crashed or ran out of time before.")
+        bool, typer.Option("--again", help="Repeat cases that crashed or ran out of time before.")
     ] = False,
     settings: Annotated[
         list[str] | None,
@@ -70,8 +74,8 @@ def sweep(
 
         check_loudness(quiet, verbose)
         chosen = read_sweep_file(file, parse_settings(settings or ()))
-        with _Screen(console, quiet=quiet, verbose=verbose) as screen:
-            told: dict[str, Any] = {"report": screen.say, "progress": screen.progress}
+        with _SweepConsole(console, quiet=quiet, verbose=verbose) as shown:
+            told: dict[str, Any] = {"report": shown.say, "progress": shown.progress}
             result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
         if as_json:
             typer.echo(json.dumps(result.summary()))
@@ -87,7 +91,7 @@ def sweep(
                 console.print(str(picture), markup=False, highlight=False, soft_wrap=True)
 
 
-class _Screen:
+class _SweepConsole:
     """Lines about what is going on, and a live bar; where there is no terminal, a line now and then."""
 
     def __init__(self, console: Console, *, quiet: bool, verbose: bool) -> None:
@@ -102,7 +106,7 @@ class _Screen:
             self._live = Bar(*parts, console=console, transient=True)
             self._task = self._live.add_task("starting", total=None)
 
-    def __enter__(self) -> _Screen:
+    def __enter__(self) -> _SweepConsole:
         if self._live is not None:
             self._live.start()
         return self
@@ -117,7 +121,7 @@ class _Screen:
 
             self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
 
-    def progress(self, now: Progress) -> None:
+    def progress(self, now: SweepProgress) -> None:
         text = f"{now.rate:.3g} a second, {_time(now.remaining)} left"
         if now.failed:
             text += f", {now.failed} failed"

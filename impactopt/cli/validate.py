@@ -22,7 +22,10 @@ class Engine(str, enum.Enum):
 
 def validate(
     result: Annotated[
-        Path, typer.Argument(metavar="RESULT", help="What `impactopt solve` wrote, such as results/punch.")
+        Path,
+        typer.Argument(
+            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
+        ),
     ],
     engine: Annotated[
         Engine, typer.Option(help="mujoco: free robot, soles can slip and lift; pinocchio: soles are held.")
@@ -39,29 +42,36 @@ def validate(
     quiet: Quiet = False,
     verbose: Verbose = False,
     problem: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one kept in RESULT.")
+        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
     ] = None,
     step: Annotated[float | None, typer.Option(metavar="S", help="Step of the simulation.")] = None,
-    settle: Annotated[float | None, typer.Option(metavar="S", help="Time after the motion's end.")] = None,
+    settle: Annotated[
+        float | None, typer.Option(metavar="S", help="Time that is simulated after the motion's end.")
+    ] = None,
     mass: Annotated[float, typer.Option(help="Mass of the target, as a factor of the planned one.")] = 1.0,
     stiffness: Annotated[float, typer.Option(help="Stiffness of the contact, as a factor.")] = 1.0,
     damping: Annotated[float, typer.Option(help="Damping of the contact, as a factor.")] = 1.0,
     distance: Annotated[
-        float, typer.Option(metavar="M", help="The target waits this much farther; < 0: nearer.")
+        float, typer.Option(metavar="M", help="How much farther the target is; < 0: nearer.")
     ] = 0.0,
     missing: Annotated[bool, typer.Option("--missing", help="There is no target.")] = False,
     payload: Annotated[float, typer.Option(metavar="KG", help="Unplanned mass at the striking point.")] = 0.0,
-    friction: Annotated[float, typer.Option(help="Coefficient between soles and floor.")] = 0.9,
+    friction: Annotated[float, typer.Option(help="Friction coefficient between soles and floor.")] = 0.9,
     floor_time: Annotated[
-        float, typer.Option(metavar="S", help="Time constant of floor and soles: how soft they are.")
+        float,
+        typer.Option(metavar="S", help="Time constant of the contact of floor and soles: their softness."),
     ] = 2e-3,
     kp: Annotated[float, typer.Option(help="Stiffness of the servo, as a factor.")] = 1.0,
     kd: Annotated[float, typer.Option(help="Damping of the servo, as a factor.")] = 1.0,
     torque_limit: Annotated[float, typer.Option(help="Torque limits of the joints, as a factor.")] = 1.0,
-    period: Annotated[float, typer.Option(metavar="S", help="Of the servo's clock; 0: every step.")] = 0.0,
-    delay: Annotated[float, typer.Option(metavar="S", help="From reading joints to setting torques.")] = 0.0,
+    period: Annotated[
+        float, typer.Option(metavar="S", help="Sampling period of the servo; 0: every step.")
+    ] = 0.0,
+    delay: Annotated[
+        float, typer.Option(metavar="S", help="Delay from reading joints to setting torques.")
+    ] = 0.0,
 ) -> None:
-    """Does it stand? Replay a result with nothing held, in the world as planned or in another one.
+    """Replay a result with nothing held, as planned or with perturbations: does the robot stand?
 
     Exit code: 0 stands (or the engine holds the soles), 1 fell, 2 bad input.
     """
@@ -70,12 +80,12 @@ def validate(
         from impactopt.files.output import make_directory, remove_file, write_file
         from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned, replay
-        from impactopt.report.console import Progress
-        from impactopt.simulation import Conditions
+        from impactopt.report.console import SolveConsole
+        from impactopt.simulation import Perturbation
 
         check_loudness(quiet, verbose)
 
-        world = Conditions(
+        world = Perturbation(
             mass=mass,
             stiffness=stiffness,
             damping=damping,
@@ -95,10 +105,10 @@ def validate(
             make_directory(animation.parent)
         options = {name: value for name, value in (("step", step), ("settle", settle)) if value is not None}
         changes, written = parse_settings(settings or ()), []
-        with Progress(stderr, quiet=quiet, verbose=verbose) as progress:
+        with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
             planned = load_planned(result, problem_file=problem, settings=changes)
             progress.say(f"{result} is read; replaying it in {engine.value}")
-            done = replay(planned, engine=engine.value, conditions=world, **options)
+            done = replay(planned, engine=engine.value, perturbation=world, **options)
             if directory is not None:
                 from impactopt.pictures import save_pictures
 

@@ -224,7 +224,7 @@ def _inputs(
         off = np.abs(np.linalg.norm(given["q"][:, 3:7], axis=1) - 1)
         if off.max() > 1e-6:
             robot.check_configuration(given["q"][off.argmax()], name=f"q of collision {off.argmax()}")
-    if model.terms.feedforward:
+    if model.effects.feedforward:
         if torque is None:
             raise InputError("torque: give the feed-forward torque (N, n) [N m], or (n) for all")
         one = raw_array("torque", torque).ndim == 1

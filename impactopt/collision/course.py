@@ -1,11 +1,11 @@
 """The course of a collision: one freeze from contact to separation, or several, one after the other.
 
 With N freezes on the way, the freeze at contact only predicts. It says how long contact lasts, a trial with a
-freeze in the middle of that says it better, T, and the course is cut into N stretches of T / N (shorter ones
+freeze in the middle of that says it better, T, and the course is cut into N segmentes of T / N (shorter ones
 first are no better). Each goes by a freeze at its *middle*, which the freeze before it predicts. The
-prediction's error is of second order in the stretch's length, and so is that of a coefficient frozen in the
+prediction's error is of second order in the segment's length, and so is that of a coefficient frozen in the
 middle: the course converges to full dynamics with 1/N^2. What lasts
-longer than T belongs to the last stretch, which no N makes shorter: by the freeze at contact alone T can be a
+longer than T belongs to the last segment, which no N makes shorter: by the freeze at contact alone T can be a
 fifth too short, and the error then stayed at half a per cent however many freezes there were.
 
 A servo's reference whose joint velocities are not constant, as legs that stay closed have them, is known
@@ -25,7 +25,7 @@ import casadi as ca
 from impactopt.collision.frozen import FrozenDynamics
 from impactopt.collision.model import JointSpaceModel
 
-__all__ = ["GIVES_WAY", "Course", "Loop", "Stretch", "cuts", "relative_to"]
+__all__ = ["GIVES_WAY", "Course", "Loop", "Segment", "cuts", "relative_to"]
 
 # [1/kg] of a target that takes no impulse: drifts are frozen at the velocity given, see frozen.py
 GIVES_WAY = 1e30
@@ -35,7 +35,7 @@ Loop = Callable[[Any, float, Sequence[Any], bool], tuple[Any, Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stretch:
+class Segment:
     """What one freeze has led to, MX.
 
     Attributes
@@ -74,7 +74,7 @@ def _gained(settings: Mapping[str, Any], time: Any) -> Any:
 
 
 def cuts(freezes: int) -> list[float]:
-    """Where stretches begin and end, as fractions of the contact's duration (freezes + 1)."""
+    """Where segmentes begin and end, as fractions of the contact's duration (freezes + 1)."""
     return [i / freezes for i in range(freezes + 1)]
 
 
@@ -106,36 +106,36 @@ class Course:
         self._names = tuple(dict.fromkeys((*model.frozen, *wanted, *whole)))
         self._freeze = frozen.function("frozen", self._names)
 
-    def run(self, inputs: dict[str, Any], target_yield: Any) -> list[Stretch]:
-        """The stretches, in order; `inputs` are q, v, feedforward and settings by name."""
+    def run(self, inputs: dict[str, Any], target_yield: Any) -> list[Segment]:
+        """The segmentes, in order; `inputs` are q, v, feedforward and settings by name."""
         q, v = inputs["q"], inputs["v"]
         inputs = inputs | {"joint_velocity": v[-self.frozen.robot.n :]}
         data = relative_to(inputs, 0.0, inputs | self._frozen(q, v, inputs["normal"], target_yield))
         if not self.freezes:
-            return [self._stretch(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0, record=True)]
+            return [self._segment(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0, record=True)]
         data |= {"velocity_before": ca.MX.zeros(self.model.n), "until": ca.MX(self.horizon)}
         guess = self._time(self._loop(data, ca.MX(self.model.start()), 1.0)[0])
-        (trial,) = self._stretches(inputs, data, guess, [0.0, 1.0], record=False)
-        return self._stretches(inputs, data, self._time(trial.final), cuts(self.freezes), record=True)
+        (trial,) = self._segmentes(inputs, data, guess, [0.0, 1.0], record=False)
+        return self._segmentes(inputs, data, self._time(trial.final), cuts(self.freezes), record=True)
 
-    def _stretches(
+    def _segmentes(
         self, inputs: dict[str, Any], data: dict[str, Any], duration: Any, ends: list[float], *, record: bool
-    ) -> list[Stretch]:
-        """The stretches between these fractions of about that duration [s]; `data` of the freeze at
+    ) -> list[Segment]:
+        """The segmentes between these fractions of about that duration [s]; `data` of the freeze at
         contact."""
         n = self.model.n
         q, v = inputs["q"], inputs["v"]
         start = ca.MX(self.model.start())
-        stretches: list[Stretch] = []
+        segmentes: list[Segment] = []
         reached, frozen_at, contact = start, q, ca.MX(1.0)
         for a, b in pairwise(ends):
             last = b == ends[-1]
-            # what was frozen before goes on to the middle of this stretch
+            # what was frozen before goes on to the middle of this segment
             ahead = data | {"until": self._time(reached) + duration * (b - a) / 2}
             middle = self._loop(ahead, reached, (b - a) / 2)[0]
             q_middle, v_middle = self._moved(data, frozen_at, q, v, middle)
-            if stretches:
-                q, v = stretches[-1].q_after(), stretches[-1].v_after()
+            if segmentes:
+                q, v = segmentes[-1].q_after(), segmentes[-1].v_after()
             frozen_at = q_middle
             data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], GIVES_WAY)
             data = relative_to(inputs, duration * (a + b) / 2, data)
@@ -144,21 +144,21 @@ class Course:
             if "reference" in inputs:
                 data["reference_before"] = _gained(inputs, duration * a)
                 data["velocity_before"] -= data["reference_before"]
-            # no stretch begins after separation
+            # no segment begins after separation
             length = self.horizon - duration * a if last else duration * (b - a)
             data["until"] = ca.if_else(contact, length, -1.0)
             share = 1.0 if last else b - a
             begin = (start, share, duration * a)
-            stretches.append(self._stretch(data, frozen_at, q, v, *begin, record=record))
-            reached = stretches[-1].final
+            segmentes.append(self._segment(data, frozen_at, q, v, *begin, record=record))
+            reached = segmentes[-1].final
             start = self._handed_on(reached)
             contact *= self.model.phase(reached, data)[1]
-        return stretches
+        return segmentes
 
     def _frozen(self, q: Any, v: Any, normal: Any, target_yield: Any) -> dict[str, Any]:
         return dict(zip(self._names, self._freeze.call([q, v, normal, target_yield]), strict=True))
 
-    def _stretch(
+    def _segment(
         self,
         data: dict[str, Any],
         frozen_at: Any,
@@ -169,9 +169,9 @@ class Course:
         since: Any,
         *,
         record: bool,
-    ) -> Stretch:
+    ) -> Segment:
         final, states = self._loop(data, start, fraction, record=record)
-        return Stretch(
+        return Segment(
             data=data,
             since=since,
             final=final,
@@ -189,14 +189,14 @@ class Course:
         return self.model.part(y, "time")
 
     def _handed_on(self, y: Any) -> Any:
-        """The state at the begin of a stretch, from that at the end of the one before."""
+        """The state at the begin of a segment, from that at the end of the one before."""
         kept = ("penetration", "target", "peak", "left_out", "deviation")
         parts = {name: self.model.part(y, name) for name in self.model.layout}
         return self.model.join({k: x if k in kept else ca.MX.zeros(*x.shape) for k, x in parts.items()})
 
     # ------------------------------------------------------------ whole motion
     def _moved(self, data: dict[str, Any], frozen_at: Any, q: Any, v: Any, y: Any) -> tuple[Any, Any]:
-        """(configuration, velocity) at state y, from those at the begin of the stretch."""
+        """(configuration, velocity) at state y, from those at the begin of the segment."""
         time = self._time(y)
         way = v * time + self._change(data, frozen_at, y, second=True)
         return self.frozen.integrate(q, way), v + self._change(data, frozen_at, y)

@@ -161,10 +161,10 @@ class _Late(ca.Callback):
     def __init__(self, model: SteppedModel, whole: Any, part: _Part, every: int, compiled: Compile) -> None:
         ca.Callback.__init__(self)
         self._in = [(name, whole.size_in(name)) for name in whole.name_in()]
-        ways, shapes = directions(model), shapes_out(model, part.outputs, every)
+        seeds, shapes = directions(model), shapes_out(model, part.outputs, every)
         self._names = [f"{output}_by_{given}" for output, given in product(part.outputs, part.by)]
         self._out = [
-            (int(np.prod(shapes[output])), ways[given]) for output, given in product(part.outputs, part.by)
+            (int(np.prod(shapes[output])), seeds[given]) for output, given in product(part.outputs, part.by)
         ]
         # of the model that it is made for first: settings of another may differ
         self.sizes = {name: _size(model, name) for name, _ in self._in}

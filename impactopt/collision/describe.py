@@ -17,7 +17,7 @@ from impactopt.collision.stepped import SteppedModel, number_of_steps
 __all__ = ["Description", "describe", "independent_joints"]
 
 # term: what it is, and when it may be left out
-_TERMS = {
+_EFFECTS = {
     "stiffness": "the servo's stiffness (eq. 10): it matters little in contacts of a few milliseconds",
     "feedforward": "the feed-forward torque: it is zero, or no saturation depends on it",
     "saturation": "the torque limits (eq. 12): no joint reaches its limit, or rows of a plan keep it from it",
@@ -55,7 +55,7 @@ def describe(
     """What `SteppedModel.function` is made of for these outputs; see `SteppedModel.describe`."""
     robot, held_by, settings = collision.robot, collision.held_by, collision.settings
     by = f"{max(held_by.compliance):g} per kg" if any(held_by.compliance) else "exactly"
-    terms = [name for name in _TERMS if getattr(collision.terms, name)] if collision.n_servos else []
+    effects = [name for name in _EFFECTS if getattr(collision.effects, name)] if collision.n_servos else []
     contents: dict[str, Any] = {
         "robot": robot.name,
         "joints": robot.n,
@@ -63,7 +63,7 @@ def describe(
         "striker": collision.striker,
         "held": list(held_by.constraint_frames(robot)),
         "held_how": by if held_by.constraint_frames(robot) else "fixed base",
-        "terms": (["damping", *terms] if collision.n_servos else []),
+        "effects": (["damping", *effects] if collision.n_servos else []),
         "law": type(collision.law).__name__,
         "target": type(collision.target).__name__,
         "outputs": list(outputs),
@@ -71,7 +71,7 @@ def describe(
         **_steps(collision),
         "horizon_s": collision.horizon,
         "freezes": 1 + collision.n_freezes,
-        "inputs": ["q", "v", *(["feedforward"] if collision.terms.feedforward else []), *parameters],
+        "inputs": ["q", "v", *(["feedforward"] if collision.effects.feedforward else []), *parameters],
         "fixed_numbers": [name for name in settings if name not in parameters],
         "instructions": instructions(collision, outputs),
     }
@@ -120,9 +120,9 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
         out["servo"] = "a point mass has none"
     else:
         out |= {
-            name: f"{what} (terms.{name} is off)"
-            for name, what in _TERMS.items()
-            if not getattr(collision.terms, name)
+            name: f"{what} (effects.{name} is off)"
+            for name, what in _EFFECTS.items()
+            if not getattr(collision.effects, name)
         }
     wanted = {*outputs}
     if not held_by.soles(robot):

@@ -39,7 +39,7 @@ def joint_space_model(
     """What the time loop integrates for these outputs."""
     return JointSpaceModel(
         n=collision.n_servos,
-        terms=collision.terms,
+        effects=collision.effects,
         law=collision.law,
         target=collision.target,
         settings=collision.settings,
@@ -55,8 +55,8 @@ def joint_space_model(
 def frozen_dynamics(collision: SteppedModel) -> FrozenDynamics:
     """Steps 1b and 2b."""
     frame = collision.robot.striker(collision.striker).model_frame
-    terms = collision.terms
-    return FrozenDynamics(collision.robot, collision.held_by, frame, bias=terms.bias, jdot=terms.jdot)
+    effects = collision.effects
+    return FrozenDynamics(collision.robot, collision.held_by, frame, bias=effects.bias, jdot=effects.jdot)
 
 
 def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
@@ -107,7 +107,7 @@ def _expressions(
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     frozen = frozen_dynamics(collision)
     inputs = {"q": frozen.q, "v": frozen.v}
-    if collision.terms.feedforward:
+    if collision.effects.feedforward:
         inputs["feedforward"] = ca.MX.sym("feedforward", collision.robot.n)
     inputs |= {key: ca.MX.sym(key, *shape_of(value)) for key, value in collision.settings.items()}
     inputs["normal"] = frozen.normal
@@ -121,8 +121,8 @@ def _expressions(
         wanted=frozen_for(outputs),
     )
     gives_way = target_yield(model.target, model.target_numbers(inputs))
-    stretches = course.run(inputs, gives_way)
-    made = Outputs(model, stretches, len(frozen.soles), len(frozen.held), inputs["v"])
+    segmentes = course.run(inputs, gives_way)
+    made = Outputs(model, segmentes, len(frozen.soles), len(frozen.held), inputs["v"])
     return inputs, [ca.densify(getattr(made, output)) for output in outputs]
 
 

@@ -125,7 +125,7 @@ class _Run:
         self.viscous, self.coulomb = vector("viscous"), vector("coulomb")
         self.velocity, self.before = vector("joint_velocity"), vector("velocity_before")
         self.feedforward = vector("feedforward")
-        self.saturates, self.slides = model.terms.saturation and n > 0, model.terms.friction and n > 0
+        self.saturates, self.slides = model.effects.saturation and n > 0, model.effects.friction and n > 0
         law = {name: data[f"contact_{name}"].item() for name in model.law.parameters}
         target = {name: data[f"target_{name}"].item() for name in model.target.parameters}
         self.law = loop.contact.of(law, target)

@@ -20,9 +20,10 @@ __all__ = ["CollisionModel"]
 class CollisionModel(ABC):
     """A robot hits a target: what both do from contact to separation.
 
-    The servo holds on to a reference that coasts at the joint velocity at contact, unless the setting
-    `reference` bends it. Legs that move would not stay closed; what a plan's reference does, whose soles stay
-    where they are, is `impactopt.coasting_reference`. The collision ends at separation, for good.
+    The servo follows a reference that goes on at the joint velocity at contact, unless the setting
+    `reference` says otherwise. With such a reference, legs that move do not keep their soles in place. A
+    plan's reference does; `impactopt.coasting_reference` gives it. The collision ends at the first
+    separation.
 
     Attributes
     ----------

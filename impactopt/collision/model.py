@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.collision.effects import Effects
 from impactopt.collision.settings import Settings
-from impactopt.collision.terms import Terms
 from impactopt.contact import ContactLaw, Target
 
 __all__ = ["JointSpaceModel", "shape_of"]
@@ -31,7 +31,7 @@ class JointSpaceModel:
     Attributes
     ----------
     n : number of joints; 0 for a point mass.
-    terms, law, target, settings : as in `SDC`.
+    effects, law, target, settings : as in `SDC`.
     transition : [rad/s], of the joint friction.
     peak : keep the largest force in the state.
     error : keep in the state what the steps are estimated to leave out of the impulse, `left_out` [N s].
@@ -42,7 +42,7 @@ class JointSpaceModel:
     """
 
     n: int
-    terms: Terms
+    effects: Effects
     law: ContactLaw
     target: Target
     settings: Settings
@@ -63,7 +63,7 @@ class JointSpaceModel:
         if self.error:
             sizes["left_out"] = 1
         sizes["torque"] = self.n
-        if self.terms.stiffness:
+        if self.effects.stiffness:
             sizes["deviation"] = self.n
         if self.second_integrals:
             sizes |= {"torque2": self.n, "impulse2": 1}
@@ -82,7 +82,7 @@ class JointSpaceModel:
         """Attributes of FrozenDynamics that the model needs."""
         names = ["A", "s"] if self.n else []
         names += ["m", "hand_speed"]
-        if self.terms.bias or self.terms.jdot:
+        if self.effects.bias or self.effects.jdot:
             names += ["d", "e"]
         return tuple(names)
 
@@ -94,9 +94,9 @@ class JointSpaceModel:
         out = {name: shapes.get(name, (n, 1)) for name in self.frozen}
         if self.refrozen:
             out |= {"velocity_before": (n, 1), "until": (1, 1)}
-        if self.terms.friction:
+        if self.effects.friction:
             out["joint_velocity"] = (n, 1)
-        if self.terms.feedforward:
+        if self.effects.feedforward:
             out["feedforward"] = (n, 1)
         no_data = ("normal", "reference", "reference_until")
         return out | {name: shape_of(v) for name, v in self.settings.items() if name not in no_data}
@@ -195,14 +195,14 @@ class JointSpaceModel:
         if not self.n:
             return u
         tau = -_gain(data["kd"], u)
-        return tau + _gain(data["kp"], self.part(y, "deviation")) if self.terms.stiffness else tau
+        return tau + _gain(data["kp"], self.part(y, "deviation")) if self.effects.stiffness else tau
 
     def with_feedforward(self, tau: Any, data: dict[str, Any]) -> Any:
-        return tau + _spread(data["feedforward"], tau) if self.terms.feedforward else tau
+        return tau + _spread(data["feedforward"], tau) if self.effects.feedforward else tau
 
     def saturate(self, tau: Any, data: dict[str, Any]) -> Any:
         """The servo's torque (n) [N m] (eq. 12)."""
-        if not self.terms.saturation:
+        if not self.effects.saturation:
             return tau
         limit = _spread(data["torque_limit"], tau)
         return ca.fmax(ca.fmin(tau, limit), -limit)

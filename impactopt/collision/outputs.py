@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.collision.course import Stretch
+from impactopt.collision.course import Segment
 from impactopt.collision.model import JointSpaceModel
 from impactopt.errors import InputError, did_you_mean
 
@@ -93,7 +93,7 @@ class Outputs:
     Parameters
     ----------
     model : the collision in joint space.
-    stretches : what each freeze has led to.
+    segmentes : what each freeze has led to.
     soles, held : number of held soles, and of all that is held, the soles first.
     v : velocity at contact (nv).
     """
@@ -101,13 +101,13 @@ class Outputs:
     def __init__(
         self,
         model: JointSpaceModel,
-        stretches: list[Stretch],
+        segmentes: list[Segment],
         soles: int,
         held: int,
         v: Any,
     ) -> None:
-        self._model, self._stretches, self._last = model, stretches, stretches[-1]
-        self._instants = [Instants(model, stretch, soles, held, v) for stretch in stretches]
+        self._model, self._segmentes, self._last = model, segmentes, segmentes[-1]
+        self._instants = [Instants(model, segment, soles, held, v) for segment in segmentes]
 
     def __getattr__(self, name: str) -> Any:
         if name not in HISTORIES:
@@ -116,7 +116,7 @@ class Outputs:
         return rows.T if rows.size1() == 1 else rows
 
     def _sum(self, part: str) -> Any:
-        return sum(self._model.part(stretch.final, part) for stretch in self._stretches)
+        return sum(self._model.part(segment.final, part) for segment in self._segmentes)
 
     @cached_property
     def impulse(self) -> Any:
@@ -152,8 +152,8 @@ class Outputs:
     def separated(self) -> Any:
         """No longer in contact at the end of any freeze."""
         contact = ca.MX(1.0)
-        for stretch in self._stretches:
-            contact *= self._model.phase(stretch.final, stretch.data)[1]
+        for segment in self._segmentes:
+            contact *= self._model.phase(segment.final, segment.data)[1]
         return 1 - contact
 
     @cached_property
@@ -166,11 +166,11 @@ class Outputs:
 
 
 class Instants:
-    """Histories within one stretch, one instant a column."""
+    """Histories within one segment, one instant a column."""
 
-    def __init__(self, model: JointSpaceModel, stretch: Stretch, soles: int, held: int, v: Any) -> None:
-        self._model, self._data, self._states = model, stretch.data, stretch.states
-        self._since = stretch.since
+    def __init__(self, model: JointSpaceModel, segment: Segment, soles: int, held: int, v: Any) -> None:
+        self._model, self._data, self._states = model, segment.data, segment.states
+        self._since = segment.since
         self._n_soles, self._n_held, self._v = soles, held, v
 
     def _row(self, name: str) -> Any:
@@ -236,7 +236,7 @@ class Instants:
     @cached_property
     def _held_wrench(self) -> Any:
         torque = self.torque
-        if self._model.terms.friction:
+        if self._model.effects.friction:
             torque = torque - self._model.friction(self._joint_change, self._data)
         return self._wrench(torque, self.force, ca.DM.ones(1, torque.size2()))
 

@@ -53,7 +53,7 @@ def rate_of_change(model: JointSpaceModel, y: Any, u: Any, data: dict[str, Any])
     rate = model.rate(y, data)
     force = model.law.force(model.part(y, "penetration"), rate, model.law_numbers(data))
     tau = model.saturate(model.with_feedforward(model.servo(y, u, data), data), data)
-    if model.terms.friction:
+    if model.effects.friction:
         tau = tau - model.friction(u, data)
     target = model.target.derivative(model.target_state(y), force, model.target_numbers(data))
     rates = {

@@ -8,10 +8,10 @@ from functools import cached_property
 
 from numpy.typing import ArrayLike
 
+from impactopt.collision.effects import Effects, JointFriction
 from impactopt.collision.freezing import caution, more_often
 from impactopt.collision.settings import servo_settings
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.collision.terms import JointFriction, Terms
 from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.errors import InputError, check_array
 from impactopt.kinematics.stance import BothSoles, FixedBase, Stance
@@ -28,15 +28,16 @@ class SDC(SymbolicModel):
 
     Attributes
     ----------
-    friction : of the joints, with terms.friction.
+    friction : of the joints, with effects.friction.
     kp, kd : servo stiffness [N m/rad] and damping [N m s/rad]: one number a joint (n), one for all, or
         matrices (n, n) (paper, eq. 10); None: the robot's.
     freezes : how often H, J and the bias are frozen anew on the way; 0: only at contact, as in the paper.
         The error falls with 1/freezes^2; four take some five times as long as none.
-    accuracy : relative, of the impulse. `collide` estimates what freezing costs by a collision that is frozen
-        four times or more often, `Collision.freeze_error`, and says in `Collision.caution` where that is more
-        than this. It takes some six times as long as the impulse alone of one freeze, 1.4 times of four, and
-        a function more is compiled; None: not estimated. Of terms that are left out it knows nothing.
+    accuracy : relative, of the impulse. `collide` estimates the error that freezing makes, from a collision
+        with at least four times as many freezes: `Collision.freeze_error`. Where it is larger than this,
+        `Collision.caution` says so. The estimate makes a collision with one freeze some six times as slow,
+        one with four freezes 1.4 times, and one more function is compiled. None: no estimate. Effects that
+        are left out are not in it.
 
     Raises
     ------
@@ -51,11 +52,11 @@ class SDC(SymbolicModel):
     accuracy: float | None = 1e-2
 
     def __post_init__(self) -> None:
-        if self.terms.friction and self.friction is None:
-            raise InputError("terms.friction is on: give friction=JointFriction(viscous=..., coulomb=...)")
-        if self.friction is not None and not self.terms.friction:
+        if self.effects.friction and self.friction is None:
+            raise InputError("effects.friction is on: give friction=JointFriction(viscous=..., coulomb=...)")
+        if self.friction is not None and not self.effects.friction:
             raise InputError(
-                "friction is given, but terms.friction is off: switch it on, or leave friction out"
+                "friction is given, but effects.friction is off: switch it on, or leave friction out"
             )
         if not isinstance(self.freezes, int) or self.freezes < 0:
             raise InputError(f"freezes: {self.freezes!r}; give a whole number >= 0")
@@ -81,7 +82,7 @@ class SDC(SymbolicModel):
 
         Runge-Kutta steps of 1e-4 s, as in its section III.
 
-        What its freeze costs is not estimated: the terms that it leaves out cost more.
+        The error of freezing is not estimated: the effects that this model leaves out make a larger one.
 
         Law, target and stance are the paper's unless given: k = 1e4 N/m, d = 300 N s/m, a free
         mass of 5 kg, and virtual bases of 1e5 kg and 1e5 kg m2.
@@ -95,7 +96,7 @@ class SDC(SymbolicModel):
             law=law or SpringDamper(stiffness=1e4, damping=300.0),
             target=target or FreeMass(mass=5.0),
             stance=stance,
-            terms=Terms.paper(friction=friction is not None),
+            effects=Effects.paper(friction=friction is not None),
             friction=friction,
             method="rk4",
             step=1e-4,
@@ -122,4 +123,4 @@ class SDC(SymbolicModel):
         return "" if self.accuracy is None else caution(error, self.accuracy, self.freezes)
 
     def _servo_settings(self) -> dict[str, ArrayLike]:
-        return servo_settings(self.robot, self.terms, self.joint_friction, self.kp, self.kd)
+        return servo_settings(self.robot, self.effects, self.joint_friction, self.kp, self.kd)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.collision.terms import JointFriction, Terms
+from impactopt.collision.effects import Effects, JointFriction
 from impactopt.contact import ContactLaw, Target
 from impactopt.errors import InputError, check_array, check_direction, did_you_mean, raw_array
 from impactopt.robots.robot import Robot
@@ -32,7 +32,9 @@ NO_LIMIT = 1e12  # [N m]
 
 
 class Settings(Mapping[str, Array]):
-    """Defaults of a collision's numbers by input name, in the order of the inputs; only those its terms need.
+    """Defaults of a collision's numbers by input name, in the order of the inputs.
+
+    Only numbers that its effects need are there.
 
     normal (3); contact_<number of the law>; target_<number of the target>; and with a servo
     (`servo_settings`) kd; kp with servo stiffness; torque_limit (n) with saturation; viscous, coulomb (n)
@@ -107,21 +109,23 @@ class Settings(Mapping[str, Array]):
 
 def servo_settings(
     robot: Robot,
-    terms: Terms,
+    effects: Effects,
     friction: JointFriction,
     kp: ArrayLike | None = None,
     kd: ArrayLike | None = None,
 ) -> dict[str, ArrayLike]:
-    """The joints' numbers that these terms need; gains are the robot's unless given: one number for all
+    """The joints' numbers that these effects need; gains are the robot's unless given: one number for all
     joints, (n), or (n, n)."""
     values: dict[str, ArrayLike] = {"kd": _gain("kd", kd, robot.kd)}
-    if terms.stiffness:
+    if effects.stiffness:
         values["kp"] = _gain("kp", kp, robot.kp)
-    if terms.saturation:
+    if effects.saturation:
         values["torque_limit"] = robot.torque_limit
-    if terms.friction:
+    if effects.friction:
         values["viscous"], values["coulomb"] = friction.arrays(robot.n)
-    elif terms.jdot:  # what bends a reference is dJ/dt v; friction goes by velocities that are no differences
+    elif (
+        effects.jdot
+    ):  # what bends a reference is dJ/dt v; friction goes by velocities that are no differences
         values |= no_bend(robot.n)
     return values
 

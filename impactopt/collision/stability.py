@@ -124,7 +124,7 @@ class Stability:
     def longest(self, frozen: dict[str, Array], values: dict[str, Array]) -> float:
         """[s], of what is frozen and the settings' values."""
         data: dict[str, Any] = frozen | values
-        if self._collision.terms.bias or self._collision.terms.jdot:
+        if self._collision.effects.bias or self._collision.effects.jdot:
             data |= {"d": np.zeros(self._collision.robot.n), "e": 0.0}
         return longest_stable_step(self._model, self._slope, data)
 
@@ -137,7 +137,7 @@ class Stability:
         found = self._freeze.map(count).call([ca.DM(x) for x in columns])
         frozen = {name: np.array(x).T for name, x in zip(self._freeze.name_out(), found, strict=True)}
         data: dict[str, Any] = frozen | {name: given[name] for name in collision.settings}
-        if collision.terms.bias or collision.terms.jdot:
+        if collision.effects.bias or collision.effects.jdot:
             data |= {"d": np.zeros((1, collision.robot.n)), "e": np.zeros((1, 1))}
         own = {name: x for name, x in data.items() if name in self._model.data}
         step = collision.step_length

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from impactopt.codegen.hashing import model_hash
 from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
+from impactopt.collision.effects import Effects, JointFriction
 from impactopt.collision.interface import CollisionModel
 from impactopt.collision.outputs import OF_SERVO, OF_SOLES, OUTPUTS
 from impactopt.collision.settings import Settings
-from impactopt.collision.terms import JointFriction, Terms
 from impactopt.errors import InputError, check_array, did_you_mean
 
 __all__ = ["SteppedModel", "number_of_steps"]
@@ -27,29 +27,29 @@ _MOST_STEPS = 50_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SteppedModel(CollisionModel):
-    """A collision model with frozen dynamics, in its numbers.
+    """A collision model with frozen dynamics: its numbers, and how it is integrated.
 
     Attributes
     ----------
-    terms : effects that are taken into account.
+    effects : those that are taken into account.
     method : how the frozen system is integrated. "implicit" (None): A-stable steps of order eight that end on
         events and find their own length. Without a C compiler they are done in NumPy: the same numbers, a
-        hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps, within 1e-2
-        of the impulse, or of a plastic blow's where contact is broken off before; `collide` refuses a step
-        that it estimates not to hold this.
-    step : [s] of "rk4", its length, below `stable_step(q)`; None: the paper's 1e-4. Of "implicit", which any
-        step suits, the histories' spacing; None: 1e-3.
-    tolerance : of "implicit", what a step may leave out of the hand's speed and of the impulse, relative to
-        their changes. The impulse is most often that exact; contacts that are pushed on and on by servos
-        that swing undamped, or saturate to and fro, gather more.
-    report : told what is going on while functions are compiled, one line a call.
+        hundred times slower, and without derivatives. "rk4": the paper's fixed Runge-Kutta steps, exact to
+        1e-2 of the impulse (where contact ends early, of a plastic blow's impulse). `collide` refuses steps
+        whose estimated error is larger.
+    step : [s]. With "rk4" the length of its steps, below `stable_step(q)`; None: the paper's 1e-4. With
+        "implicit", which chooses its own steps, the spacing of histories; None: 1e-3.
+    tolerance : of "implicit", the error of one step in the hand's speed and in the impulse, relative to their
+        changes. The impulse is mostly as exact as that. Errors add up in long contacts, where a servo swings
+        undamped or saturates again and again.
+    report : called with a line of text while functions are compiled.
 
     Raises
     ------
     InputError : as `CollisionModel`; an unknown method; a step that is not positive, or makes too many steps.
     """
 
-    terms: Terms = field(default_factory=Terms)
+    effects: Effects = field(default_factory=Effects)
     method: str | None = None
     step: float | None = None
     tolerance: float = 1e-7
@@ -135,9 +135,9 @@ class SteppedModel(CollisionModel):
         """All that shapes the functions; numbers that are inputs do not."""
         held = (self.held_by.sole_frames(self.robot), self.held_by.hand_frames(self.robot))
         held_by = (*held, tuple(self.held_by.compliance))
-        transition = self.joint_friction.transition if self.terms.friction else None
+        transition = self.joint_friction.transition if self.effects.friction else None
         bends = (law_is_linear(self.law), target_is_linear(self.target))
-        kinds = (self.law.formula(), self.target.formula(), *bends, self.terms, transition)
+        kinds = (self.law.formula(), self.target.formula(), *bends, self.effects, transition)
         shapes = tuple((name, value.shape) for name, value in self.settings.items())
         frame = self.robot.striker(self.striker).model_frame
         steps = (self.stepping, self.step_length, self.tolerance, self.step_of_graph)

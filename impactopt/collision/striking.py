@@ -40,14 +40,14 @@ def striking_functions(robot: Robot, *, striker: str, stance: Stance) -> dict[st
     frame, held = robot.striker(striker).model_frame, stance.constraint_frames(robot)
 
     def build() -> list[Any]:
-        tree = _Tree(robot, held, frame)
+        tree = _StrikingGraphs(robot, held, frame)
         return [tree.least_energy(), tree.least_rates(), tree.holding()]
 
     recipe = (model_hash(robot.model), frame, held, robot.velocity_limit)
     return cached("striking", recipe, build)
 
 
-class _Tree:
+class _StrikingGraphs:
     """What depends on the robot's tree in SX, dense algebra in MX, as in `FrozenDynamics`."""
 
     def __init__(self, robot: Robot, held: tuple[str, ...], frame: str) -> None:

@@ -38,8 +38,12 @@ class SymbolicModel(SteppedModel):
     def graph(self, outputs: tuple[str, ...] = ("impulse",), *, every: int = 1) -> Any:
         """The collision as a differentiable ca.Function that is not compiled, to build larger graphs with.
 
-        Its steps are Runge-Kutta's, `step_of_graph` long, whatever the method: within 1e-2. Only without
-        further freezes: else InputError. Inputs as of `function` with all settings; see there.
+        Whatever the method, it takes Runge-Kutta steps of `step_of_graph` [s], which are exact to 1e-2. Its
+        inputs are those of `function` with all settings as parameters.
+
+        Raises
+        ------
+        InputError : the model has freezes on the way.
         """
         self._check_outputs(outputs, every)
         if self.n_freezes:
@@ -59,24 +63,26 @@ class SymbolicModel(SteppedModel):
     ) -> Any:
         """The collision as a compiled ca.Function of what it needs, to the outputs asked for.
 
-        Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with terms.feedforward; then the settings
-        that `parameters` name (any of `settings`), the others being fixed. It does not contain what no
-        output needs. Where an input is NaN, so are all outputs, `separated` too.
+        Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with effects.feedforward; then the settings
+        that `parameters` name (any of `settings`); the others are fixed. What no output needs is left out.
+        If an input is NaN, all outputs are, `separated` too.
 
-        CasADi can differentiate it by all of its inputs: jacobian, forward, reverse; twice by differences.
-        What this takes is compiled when it is first evaluated. One number has its adjoint; numbers and
-        histories have tangents, by q, v and feedforward. The others come from differences of collisions with
-        tight steps, two for each number of the input: by settings, and all with freezes on the way, with
-        "rk4" and of configuration, velocity and the target's results. q's quaternion may have any length:
-        it counts as the unit one along it, so that derivatives along its length are zero.
+        CasADi can differentiate it with respect to all inputs (jacobian, forward, reverse), and twice by
+        differences. The code for this is compiled when it is first evaluated. A single scalar output has an
+        adjoint. Scalars and histories have tangents with respect to q, v and feedforward. All other
+        derivatives are differences of two collisions with tight steps for each number of the input: those
+        with respect to settings; those of models with freezes on the way or with "rk4"; and those of
+        configuration, velocity and the target's results. The quaternion in q is normalized, so derivatives
+        along its length are zero.
 
         Parameters
         ----------
         outputs : names out of `impactopt.collision.OUTPUTS`, which says what they are; histories have a
             column an instant, and repeat the last one after separation.
         parameters : settings that are inputs.
-        by : inputs that derivatives are by, None: all; by others they are zero, and cost nothing.
-        every : keep every so many steps, and the last, of the histories.
+        by : inputs to differentiate with respect to; None: all. Derivatives by others are zero, and cost
+            nothing.
+        every : histories keep each so many-th instant, and the last.
         """
         self._check_outputs(outputs, every)
         self._check_parameters(parameters)
@@ -115,14 +121,16 @@ class SymbolicModel(SteppedModel):
     ) -> Any:
         """A compiled ca.Function with the inputs of `function`, to outputs and their Jacobians by q and v.
 
-        Of each output, in turn: its value, `<output>_by_q` and `<output>_by_v` (number of its entries, nv),
-        dense; rows are the entries column by column, instant after instant; q's Jacobian is in the basis of
-        v, as `pin.integrate` moves q. Instants stay where they are in time, but for that of separation, and
-        those after it, which repeat it: they move with it.
+        For each output there are its value, `<output>_by_q` and `<output>_by_v` (number of entries, nv),
+        dense. Rows are the entries column by column, one instant after the other. The Jacobian by q is in
+        the basis of v, as `pin.integrate` moves q. The instants of a history are fixed in time, except that
+        of separation, which moves with it, and those after it, which repeat it. A horizon that is not much
+        longer than the contact keeps the Jacobians small.
 
-        Only with implicit steps and a single freeze, and neither of what the target's `results` say nor of
-        configuration and velocity: else InputError. For more than a few collisions, a horizon not much longer
-        than contact keeps the Jacobians small.
+        Raises
+        ------
+        InputError : a model with "rk4" or with freezes on the way; the target's results, configuration or
+            velocity among the outputs.
         """
         self._check_outputs(outputs, every)
         check_jacobian(outputs, self.stepping, self.n_freezes)
@@ -157,26 +165,25 @@ class SymbolicModel(SteppedModel):
         threads: int | None = None,
         **settings: ArrayLike,
     ) -> dict[str, NDArray[np.float64]]:
-        """Collisions by name of output, with no interpreter between them, on several cores.
+        """Many collisions in compiled code, on several cores: arrays by name of output.
 
         Parameters
         ----------
         q, v : (N, nq), (N, nv) at contact.
-        torque : (N, n), or (n) for all [N m]; needed with terms.feedforward.
+        torque : (N, n), or (n) for all [N m]; needed with effects.feedforward.
         outputs : names out of `impactopt.collision.OUTPUTS`; or "freeze_error", which is not computed unless
             it is named: of one freeze it takes some six times as long as the impulse.
-        every : keep every so many steps, and the last, of the histories.
+        every : histories keep each so many-th instant, and the last.
         threads : cores to use; None: all.
         settings : other values of any of `settings`, for all, or with a first axis of N, one each.
 
         Returns
         -------
         Arrays (N, ...): numbers (N), vectors (N, size), histories (N, k), (N, k, size), wrenches (N, k,
-        frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool,
-        False also where there came out no number. With "rk4" also `step_error` (N), what its steps left out
-        of each impulse, as an estimate: collisions that it is too large of, more than 1e-2, have no numbers.
-        So have those that the step is unstable of.
-        `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
+        frames, 6), where the last instant is repeated after separation. `separated` (N) of bool is always
+        there; it is False too where numbers are not finite. With "rk4" there is `step_error` (N), an
+        estimate of the impulse's error by its steps. Where this is above 1e-2, or the step is unstable,
+        all numbers are nan. `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 
         Raises
         ------
@@ -247,20 +254,20 @@ class SymbolicModel(SteppedModel):
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
         values = self.settings.override(overrides)
         arguments: list[Any] = [q, v]
-        if self.terms.feedforward and torque is None:
+        if self.effects.feedforward and torque is None:
             raise InputError(
-                "torque: give the feed-forward torque (n) [N m], or switch terms.feedforward off"
+                "torque: give the feed-forward torque (n) [N m], or switch effects.feedforward off"
             )
         if torque is not None:
             given = check_array("torque [N m]", torque, (self.robot.n,))
-            if self.terms.feedforward:
+            if self.effects.feedforward:
                 arguments.append(given)
         result = self._by_steps(arguments, values)
         if require_separation:
             self.check_separation(result)
         if self._more_often is None or not result.separated:
             return result
-        impulse, one = np.array([result.impulse]), arguments[2] if self.terms.feedforward else None
+        impulse, one = np.array([result.impulse]), arguments[2] if self.effects.feedforward else None
         (error,) = self._freeze_error(impulse, q[None], v[None], one, values, threads=1)
         return replace(result, freeze_error=float(error), caution=self._caution(float(error)))
 

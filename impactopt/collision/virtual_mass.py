@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from impactopt.collision.effects import Effects
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.collision.terms import Terms
 
 __all__ = ["VirtualMass"]
 
@@ -14,13 +14,13 @@ __all__ = ["VirtualMass"]
 class VirtualMass(SymbolicModel):
     """A point of the robot's effective mass m_a = 1 / (n' J P J' n) meets the target; no servo, no gravity.
 
-    The lowest rung of the ladder (paper, fig. 9, Table III; after Asada and Ogawa, and Khatib): P is the
-    inverse inertia of the robot as held. It knows nothing of joint torques, sole wrenches and ZMP (None in
-    its results); the velocity after the collision is that of free joints. Attributes and errors as of
+    The simplest model of the hierarchy (paper, fig. 9, Table III; after Asada and Ogawa, and Khatib): P is
+    the inverse inertia of the robot as held. It knows nothing of joint torques, sole wrenches and ZMP (None
+    in its results); the velocity after the collision is that of free joints. Attributes and errors as of
     `SymbolicModel`.
     """
 
-    terms: Terms = field(init=False, default=Terms.none())
+    effects: Effects = field(init=False, default=Effects.none())
 
     @property
     def n_servos(self) -> int:

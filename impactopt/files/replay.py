@@ -16,7 +16,7 @@ from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import parse_problem_file, read_problem_file
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation import Conditions, Simulation, scene_of, simulate
+from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.accuracy import check_steps
 from impactopt.transcription.plan import Trajectory
 
@@ -43,7 +43,7 @@ class Replay:
     """
 
     planned: Planned
-    conditions: Conditions
+    perturbation: Perturbation
     simulation: Simulation
     report: dict[str, Any]
     record: Record
@@ -63,7 +63,7 @@ def load_planned(
     """The plan in a directory that `impactopt solve` wrote, or in its `solution.npz`.
 
     problem_file : instead of the record's own text, such as when that is missing or its URDF has moved.
-    settings : other values of the problem, by dotted key.
+    settings : other values of the problem, by key path.
 
     Raises
     ------
@@ -111,21 +111,21 @@ def _problem(
 
 
 def replay(
-    planned: Planned, *, engine: str = "mujoco", conditions: Conditions | None = None, **options: Any
+    planned: Planned, *, engine: str = "mujoco", perturbation: Perturbation | None = None, **options: Any
 ) -> Replay:
     """Follow the plan's reference in an engine; "mujoco" lets the robot slip, lift its soles and fall.
 
-    conditions : where the world differs from what was planned ("mujoco" only).  options : of the engine, such
-        as ``step`` [s].
+    perturbation : where the world differs from what was planned ("mujoco" only).  options : of the engine,
+        such as ``step`` [s].
 
     Raises
     ------
     InputError : an unknown engine or option, a missing package, a simulation that diverges, or whose steps
         leave more than 1 % of its impulse uncertain.
     """
-    world = conditions if conditions is not None else Conditions()
-    if world != Conditions():
-        options["conditions"] = world
+    world = perturbation if perturbation is not None else Perturbation()
+    if world != Perturbation():
+        options["perturbation"] = world
     if engine == "mujoco" and planned.missed is not None:
         options["missed"] = planned.missed
     problem = planned.problem
@@ -143,4 +143,4 @@ def replay(
     record = dataclasses.replace(
         planned.record, arrays=kept, summary={**planned.record.summary, "replayed": report}
     )
-    return Replay(planned=planned, conditions=world, simulation=simulation, report=report, record=record)
+    return Replay(planned=planned, perturbation=world, simulation=simulation, report=report, record=record)

@@ -1,7 +1,7 @@
 """Pictures of a record: force, ZMP, torque, poses and joint motion, planned beside simulated; the fist's
 effective mass, the solver's way, soles in a replay.
 
-One picture a file, all in the style of `style.py`. `ladder.py` and `pareto.py` draw what is in no record:
+One picture a file, all in the style of `style.py`. `hierarchy.py` and `pareto.py` draw what is in no record:
 collision models beside each other.
 """
 
@@ -15,8 +15,8 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import Record, record_of, write_file
 from impactopt.pictures.ellipsoid import ellipsoid
 from impactopt.pictures.force import force
+from impactopt.pictures.hierarchy import hierarchy
 from impactopt.pictures.iterations import iterations
-from impactopt.pictures.ladder import ladder
 from impactopt.pictures.motion import motion
 from impactopt.pictures.overview import overview
 from impactopt.pictures.replay import replay as _replay
@@ -31,8 +31,8 @@ __all__ = [
     "Picture",
     "ellipsoid",
     "force",
+    "hierarchy",
     "iterations",
-    "ladder",
     "motion",
     "overview",
     "plot",

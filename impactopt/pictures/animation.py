@@ -43,7 +43,7 @@ SIDE, BEHIND, ABOVE = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Scene:
+class _Instant:
     """What is drawn of one instant: places in the world and arrows [m]."""
 
     sticks: Array  # (links, 2, 3)
@@ -57,13 +57,13 @@ class _Scene:
     zmp: Array | None  # (3,)
 
 
-class _Stage:
+class _Drawing:
     """The figure with its things, moved from instant to instant."""
 
     def __init__(self, done: Replay) -> None:
         self.done, self.sim = done, done.simulation
         self.robot, self.scene = done.planned.problem.robot, scene_of(done.planned.problem)
-        self.scene = done.conditions.scene(self.scene)
+        self.scene = done.perturbation.scene(self.scene)
         model = self.robot.model
         self.data = model.createData()
         weight = 9.81 * float(sum(i.mass for i in model.inertias))
@@ -86,7 +86,7 @@ class _Stage:
         self.head = self.figure.text(0.02, 0.93, "", fontsize=11, family="monospace")
         self.views = (SIDE, BEHIND, ABOVE)
 
-    def look(self, k: int) -> _Scene:
+    def look(self, k: int) -> _Instant:
         """What there is at recorded instant `k`."""
         model, data, sim, scene = self.robot.model, self.data, self.sim, self.scene
         pin.framesForwardKinematics(model, data, sim.q[k])
@@ -108,22 +108,22 @@ class _Stage:
         world = [
             (part, part.placed(self.travel[k], scene.normal) + (part.kind != "obstacle") * self.shift)
             for part in self.world
-            if part.kind == "obstacle" or not self.done.conditions.missing
+            if part.kind == "obstacle" or not self.done.perturbation.missing
         ]
         zmp = centre_of_pressure(sim.ground[k]) if len(ground) else np.full(2, np.nan)
-        return _Scene(
+        return _Instant(
             sticks=sticks,
             soles=soles,
             hand=hand,
             world=[vertices for _, vertices in world],
             near=[v for part, v in world if not part.clear and np.linalg.norm(v.mean(axis=0) - hand) < NEAR],
-            face=None if self.done.conditions.missing else scene.point + self.travel[k] * scene.normal,
+            face=None if self.done.perturbation.missing else scene.point + self.travel[k] * scene.normal,
             push=self.per_push * sim.force[k] * scene.normal,
             feet=feet,
             zmp=np.array([*zmp, 0.0]) if np.isfinite(zmp).all() else None,
         )
 
-    def set_up(self, scenes: list[_Scene]) -> None:
+    def set_up(self, scenes: list[_Instant]) -> None:
         """Panels that hold all that comes; the first two are of one scale."""
         body = np.concatenate([s.sticks.reshape(-1, 3) for s in scenes])
         near = [vertices for s in scenes for vertices in s.near]
@@ -154,7 +154,7 @@ class _Stage:
         ]
         self.figure.legend(handles=key, loc="lower right", fontsize=8)
 
-    def draw(self, scene: _Scene, text: str) -> Image.Image:
+    def draw(self, scene: _Instant, text: str) -> Image.Image:
         """One picture."""
         self.head.set_text(text)
         moving: list[Any] = []
@@ -179,7 +179,7 @@ class _Stage:
             thing.remove()
         return picture.convert("RGB")
 
-    def _robot(self, axes: Any, view: Array, scene: _Scene, moving: list[Any]) -> None:
+    def _robot(self, axes: Any, view: Array, scene: _Instant, moving: list[Any]) -> None:
         for vertices in scene.world:
             flat = vertices @ view.T
             outline = flat[ConvexHull(flat).vertices]
@@ -228,7 +228,7 @@ def save_animation(done: Replay, path: Path) -> Path:
     instants = np.searchsorted(sim.time, times).clip(0, len(sim.time) - 1)
     phase = sim.phase()
     with matplotlib.rc_context({**STYLE, "figure.constrained_layout.use": False}):
-        stage = _Stage(done)
+        stage = _Drawing(done)
         scenes = [stage.look(int(k)) for k in instants]
         stage.set_up(scenes)
         pictures = []

@@ -1,4 +1,4 @@
-"""Replays under drawn conditions: how hard they hit, which stand, and what that depends on."""
+"""Replays under drawn perturbations: how hard they hit, which stand, and what that depends on."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _scatter(axes: Any, name: str, value: Any, result: Robustness) -> None:
         axes.scatter(x[mask], result.impulse[mask], s=size, marker=marker, color=color, alpha=0.8, **edge)
     if name in LOGARITHMIC:
         axes.set_xscale("log")
-        low, high = result.spread.ranges()[name]
+        low, high = result.drawn_from.bounds()[name]
         ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 10.0) if low <= t <= high]
         axes.xaxis.set_major_locator(FixedLocator(ticks))
         axes.xaxis.set_minor_locator(NullLocator())

@@ -72,11 +72,12 @@ def drive_nail(
 ) -> Series:
     """Blows on the problem's nail until it is ``depth`` [m] deep in the wood.
 
-    The nail's head goes with it: each blow is planned anew at ``point`` plus what has been driven along the
-    normal, with the wood's resistance at that depth, from the plan before, or if that leads nowhere from a
-    plain reach. Between the blows the robot goes back to its start.
+    Each blow is planned for the nail's present depth: its head is at ``point`` plus the driven length along
+    the normal, and the wood has the resistance of that depth. A solve starts from the plan before, and if
+    that fails from a plain reach. Between the blows the robot goes back to its start.
 
-    most : blows at most.  report : told of each blow in words.  options : of :func:`impactopt.solve`.
+    most : largest number of blows.  report : called with a line of text for each blow.  options : of
+        :func:`impactopt.solve`.
 
     Raises
     ------

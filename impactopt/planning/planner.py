@@ -62,23 +62,23 @@ def solve(
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
 ) -> Solution:
-    """Plan the motion that hits hardest within the problem's terms.
+    """Plan the motion that maximizes the problem's objectives, by default the impulse, within its terms.
 
-    solver : "sqp" (ours) or "ipopt".
+    solver : "sqp", our own, or "ipopt". Ours is a primal-dual interior-point method: it takes one Newton step
+        on each quadratic model of the program. ``options={"qp_solver": "piqp"}`` makes it a true SQP, which
+        solves its QPs to their end, for small programs (:class:`impactopt.solvers.sqp.SQPOptions`).
     start : "reach", a plain reach to the target; "strike", the state at contact of the hardest blow near such
         a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or
         the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
-    starts : so many of them, the first one plain, the others with perturbed postures and other speeds, drawn
-        by ``seed``; the best motion is kept, ``Solution.attempts`` tells of all.
-    options : the solver's own.  time_limit [s] : for the program and all starts together; compiling
-        functions, which is done once, does not count.
-    between : whether a motion that leaves its limits between the nodes of its program gets more of them
-        there, and is solved once more from where it is: while it gives up half of a margin somewhere, at most
-        thrice. ``Solution.nodes`` tells where they are. So does one whose contact is too coarse: it gets
-        finer elements while their error is more than half a per cent of the impulse (``Solution.elements``,
-        ``Solution.contact_error``).
-    report : told in words what is being built; callback : called with every iteration's record; returning
-        True, or Ctrl-C, stops with the best iterate.
+    starts : number of starts. The first one is plain, the others have perturbed postures and other speeds,
+        drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all.
+    options : the solver's own.  time_limit [s] : of all starts together, without compiling functions.
+    between : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
+        between two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``).
+        The contact gets finer elements while theirs make an error of more than half a per cent of the impulse
+        (``Solution.elements``, ``Solution.contact_error``).
+    report : called with a line of text while functions are built.  callback : called with every iteration's
+        record; if it returns True, or on Ctrl-C, the solve stops with the best iterate.
 
     An infeasible problem is a status with named rows, not an exception.
 

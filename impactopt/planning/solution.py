@@ -31,15 +31,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Solved:
-    """What a solved (or stopped) program of a problem is told by.
+    """Result of a solver on a problem's program, solved or stopped.
 
     result : the solver's own record, its history included; of the best start.
-    build_seconds : compiling or loading functions and assembling the program; solve_seconds : the solver,
-        from all starts.
-    violations : what is not met, worst first.
-    objectives : what each of the problem's objectives comes to, by name, in its own unit.
-    attempts : what came of each start.
-    rattle : what is left out, as a nail and a striker that rattle are held together; None where they do not.
+    build_seconds : time to compile or load functions and to assemble the program.  solve_seconds : time of
+        the solver, of all starts.
+    violations : rows that are not met, worst first.
+    objectives : value of each of the problem's objectives, by name, in its own unit.
+    attempts : result of each start.
+    rattle : error of a plan in which a nail and a striker that rattle stay together; None if they do not
+        rattle.
     """
 
     problem: ImpactProblem
@@ -86,13 +87,12 @@ class Solution(Solved):
     """A solved (or stopped) impact problem.
 
     plan : the motion; for a status that is not usable, that of the best iterate.
-    nodes : what its program had beside the ends and middles of its splines' intervals, as
-        :func:`impactopt.solve` adds them.
-    elements : of the contact's phases, fractions of them, where it took finer ones than the problem asks for;
-        () where not.
-    contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
-        without duration, and where nothing usable was found.
-    apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
+    nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
+    elements : lengths of the collocation elements of the contact's phases, as fractions of them, if they are
+        finer than the problem asks for; else ().
+    contact_error : estimated error of the impulse by the contact's elements; None for an impact without
+        duration, and if no usable plan was found.
+    apart : rows of the program between bodies.  The rest: :class:`Solved`.
     """
 
     plan: Plan
@@ -121,7 +121,7 @@ class Solution(Solved):
 
     @property
     def motion_price_pct(self) -> float:
-        """What the prices on motion, sole wrenches and a rest away from the start take of the objective [%].
+        """Share of the objective that the prices on motion, sole wrenches and the end posture take [%].
 
         They are there for one optimum among motions that hit as hard: ``ImpactProblem.smoothness``,
         ``wrench_price`` and ``return_price``.  nan where the objectives are worth nothing, or not known.
@@ -140,7 +140,7 @@ class Solution(Solved):
 
     @cached_property
     def missed_trajectory(self) -> Trajectory:
-        """The servo's reference if nothing is hit; InputError if the plan has no brake."""
+        """The servo's reference if nothing is hit; InputError if the plan has no abort motion."""
         return self.plan.trajectory(missed=True)
 
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:

@@ -73,14 +73,16 @@ def optimize_strike(
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
 ) -> StrikeSolution:
-    """Find the state at contact that hits hardest within the problem's terms, whatever leads to it.
+    """Find the state at contact that hits hardest within the problem's terms, without a motion that leads to
+    it.
 
-    What the robot does before and after is left open, so near a motion's state at contact the impulse of the
-    strike is a bound on the motion's. There are local optima, so different postures can differ by a factor.
+    The motion before and after is free. So near the state at contact of a motion, the impulse of the strike
+    is an upper bound on that of the motion. There are local optima: different postures can differ by a
+    factor.
 
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
-        drawn by ``seed``; the best strike is kept, ``StrikeSolution.attempts`` tells of all.
+        drawn by ``seed``; the best strike is kept. ``StrikeSolution.attempts`` has all.
     start (n,) : solver variables to start from instead, such as ``result.x`` of a neighbouring problem.
 
     Raises

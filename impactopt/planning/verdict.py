@@ -35,7 +35,7 @@ def second_look(
     if old.status is Status.FAILED and max_violation(program, old.x, program.constraints(old.x)) <= VIOLATED:
         return old  # it has been refused for what is no row
     if report is not None:
-        report("the SQP ends without a verdict: IPOPT looks once, from the same start")
+        report("our solver ends without a verdict: IPOPT tries once, from the same start")
     new = replace(budget, solver="ipopt", options=None).run(program, start)
     if new.status is Status.INTERRUPTED or _rank(new) < _rank(old):
         return new
@@ -65,7 +65,7 @@ def with_reason(t: ContactProgram, result: SolverResult) -> SolverResult:
 def _too_stiff(t: ContactProgram) -> str:
     """The target's last event does not happen in one contact, however fast the robot is."""
     p = t.problem
-    if not isinstance(t.expected, Collision) or not p.target.events:
+    if not isinstance(t.expected, Collision) or not p.target.guards:
         return ""
     limit = fastest(t.coordinates, p.striker, p.normal, p.contact_posture, t.builder.limits.rate_limit)
     found = parting(p.law, p.target, t.hit.mass, limit)

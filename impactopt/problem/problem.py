@@ -63,9 +63,9 @@ MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per m
 class Phase:
     """A phase of the motion: its duration and its spline.
 
-    ``duration`` [s] : (shortest, longest) or one number.  ``intervals`` : of the spline.
-    ``grading``: longest over shortest interval, the short ones at the contact. The program's nodes are the
-    intervals' ends and middles.
+    ``duration`` [s] : (shortest, longest), or one number.  ``intervals`` : how many the spline has.
+    ``grading`` : longest over shortest interval; the short ones are at the contact. The program's nodes are
+    the ends and the middles of the intervals.
     """
 
     duration: tuple[float, float]
@@ -100,34 +100,36 @@ class ImpactProblem:
 
     Attributes
     ----------
-    robot, striker : who hits, and with which of its strikers.
-    point (3,) [m] : where the striking point meets the target, world; the ground is z = 0 and the start
-        posture's soles are centred on the origin.
-    normal (3,) : unit vector of the blow, world: the target is pushed along it.
-    law, target : contact law and target. A plan breaks a `Board`, in compression; it drives a `Nail`
-        once, which stands again before the striker leaves it.
+    robot, striker : the robot, and the name of the one of its strikers that hits.
+    point (3,) [m] : where the striking point meets the target, in the world frame. The ground is z = 0. The
+        soles of the start posture are centred on the origin.
+    normal (3,) : unit vector in the world frame, along which the target is pushed.
+    law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
+        once and stands again before the striker leaves it.
     stance : which soles are held.
     start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
-    contact_duration : bounds [s] of each of compression (until a nail stands) and restitution; what a break
-        or a start makes two of may each be shorter. A shortest of 0: as short as law and masses make it.
-    collision_elements : lengths of the collocation elements of compression and restitution, as fractions that
-        sum to 1; those of compression before and after a break or a start. They are halved for a nail and a
-        board.
+    contact_duration : (shortest, longest) [s], of compression (of a nail: until it stands) and of restitution
+        alike. A phase that an event splits in two, as a board's break does, may be shorter than this. With 0
+        as the shortest, law and masses decide.
+    collision_elements : lengths of the collocation elements of compression, and of restitution, each as
+        fractions that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the
+        event, and every element is cut in two halves.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
-    collision : "dynamics", the whole equation of motion while the contact lasts; "rigid", an impact in no
-        time with ``coefficient_of_restitution`` (speed of separation over that of approach); "virtual mass",
-        the same with the restitution of two masses under the contact law. The last two know nothing of
-        torque, ZMP and servo during the impact: they are what others plan with, to compare.
-    scenarios : what else may be hit, or not, and has to be survived with the same swing.
-    body : what the target looks like, to all but the striking point.
-    obstacles : what else stands about, that nothing may touch.
-    terms : what must hold; those of DEFAULT_TERMS that are not given take their defaults.
-    objectives : what is maximized, a weighted sum.
-    smoothness : price [N s per (rad/s^2)^2 s] of accelerations; wrench_price: of sole wrenches;
-        return_price: of ending away from the start posture [N s per rad^2]. They only make the optimum
-        unique, and its end natural.
+    collision : the model of the impact. "dynamics": the whole equation of motion while the contact lasts.
+        "rigid": an impact without duration, with ``coefficient_of_restitution`` (speed of separation over
+        speed of approach). "virtual mass": likewise, with the restitution of two masses under the contact
+        law. The last two know nothing of torque, ZMP and servo during the impact. They are there to compare
+        with.
+    scenarios : other targets, or none, that the robot has to survive with the same swing.
+    body : the target's shape, which all of the robot but the striking point keeps off.
+    obstacles : bodies in the world that the robot keeps off.
+    terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults.
+    objectives : their weighted sum is maximized.
+    smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
+        return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
+        they make the optimum unique, and bring the robot back to its start.
 
     Raises
     ------
@@ -279,7 +281,7 @@ class ImpactProblem:
 
     @property
     def brake_after(self) -> float | None:
-        """When after the planned contact [s] a robot that has felt nothing brakes; None: it feels nothing."""
+        """When the motion is aborted if nothing is hit, after the planned contact [s]; None: never."""
         return next((s.brake_after for s in self.scenarios if s.brake_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:

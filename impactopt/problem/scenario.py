@@ -13,40 +13,47 @@ from impactopt.errors import MOST, InputError, check_array, check_name
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Described):
-    """What else may happen, and has to be survived with the same swing.
+    """Another target than the expected one, or none, that the robot has to survive with the same swing.
 
-    A target that differs from the expected one. The impulse to the expected target is what is maximized; in a
-    scenario the collision's rows (torque, wrench cones) and the balance after it hold, with margins of their
-    own, under the same reference and servo. Where there is nothing to hit, what the robot has at contact it
-    has to stop by itself: the margin of balance is that at contact, and a robot that brakes goes on to a
-    motion to rest that is planned with the swing, not to the follow-through of a blow that was none.
+    Objectives are those of the blow on the expected target. In a scenario the collision's rows (torque,
+    wrench cones) and the balance after it hold too, with margins of their own, under the same reference and
+    servo. If there is nothing to hit, no impulse slows the robot down: the margin of balance is then taken at
+    contact. With `brake_after` the robot goes on to an abort motion, which brings it to rest and is planned
+    with the swing; without, it follows the follow-through of the blow.
     """
 
     name: str = field(metadata=about("what reports call it"))
-    mass: float = field(
-        default=1.0, metadata=about("of the target, as a factor of the expected one", above=0)
-    )
-    stiffness: float = field(default=1.0, metadata=about("of the contact, as a factor", above=0))
-    damping: float = field(default=1.0, metadata=about("of the contact, as a factor", least=0))
-    missing: bool = field(default=False, metadata=about("there is nothing to hit"))
+    mass: float = field(default=1.0, metadata=about("target's mass over the expected mass", above=0))
+    stiffness: float = field(default=1.0, metadata=about("contact stiffness over the expected one", above=0))
+    damping: float = field(default=1.0, metadata=about("contact damping over the expected one", least=0))
+    missing: bool = field(default=False, metadata=about("true: there is nothing to hit"))
     brake_after: float | None = field(
         default=None,
         metadata=about(
-            "when a robot that has felt nothing goes on to a stop planned for that", unit="s", above=0
+            "time after the planned contact at which the motion is aborted, to a planned stop",
+            unit="s",
+            above=0,
         ),
     )
     torque: float = field(
-        default=1.0, metadata=about("fraction of each joint's limit in the collision", above=0)
+        default=1.0,
+        metadata=about("share of each joint's torque limit that may be used in the collision", above=0),
     )
     cone_margin: float = field(
         default=0.005,
         metadata=about(
-            "from each sole's centre of pressure to its edges in the collision", unit="m", least=0
+            "least distance from each sole's centre of pressure to its edges in the collision",
+            unit="m",
+            least=0,
         ),
     )
     capture_margin: float = field(
         default=0.0,
-        metadata=about("from the capture point to the support polygon's edges, after it", unit="m", least=0),
+        metadata=about(
+            "least distance from the capture point to the support polygon's edges, after contact",
+            unit="m",
+            least=0,
+        ),
     )
 
     def __post_init__(self) -> None:

@@ -25,12 +25,12 @@ from impactopt.report.result_rows import (
 from impactopt.solvers.program import IterationRecord
 
 __all__ = [
-    "Progress",
-    "blows_table",
+    "SolveConsole",
     "collision_table",
+    "multistart_table",
+    "nail_driving_table",
     "replay_table",
     "result_table",
-    "starts_table",
     "strike_table",
     "told_touches",
     "torques_table",
@@ -46,7 +46,7 @@ def _plain(text: str) -> str:
     return escape(printable(text))
 
 
-class Progress:
+class SolveConsole:
     """Lines about what is being done, and a live line about the iterations.
 
     Where there is no terminal, iterations are plain lines, one a second at most; `verbose`: all of them.
@@ -58,7 +58,7 @@ class Progress:
         self._last = -QUIET_BETWEEN
         self._start = time.perf_counter()
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> SolveConsole:
         if self._console.is_terminal and not self._quiet:
             self._live = self._console.status("starting")
             self._live.start()
@@ -141,7 +141,7 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
     return table
 
 
-def starts_table(starts: Sequence[Mapping[str, Any]]) -> Table:
+def multistart_table(starts: Sequence[Mapping[str, Any]]) -> Table:
     """What came of each start; `starts` as in a summary."""
     table = Table(title="starts", title_justify="left")
     for name in ("start", "status", "impulse [N s]", "iterations", "time [s]"):
@@ -197,7 +197,7 @@ def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def blows_table(series: Mapping[str, Any]) -> Table:
+def nail_driving_table(series: Mapping[str, Any]) -> Table:
     """A row for each blow on a nail; `series` as in `impactopt drive --json`."""
     table = Table(title="blows on the nail", title_justify="left")
     columns = (

@@ -1,4 +1,4 @@
-"""Planned beside simulated, as rows of text: what tables on screen and in reports are made of."""
+"""Planned beside simulated, as rows of text: for tables on the console and in reports."""
 
 from __future__ import annotations
 

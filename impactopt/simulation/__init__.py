@@ -1,15 +1,15 @@
 """Re-simulation of plans in full dynamics, by engines that share no code with the planner."""
 
-from impactopt.simulation.conditions import Conditions
 from impactopt.simulation.engines import ENGINES, simulate
 from impactopt.simulation.mujoco_engine import simulate_mujoco
+from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.scene import scene_of
 
 __all__ = [
     "ENGINES",
-    "Conditions",
+    "Perturbation",
     "Scene",
     "Simulation",
     "scene_of",

@@ -44,9 +44,9 @@ def simulate(
     run = ENGINES[engine]
     known = set(run.__kwdefaults__ or {})
     for name in options:
-        if name == "conditions" and name not in known:
+        if name == "perturbation" and name not in known:
             raise InputError(
-                f"engine {engine!r} replays what was planned, no other conditions; take engine 'mujoco'"
+                f"engine {engine!r} replays what was planned, no perturbation; take engine 'mujoco'"
             )
         if name not in known:
             raise InputError(

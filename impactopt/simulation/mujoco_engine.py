@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.besides import Besides
-from impactopt.simulation.conditions import Conditions
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.simulation.mujoco_robot import MujocoRobot
-from impactopt.simulation.mujoco_world import Solver, build_world, no_log_file
+from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file
+from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.soles import BEARS, sole_names, weight_of
@@ -35,12 +35,12 @@ LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s
 
 class _Replay(MujocoRobot):
     def __init__(
-        self, robot: Robot, reference: Any, scene: Scene, conditions: Conditions, solver: Solver
+        self, robot: Robot, reference: Any, scene: Scene, perturbation: Perturbation, solver: MujocoOptions
     ) -> None:
-        self.scene, self.conditions = conditions.scene(scene), conditions
+        self.scene, self.perturbation = perturbation.scene(scene), perturbation
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
-        super().__init__(robot, build_world(robot, self.scene, conditions, solver, near), "striker")
+        super().__init__(robot, build_world(robot, self.scene, perturbation, solver, near), "striker")
         self.besides = Besides(self.world, solids)
         self.follow(reference)
         self.struck = Struck(self.scene)
@@ -63,7 +63,7 @@ class _Replay(MujocoRobot):
 
     def follow(self, reference: Any) -> None:
         """What the servo follows from now on."""
-        world = self.conditions
+        world = self.perturbation
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
 
@@ -88,7 +88,7 @@ class _Replay(MujocoRobot):
             # the depth is the contact's: it is followed more exactly there than the arm is
             along = struck.depth(place, 0.0)
             self.travel = along - self.kept if np.isfinite(along) else self.travel
-        depth = -np.inf if self.conditions.missing else struck.depth(place, self.travel)
+        depth = -np.inf if self.perturbation.missing else struck.depth(place, self.travel)
         self.kept = None
         if struck.near(depth, speed, self.target, step):
             answer = np.zeros((1, self.world.nv))
@@ -194,7 +194,7 @@ def simulate_mujoco(
     tolerance: float = 1e-10,
     settle: float = 2.0,
     record: int = 5,
-    conditions: Conditions | None = None,
+    perturbation: Perturbation | None = None,
     missed: Any = None,
     until: float = np.inf,
 ) -> Simulation:
@@ -203,7 +203,7 @@ def simulate_mujoco(
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n), as of
     :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
-    recorded in contact. conditions : where the world differs from what was planned; default: nowhere.
+    recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
         default: it does not notice.
     until [s] : it ends, if that is earlier.
@@ -216,8 +216,8 @@ def simulate_mujoco(
     """
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
-    world = conditions if conditions is not None else Conditions()
-    replay = _Replay(robot, reference, scene, world, Solver(step, iterations, tolerance))
+    world = perturbation if perturbation is not None else Perturbation()
+    replay = _Replay(robot, reference, scene, world, MujocoOptions(step, iterations, tolerance))
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
     hold = max(1, round(world.period / step))
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque

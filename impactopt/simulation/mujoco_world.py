@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
-from impactopt.simulation.conditions import Conditions
+from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
 from impactopt.simulation.solids import FLOOR, Solid
 
@@ -22,7 +22,7 @@ FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the
 
 
 @dataclass(frozen=True)
-class Solver:
+class MujocoOptions:
     """MuJoCo's own settings: step [s], iterations and tolerance of its contact solver."""
 
     step: float = 2e-4
@@ -56,8 +56,8 @@ def no_log_file() -> Iterator[None]:
 def build_world(
     robot: Robot,
     scene: Scene,
-    conditions: Conditions,
-    solver: Solver,
+    perturbation: Perturbation,
+    solver: MujocoOptions,
     near: Sequence[tuple[int, int]] = (),
 ) -> Any:
     """The compiled mujoco.MjModel.
@@ -74,13 +74,13 @@ def build_world(
     spec.option.impratio = 10.0  # friction as hard as the normal direction: no creep
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
-    _surface(floor, conditions, sole=False)
-    bodies = _robot_bodies(mujoco, spec, robot, scene, conditions)
+    _surface(floor, perturbation, sole=False)
+    bodies = _robot_bodies(mujoco, spec, robot, scene, perturbation)
     _solids(mujoco, spec, bodies, scene, near)
     return spec.compile()
 
 
-def spec_of(robot: Robot, solver: Solver) -> Any:
+def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
     """An empty world with the robot's gravity, that is integrated and solved so."""
     mujoco = mujoco_module()
     spec = mujoco.MjSpec()
@@ -133,7 +133,9 @@ def _primitive(mujoco: Any, solid: Solid) -> dict[str, Any]:
     return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0.0, 0.0], **place}
 
 
-def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions: Conditions) -> list[Any]:
+def _robot_bodies(
+    mujoco: Any, spec: Any, robot: Robot, scene: Scene, perturbation: Perturbation
+) -> list[Any]:
     model = robot.model
     bodies = robot_bodies(mujoco, spec, robot)
     for sole in robot.soles:
@@ -147,13 +149,13 @@ def _robot_bodies(mujoco: Any, spec: Any, robot: Robot, scene: Scene, conditions
                 pos=centre,
                 mass=0.0,
             )
-            _surface(sphere, conditions, sole=True)
+            _surface(sphere, perturbation, sole=True)
     frame = model.frames[model.getFrameId(scene.striker)]
     hand = bodies[frame.parentJoint]
     hand.add_site(name="striker", pos=frame.placement.translation)
-    if conditions.payload > 0:
+    if perturbation.payload > 0:
         load = hand.add_body(name="payload", pos=frame.placement.translation)
-        _inertial(load, conditions.payload, np.zeros(3), 1e-4 * conditions.payload * np.eye(3))
+        _inertial(load, perturbation.payload, np.zeros(3), 1e-4 * perturbation.payload * np.eye(3))
     return bodies
 
 
@@ -186,11 +188,11 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
     return bodies
 
 
-def _surface(geom: Any, conditions: Conditions, *, sole: bool) -> None:
+def _surface(geom: Any, perturbation: Perturbation, *, sole: bool) -> None:
     geom.contype, geom.conaffinity = int(sole), int(not sole)  # soles meet the floor, not each other
-    geom.friction = [conditions.friction, 1e-3, 1e-4]
+    geom.friction = [perturbation.friction, 1e-3, 1e-4]
     geom.condim = 3
-    geom.solref = [conditions.floor_time, 1.0]
+    geom.solref = [perturbation.floor_time, 1.0]
     # as soft as a rubber sole: with more impedance the corners leave the floor by micrometres, many times a
     # millisecond, and the force and ZMP of one step say nothing (the motion hardly changes). One impedance at
     # all depths makes a linear floor.

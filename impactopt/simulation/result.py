@@ -77,15 +77,15 @@ class Simulation:
     the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
     integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
-    outcome: what the target has of it, as its last touch has left it, by name and unit (``speed_m_s``,
-    ``depth_m``, ``broken``).  saturated [s]: how long some joint asked for more
-    than its torque limit.  fall: why the robot does not stand at the end, "" if it stands; None where the
-    engine holds the soles and cannot say.  posture_error [rad]: of the joint, or of the base's orientation,
-    that ends farthest from the reference's last posture.  touched: what touched that should not have, where
-    the engine's solids push back.  clearance [m], nearest: the least distance of any two bodies that are not
-    to touch, by exact geometry, and which two.  missed: there was no target.  touches: start and end [s] and
-    impulse [N s] of each.  step_error: relative, of the impulse, what the engine's steps leave uncertain, as
-    an estimate; nan where it was not asked for, or nothing was hit.
+    outcome: the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
+    ``broken``).  saturated [s]: how long the demand of some joint was above its torque limit.  fall: why the
+    robot does not stand at the end, "" if it stands; None where the engine holds the soles and cannot say.
+    posture_error [rad]: of the joint, or of the base's orientation, that ends farthest from the reference's
+    last posture.  touched: pairs of bodies that touched and should not have, if the engine has solids that
+    push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
+    geometry, and which two.  missed: there was no target.  touches: start and end [s] and impulse [N s] of
+    each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
+    computed, or nothing was hit.
     """
 
     engine: str

@@ -1,4 +1,4 @@
-"""Does it stand, and hit, when the world is not quite as planned? Replays under drawn conditions."""
+"""Does it stand, and hit, when the world is not quite as planned? Replays under drawn perturbations."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, check_array, check_whole, shortened
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
-from impactopt.simulation import Conditions, Scene, Simulation, scene_of, simulate_mujoco
+from impactopt.simulation import Perturbation, Scene, Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.accuracy import check_steps, with_step_error
 from impactopt.simulation.mujoco_world import mujoco_module
 from impactopt.simulation.workers import map_on_workers
 
-__all__ = ["Robustness", "Spread", "draw_conditions", "robustness"]
+__all__ = ["PerturbationRanges", "Robustness", "draw_perturbations", "robustness"]
 
 Array = NDArray[np.float64]
 Z95 = 1.959964  # of the normal distribution: 95 % lie within
@@ -30,16 +30,16 @@ LOGARITHMIC = ("mass", "stiffness", "kp", "kd")  # factors: half is as far from 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spread:
-    """Between which bounds conditions are drawn, independently; what they mean: :class:`Conditions`.
+class PerturbationRanges:
+    """Ranges (lower, upper) from which perturbations are drawn independently; see :class:`Perturbation`.
 
     mass, stiffness, kp, kd : factors, log-uniform.  distance [m], payload [kg], friction, torque_limit
         (a factor) : uniform.
-    period [s] : of the servo, in every draw: a real servo is sampled.
+    period [s] : sampling period of the servo, the same in every draw.
 
     Raises
     ------
-    InputError : naming the range whose bounds are crossed, or that no condition could come from.
+    InputError : naming the range that is empty, or that has values that no perturbation can have.
     """
 
     mass: tuple[float, float] = (0.5, 2.0)
@@ -53,30 +53,30 @@ class Spread:
     period: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name, bounds in self.ranges().items():
-            low, high = check_array(f"spread: {name}", bounds, (2,)).tolist()
+        for name, bounds in self.bounds().items():
+            low, high = check_array(f"ranges: {name}", bounds, (2,)).tolist()
             object.__setattr__(self, name, (low, high))
             if not low <= high:
-                raise InputError(f"spread: {name} is from {low:g} to {high:g}; give the lower bound first")
+                raise InputError(f"ranges: {name} is from {low:g} to {high:g}; give the lower bound first")
             if name in LOGARITHMIC and not low > 0:
-                raise InputError(f"spread: {name} starts at {low:g}; a factor that is drawn must be > 0")
+                raise InputError(f"ranges: {name} starts at {low:g}; a factor that is drawn must be > 0")
             for bound in (low, high):
-                _changed(Conditions(), {name: bound})  # refuses what is out of range
-        Conditions(period=self.period)
+                _changed(Perturbation(), {name: bound})  # refuses what is out of range
+        Perturbation(period=self.period)
 
-    def of(self, scene: Scene) -> Spread:
-        """This spread, without factors of numbers that the scene's law or target does not have."""
+    def of(self, scene: Scene) -> PerturbationRanges:
+        """These ranges, without factors of numbers that the scene's law or target does not have."""
         has = {"mass": scene.target.parameters, "stiffness": scene.law.parameters}
         none: dict[str, Any] = {name: (1.0, 1.0) for name, numbers in has.items() if name not in numbers}
         return replace(self, **none)
 
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """What is drawn, by name, with its bounds."""
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """(lower, upper) by name, of what is drawn."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "period"}
 
 
-def draw_conditions(n: int, seed: int = 0, spread: Spread | None = None) -> list[Conditions]:
-    """n conditions from a spread; of one seed, fewer draws are the first of more.
+def draw_perturbations(n: int, seed: int = 0, ranges: PerturbationRanges | None = None) -> list[Perturbation]:
+    """n perturbations, drawn from ranges. With one seed, the first draws do not depend on n.
 
     Raises
     ------
@@ -84,20 +84,20 @@ def draw_conditions(n: int, seed: int = 0, spread: Spread | None = None) -> list
     """
     n = check_whole("draws", n, least=1, most=MOST_DRAWS)
     seed = check_whole("seed", seed, least=0, most=2**63)
-    if spread is not None and not isinstance(spread, Spread):
-        raise InputError(f"spread: {shortened(repr(spread))}; give a Spread")
-    chosen = spread if spread is not None else Spread()
-    ranges = chosen.ranges()
-    unit = np.random.default_rng(seed).random((n, len(ranges)))
-    columns, planned = {}, Conditions(period=chosen.period)
-    for (name, (low, high)), u in zip(ranges.items(), unit.T, strict=True):
+    if ranges is not None and not isinstance(ranges, PerturbationRanges):
+        raise InputError(f"ranges: {shortened(repr(ranges))}; give PerturbationRanges")
+    chosen = ranges if ranges is not None else PerturbationRanges()
+    bounds = chosen.bounds()
+    unit = np.random.default_rng(seed).random((n, len(bounds)))
+    columns, planned = {}, Perturbation(period=chosen.period)
+    for (name, (low, high)), u in zip(bounds.items(), unit.T, strict=True):
         value = low * (high / low) ** u if name in LOGARITHMIC else low + (high - low) * u
         columns[name] = np.clip(value, low, high)  # rounding does not leave the range
     return [_changed(planned, {name: float(value[k]) for name, value in columns.items()}) for k in range(n)]
 
 
-def _changed(conditions: Conditions, numbers: dict[str, Any]) -> Conditions:
-    return replace(conditions, **numbers)
+def _changed(perturbation: Perturbation, numbers: dict[str, Any]) -> Perturbation:
+    return replace(perturbation, **numbers)
 
 
 class Row(NamedTuple):
@@ -112,15 +112,15 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Robustness:
-    """Replays under n drawn conditions.
+    """Replays under n drawn perturbations.
 
     standing (n,); reason (n,): why a robot does not stand, or a replay has no result, "" else; impulse (n,)
     [N s]; slip, lift (n,) [m]: the most that a corner of a sole did; nan where a replay has no result.
     planned_impulse [N s].
     """
 
-    conditions: Sequence[Conditions] = field(repr=False)
-    spread: Spread
+    perturbations: Sequence[Perturbation] = field(repr=False)
+    drawn_from: PerturbationRanges
     standing: NDArray[np.bool_]
     reason: Sequence[str]
     impulse: Array
@@ -130,7 +130,7 @@ class Robustness:
 
     @property
     def draws(self) -> int:
-        return len(self.conditions)
+        return len(self.perturbations)
 
     @property
     def rate(self) -> float:
@@ -139,7 +139,7 @@ class Robustness:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval of the rate at which the plan stands under the spread."""
+        """Wilson's 95 % interval of the rate at which the plan stands under such perturbations."""
         n, p = self.draws, self.rate
         middle = (p + Z95**2 / (2 * n)) / (1 + Z95**2 / n)
         half = Z95 / (1 + Z95**2 / n) * np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n**2))
@@ -164,7 +164,10 @@ class Robustness:
 
     def table(self) -> dict[str, Array]:
         """What was drawn, (n,) by name."""
-        return {name: np.array([getattr(c, name) for c in self.conditions]) for name in self.spread.ranges()}
+        return {
+            name: np.array([getattr(c, name) for c in self.perturbations])
+            for name in self.drawn_from.bounds()
+        }
 
     def separation(self) -> dict[str, dict[str, float]]:
         """By parameter, its mean among draws that stand and that do not (of factors: the geometric mean), and
@@ -192,7 +195,7 @@ class Robustness:
         """
         out = {}
         for name, value in self.table().items():
-            low, high = self.spread.ranges()[name]
+            low, high = self.drawn_from.bounds()[name]
             x, ends = (np.log(a) if name in LOGARITHMIC else a for a in (value, np.array([low, high])))
             width = max(float(ends[1] - ends[0]), np.finfo(float).tiny)
             third = np.clip(np.floor(3 * (x - ends[0]) / width), 0, 2)
@@ -218,11 +221,11 @@ def _simulate(
     return simulate_mujoco(robot, reference, scene, step=step, **options)
 
 
-def replay(shared: Shared, conditions: Conditions) -> Row:
+def replay(shared: Shared, perturbation: Perturbation) -> Row:
     """One draw; what goes wrong is its reason."""
     given = (shared.robot, shared.reference, shared.scene)
     try:
-        s = with_step_error(_simulate, *given, step=shared.step, conditions=conditions)
+        s = with_step_error(_simulate, *given, step=shared.step, perturbation=perturbation)
         check_steps(s, shared.step)
     except InputError as error:
         return Row(standing=False, reason=str(error))
@@ -253,16 +256,17 @@ def robustness(
     *,
     draws: int = 200,
     seed: int = 0,
-    spread: Spread | None = None,
+    ranges: PerturbationRanges | None = None,
     workers: int = 2,
     step: float = STEP,
     progress: Callable[[int, int], None] | None = None,
 ) -> Robustness:
-    """Replay a reference in MuJoCo, on free soles, under drawn conditions; numbers do not depend on workers.
+    """Replay a reference in MuJoCo, on free soles, under drawn perturbations.
 
     reference : as of :class:`impactopt.transcription.plan.Trajectory`.  planned_impulse [N s].
-    draws, seed, spread : as of :func:`draw_conditions`; a wall has no mass, so none is drawn.
-    workers : processes. A script that asks for more than 1 needs `if __name__ == "__main__":`.
+    draws, seed, ranges : as of :func:`draw_perturbations`; a wall has no mass, so none is drawn.
+    workers : processes; the numbers do not depend on how many. A script that asks for more than 1 needs
+        `if __name__ == "__main__":`.
     step [s] : of the simulation; shorter where the impulse needs it, as of `validate`.
     progress : called with how many replays are done, of how many.
 
@@ -276,8 +280,8 @@ def robustness(
         start, or a law or target of one's own cannot go to them.
     """
     scene = scene_of(problem)
-    chosen = (spread if spread is not None else Spread()).of(scene)
-    conditions = draw_conditions(draws, seed, chosen)
+    chosen = (ranges if ranges is not None else PerturbationRanges()).of(scene)
+    perturbations = draw_perturbations(draws, seed, chosen)
     if workers < 1:
         raise InputError(f"{workers} workers; ask for at least 1")
     if not (np.isfinite(step) and step > 0):
@@ -286,10 +290,10 @@ def robustness(
     if workers > 1:
         _check_travels(scene)
     shared = Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
-    rows = map_on_workers(replay, shared, conditions, workers=workers, crashed=_crashed, progress=progress)
+    rows = map_on_workers(replay, shared, perturbations, workers=workers, crashed=_crashed, progress=progress)
     return Robustness(
-        conditions=tuple(conditions),
-        spread=chosen,
+        perturbations=tuple(perturbations),
+        drawn_from=chosen,
         standing=np.array([row.standing for row in rows]),
         reason=tuple(row.reason for row in rows),
         impulse=np.array([row.impulse for row in rows]),

@@ -102,7 +102,7 @@ def each_on_workers(
     """
     context = multiprocessing.get_context("spawn")
     source, back = iter(inputs), list[_Task]()
-    crew: list[_Worker] = []
+    pool: list[_Worker] = []
     failed = 0
 
     def task() -> _Task | None:
@@ -113,17 +113,17 @@ def each_on_workers(
 
     try:
         waiting = task()
-        while waiting is not None or crew:
+        while waiting is not None or pool:
             # as many as there are inputs, at most; each is given its input when it says that it is ready
-            while waiting is not None and len(crew) < workers:
-                crew.append(_Worker(context, function, shared, waiting))
+            while waiting is not None and len(pool) < workers:
+                pool.append(_Worker(context, function, shared, waiting))
                 waiting = task()
-            pipes: Any = wait([worker.pipe for worker in crew], timeout=AWAKE)
-            for worker in [w for w in crew if w.pipe in pipes]:
+            pipes: Any = wait([worker.pipe for worker in pool], timeout=AWAKE)
+            for worker in [w for w in pool if w.pipe in pipes]:
                 try:
                     index, result = worker.pipe.recv()
                 except (EOFError, OSError):
-                    crew.remove(worker)
+                    pool.remove(worker)
                     code, mine = worker.end(), worker.task
                     if not worker.ready:
                         failed += 1
@@ -150,11 +150,11 @@ def each_on_workers(
                     worker.task, waiting = waiting, task()
                     worker.give()
                 else:
-                    crew.remove(worker)
+                    pool.remove(worker)
                     worker.end()
                 yield index, result
     finally:
-        for worker in crew:
+        for worker in pool:
             worker.end()
 
 

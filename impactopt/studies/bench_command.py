@@ -24,11 +24,11 @@ app = typer.Typer(
 
 Json = Annotated[bool, typer.Option("--json", help="Print the numbers as JSON, no tables.")]
 Out = Annotated[
-    Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep numbers and pictures there.")
+    Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write numbers and pictures there.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn conditions.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of the draws.")]
+Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn perturbations.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
 Compilers = Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")]
 FEW_DRAWS = 10  # of the bench margins among all others, which has a dozen plans to replay
@@ -109,7 +109,9 @@ def _fidelity(
 
 @_command("freezes")
 def _freezes(
-    count: Annotated[int, typer.Option(min=1, help="Collisions that end, on each of three robots.")] = 10,
+    count: Annotated[
+        int, typer.Option(min=1, help="Number of collisions that end, on each of three robots.")
+    ] = 10,
     seed: Seed = 0,
     workers: Compilers = 2,
 ) -> None:
@@ -164,17 +166,15 @@ def _skip() -> None:
 @_command("solve")
 def _solve(
     problem: Annotated[
-        str | None, typer.Option("--problem", metavar="NAME", help="One problem, or its file (default: all).")
+        str | None, typer.Option("--problem", metavar="NAME", help="A problem's name or file (default: all).")
     ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Starts: the plain one, and perturbed ones.")] = 3,
-    time_limit: Annotated[float, typer.Option(min=0.1, help="Of one solve [s].")] = 60.0,
+    time_limit: Annotated[float, typer.Option(min=0.1, help="Time limit of one solve, in seconds.")] = 60.0,
     solvers: Annotated[
         list[str] | None,
         typer.Option("--solver", metavar="NAME", help="One solver, as ipopt or sqp:piqp; may be repeated."),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Take up what results/bench/solve.jsonl has.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume from results/bench/solve.jsonl.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="One start, our default solver and IPOPT.")] = False,
     seed: Seed = 0,
 ) -> None:
@@ -190,9 +190,7 @@ def _zoo(
     robot: Annotated[
         str | None, typer.Option("--robot", metavar="NAME", help="Problems of this robot only, as talos.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Take up what results/bench/zoo.jsonl has.")
-    ] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume from results/bench/zoo.jsonl.")] = False,
     seed: Seed = 0,
 ) -> None:
     """Problems that nobody has tuned, drawn at random: solved from one start, do they stand on free soles?"""
@@ -200,7 +198,7 @@ def _zoo(
 
 @app.command("all")
 def _all(
-    draws: Annotated[int, typer.Option(min=1, help="Of the bench robustness.")] = 200,
+    draws: Annotated[int, typer.Option(min=1, help="Number of draws, as of the bench robustness.")] = 200,
     seed: Seed = 0,
     workers: Workers = 2,
     as_json: Json = False,

@@ -54,7 +54,7 @@ def figures(
             metavar="[NAME]...", help="Figures; all but the benchmarks' and the sweeps' if left out."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Where they are put.")] = FOLDER,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Directory for them.")] = FOLDER,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """The figures of the documentation, made anew.
@@ -63,11 +63,11 @@ def figures(
     """
     with plain_errors("interrupted before all figures were made") as console:
         from impactopt.files.output import make_directory, write_file
-        from impactopt.report.console import Progress
+        from impactopt.report.console import SolveConsole
 
         wanted = chosen(names or [name for name, (how, _) in FIGURES.items() if how not in DEAR])
         directory = make_directory(out)
-        with Progress(console, quiet=quiet) as progress:
+        with SolveConsole(console, quiet=quiet) as progress:
             for name, picture in drawn(wanted, progress.say):
                 write_file(directory / f"{name}.png", picture.write)
                 progress.say(f"{directory / name}.png")

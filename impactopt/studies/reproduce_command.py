@@ -20,7 +20,7 @@ def reproduce(
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON, no tables.")] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Keep numbers and pictures there.")
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write numbers and pictures there.")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Reports, run one after the other: progress, tables on screen, files, JSON."""
+"""Reports, run one after the other: progress, tables on the console, files, JSON."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def show_reports(
         from rich.console import Console
 
         from impactopt.files.output import make_directory, plain
-        from impactopt.report.console import Progress
+        from impactopt.report.console import SolveConsole
         from impactopt.studies.report import save_report
 
         directory = make_directory(out) if out is not None else None
         found = {}
         for name in names:
-            with Progress(console, quiet=quiet) as progress:
+            with SolveConsole(console, quiet=quiet) as progress:
                 report = run(name, progress.say)
                 written = save_report(report, directory) if directory is not None else []
             found[name] = plain(report.numbers)

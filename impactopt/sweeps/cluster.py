@@ -80,13 +80,13 @@ def on_cluster(
         lost.
     """
     distributed = _distributed()
-    crew = _Crew(client, tell)
+    pool = _Pool(client, tell)
     name, source = uuid.uuid4().hex[:8], iter(units)
     pending: dict[Any, Unit] = {}
     done = distributed.as_completed()
 
     def submit() -> None:
-        while len(pending) < AHEAD * crew.threads and (unit := next(source, None)) is not None:
+        while len(pending) < AHEAD * pool.threads and (unit := next(source, None)) is not None:
             # a unit is worth more than its arguments: a new task each, none that depends on another's data
             key = f"impactopt-{name}-{unit.index}"
             future = client.submit(evaluate, work, unit, key=key, pure=False)
@@ -107,7 +107,7 @@ def on_cluster(
                 client.cancel([*pending], force=True)
 
 
-class _Crew:
+class _Pool:
     """How many threads the workers have now."""
 
     def __init__(self, client: Any, tell: Callable[[str], None]) -> None:

@@ -28,7 +28,7 @@ _STATE = (("at_contact", "speed_m_s"), ("at_contact", "joints_rad"))
 
 
 def sweep_place(data: Mapping[str, Any], key: str) -> Place:
-    """Where a dotted key is: in the problem file's data, or in [at_contact]; units may be left out.
+    """Where a key path is: in the problem file's data, or in [at_contact]; units may be left out.
 
     Raises
     ------

@@ -19,10 +19,10 @@ from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError, raw_array
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.problem_file.toml import plain_value
+from impactopt.sweeps.alike import AlikeCollisions
 from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
 from impactopt.sweeps.collision_keys import role_of, sweep_place
 from impactopt.sweeps.measures import chosen
-from impactopt.sweeps.scene import Scene
 from impactopt.sweeps.states import ContactStates
 
 __all__ = ["Collisions", "collide_many"]
@@ -41,7 +41,7 @@ def collide_many(
     Parameters
     ----------
     problem : a problem file, its path, or its name.
-    columns : by dotted key (N) values: numbers of the problem file's [target], [contact] and servo
+    columns : by key path (N) values: numbers of the problem file's [target], [contact] and servo
         (robot.kp, robot.kd, robot.torque_limit, of all joints or of one), of [at_contact], and problem.point;
         names and numbers that make another robot or model are in few combinations. Of one value: for all.
     outputs : names of columns; see docs/sweeps.md. Only what they need is computed: where a million rows are
@@ -74,7 +74,7 @@ def collide_many(
 class Collisions:
     """Evaluates rows of a sweep of collisions; keeps what rows share from one call to the next.
 
-    file, at_contact, outputs : as of `collide_many`.  keys : dotted keys of the columns.  folder : where a
+    file, at_contact, outputs : as of `collide_many`.  keys : key paths of the columns.  folder : where a
     relative path of [at_contact] result begins.
 
     Raises
@@ -96,7 +96,7 @@ class Collisions:
         self.places = {key: sweep_place(file.data, key) for key in keys}
         if len({*self.places.values()}) < len(self.places):
             raise InputError(f"two columns are of one key: {', '.join(keys)}")
-        self._scenes: dict[tuple[Any, ...], Scene] = {}
+        self._alike: dict[tuple[Any, ...], AlikeCollisions] = {}
         self._bodies: dict[str, ContactStates] = {}
 
     # ------------------------------------------------------------ checks
@@ -113,13 +113,13 @@ class Collisions:
                 numbers = values.dtype.kind in "fiu"  # NaN is among their least and their largest
                 for value in (values.min(axis=0), values.max(axis=0)) if numbers else values:
                     self._with({**structure, key: plain_value(value)})
-            scene = self._scene(structure)
+            alike = self._alike_of(structure)
             for place in self.places.values():
                 if place[:2] == ("at_contact", "joints_rad"):
-                    scene.states.check_joint(str(place[2]))
-            for name in scene.section.joints:
-                scene.states.check_joint(name)
-            scene.posture()
+                    alike.states.check_joint(str(place[2]))
+            for name in alike.section.joints:
+                alike.states.check_joint(name)
+            alike.posture()
 
     def _with(self, values: Mapping[str, Any]) -> tuple[ProblemFile, AtContact]:
         """Problem and section with other values by key."""
@@ -148,7 +148,7 @@ class Collisions:
         numbers = {p: np.asarray(columns[key]) for key, p in self.places.items() if role_of(p) != "structure"}
         for structure, rows in self._groups(columns):
             own = {place: x[rows] for place, x in numbers.items()}
-            for name, values in self._scene(structure)(own, len(rows), threads).items():
+            for name, values in self._alike_of(structure)(own, len(rows), threads).items():
                 out[name][rows] = values
         return out
 
@@ -166,9 +166,9 @@ class Collisions:
         for structure, rows in groups.values():
             yield structure, np.array(rows, dtype=np.intp)
 
-    def _scene(self, structure: Mapping[str, Any]) -> Scene:
+    def _alike_of(self, structure: Mapping[str, Any]) -> AlikeCollisions:
         key = tuple(repr(structure[name]) for name in sorted(structure))
-        if key not in self._scenes:
+        if key not in self._alike:
             file, section = self._with(structure)
             states = self._body(file)
             model = collision_model(file.content, states.robot, states.stance, section)
@@ -176,10 +176,10 @@ class Collisions:
             if isinstance(model, SymbolicModel):
                 needed = [name for m in measures.values() for name in m.outputs if name != FREEZE_ERROR]
                 model._check_outputs(tuple(needed), 1)
-            self._scenes[key] = Scene(
+            self._alike[key] = AlikeCollisions(
                 file=file, section=section, model=model, states=states, measures=measures
             )
-        return self._scenes[key]
+        return self._alike[key]
 
     def _body(self, file: ProblemFile) -> ContactStates:
         """Of a robot on its stance: models share it."""

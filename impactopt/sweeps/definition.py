@@ -29,9 +29,9 @@ from impactopt.files.problem_file.toml import (
 from impactopt.sweeps.collision_keys import sweep_place
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.design import Design, Draws, column
-from impactopt.sweeps.dotted import flat, put
 from impactopt.sweeps.figure import Figure
-from impactopt.sweeps.sections import File, Grain, of_other_grains
+from impactopt.sweeps.key_paths import flat, put
+from impactopt.sweeps.sections import CaseKind, SweepFile, of_other_kinds
 from impactopt.sweeps.varied import VariedKeys, telling
 
 __all__ = ["Sweep", "parse_sweep", "read_sweep_file", "sweep_from_data"]
@@ -44,7 +44,7 @@ class Sweep:
     path, text : where it was read, and what it said.  content : the same as tables, but for [figure], which
         no row depends on.
     problem : the problem's file with the sweep's [set], which every case changes.
-    grain : what a case is: "solve" (a whole motion), "strike" or "collision".
+    case_kind : what a case is: "solve" (a whole motion), "strike" or "collision".
     design : the values of the cases.  name : for people.
     seed, start, starts : of a case's solves, as of :func:`impactopt.solve`.
     time_limit [s] : of a case; None for none.  trajectories : whether each case's result is kept whole.
@@ -58,7 +58,7 @@ class Sweep:
     problem: ProblemFile = field(repr=False)
     design: Design = field(repr=False)
     name: str
-    grain: Grain
+    case_kind: CaseKind
     seed: int
     start: str
     starts: int
@@ -81,7 +81,7 @@ def read_sweep_file(
 ) -> Sweep:
     """The sweep of a file, or by name one that comes with the package.
 
-    settings : other values, by dotted keys of the sweep's file, such as "draw.count".
+    settings : other values, by key paths of the sweep's file, such as "draw.count".
 
     Raises
     ------
@@ -121,7 +121,7 @@ def sweep_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[str] = 
 
 
 def _written(data: Mapping[str, Any]) -> str:
-    """As a file. What varies is written by dotted keys: its order counts, and TOML has tables last."""
+    """As a file. What varies is written by key paths: its order counts, and TOML has tables last."""
 
     def with_flat(table: Any, *names: str) -> Any:
         if not isinstance(table, Mapping):  # a mistake, which is told later
@@ -143,14 +143,14 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
             raise InputError(report_mistakes(str(path), lines, mistakes))
 
     try:
-        content = File.model_validate(data)
+        content = SweepFile.model_validate(data)
     except ValidationError as error:
-        mistakes += mistakes_of(error, File)
+        mistakes += mistakes_of(error, SweepFile)
     raise_if_any()
     given = content.sweep
-    mistakes += of_other_grains(content)
+    mistakes += of_other_kinds(content)
     base = read_problem_file(_near(given.problem, path)).changed(dict(flat(content.set)))
-    reader = VariedKeys(base, mistakes, sweep_place if given.grain == "collision" else key_place)
+    reader = VariedKeys(base, mistakes, sweep_place if given.case_kind == "collision" else key_place)
     grid = [a for key, what in flat(content.grid) if (a := reader.axis("grid", key, what)) is not None]
     rows = [a for key, what in flat(content.list) if (a := reader.axis("list", key, what)) is not None]
     reader.check_lengths(rows)
@@ -166,11 +166,11 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     if content.draw:
         draws = Draws(method=content.draw.method, count=content.draw.count, seed=given.seed, over=over)
     design = Design(grid=grid, rows=rows, draws=draws)
-    if given.grain == "collision":
+    if given.case_kind == "collision":
         _check_collisions(path, base, content, design)
     else:
         reader.check_values(grid, rows, over)
-    if content.figure is not None and given.grain == "collision":
+    if content.figure is not None and given.case_kind == "collision":
         known = [*reader.names, *given.outputs]
         for name in content.figure.renamed(reader.full_name).columns:
             if name not in known:
@@ -184,7 +184,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
         problem=base,
         design=design,
         name=given.name or path.stem,
-        grain=given.grain,
+        case_kind=given.case_kind,
         seed=given.seed,
         start=given.start,
         starts=given.starts,
@@ -196,7 +196,7 @@ def _checked(data: dict[str, Any], path: Path, text: str) -> Sweep:
     )
 
 
-def _check_collisions(path: Path, base: ProblemFile, content: File, design: Design) -> None:
+def _check_collisions(path: Path, base: ProblemFile, content: SweepFile, design: Design) -> None:
     """InputError for what collisions of the first values, and of the bounds of numbers, refuse."""
     bounds = {axis.key: telling(axis.values) for axis in design.axes}
     longest = max(map(len, bounds.values()), default=1)

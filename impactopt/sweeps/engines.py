@@ -6,9 +6,9 @@ import signal
 from collections.abc import Generator, Iterable, Iterator
 
 from impactopt.simulation.workers import Died, each_on_workers
-from impactopt.sweeps.alarm import RANG
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.units import Found, Unit, Work, failed_columns
+from impactopt.sweeps.watchdog import ENDED_BY_WATCHDOG
 
 __all__ = ["TRIES", "on_processes"]
 
@@ -34,7 +34,7 @@ def on_processes(
         work,
         numbered(),
         workers=workers,
-        again=lambda died: died.code != RANG and died.tries < TRIES,
+        again=lambda died: died.code != ENDED_BY_WATCHDOG and died.tries < TRIES,
     )
     for index, result in found:
         unit = given.pop(index)
@@ -42,7 +42,7 @@ def on_processes(
 
 
 def _lost(work: Work, unit: Unit, died: Died) -> Found:
-    if died.code == RANG:
+    if died.code == ENDED_BY_WATCHDOG:
         columns = failed_columns(
             unit.count, "time_limit", f"it took longer than {work.time_limit:g} s and did not stop by itself"
         )

@@ -15,13 +15,13 @@ from threadpoolctl import threadpool_limits
 from impactopt import __version__
 from impactopt.errors import InputError
 from impactopt.files.output import Record
-from impactopt.sweeps.alarm import Alarm
-from impactopt.sweeps.grains import GRAINS
+from impactopt.sweeps.case_kinds import CASE_KINDS
 from impactopt.sweeps.units import Found, Unit, Work, failed_columns
+from impactopt.sweeps.watchdog import Watchdog
 
 __all__ = ["evaluate"]
 
-_ONE_AT_A_TIME = threading.Lock()  # in a Dask worker of several threads: the alarm is the process's
+_ONE_AT_A_TIME = threading.Lock()  # in a Dask worker of several threads: the watchdog is the process's
 
 
 def evaluate(work: Work, unit: Unit) -> Found:
@@ -40,18 +40,18 @@ def evaluate(work: Work, unit: Unit) -> Found:
 
 
 def _evaluate(work: Work, unit: Unit) -> Found:
-    began, alarm = time.perf_counter(), Alarm(work.time_limit, work.grace)
+    began, watchdog = time.perf_counter(), Watchdog(work.time_limit, work.grace)
     records: Mapping[int, Record] = {}
     try:
-        columns, records = GRAINS[work.grain](work, unit, alarm)
+        columns, records = CASE_KINDS[work.case_kind](work, unit, watchdog)
     except InputError as error:
         columns = failed_columns(unit.count, "refused", str(error))
     except Exception as error:  # of whatever kind: it is this unit's alone
         columns = failed_columns(unit.count, "error", f"{type(error).__name__}: {error}")
     finally:
-        alarm.off()
+        watchdog.off()
         gc.collect()  # a solve leaves cycles, which would make a worker of a long night ever larger
-    if work.grain != "collision":
+    if work.case_kind != "collision":
         columns = {**columns, "seconds": [time.perf_counter() - began]}
     return Found(columns=columns, records=records, peak_mb=_peak_memory())
 

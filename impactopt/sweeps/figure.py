@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from impactopt.files.problem_file.section import Section, optional, required
-from impactopt.sweeps.dotted import flat
+from impactopt.sweeps.key_paths import flat
 
 __all__ = ["Figure"]
 
@@ -27,8 +27,8 @@ class Figure(Section):
     """What a sweep's picture shows; names are the sweep's keys, and columns of its table."""
 
     drawn_as: Literal["heatmap", "lines", "scatter"] = required("what is drawn", "kind")
-    x: str = required("across")
-    y: Names = required("upwards; of lines one or several, each in a panel")
+    x: str = required("column on the horizontal axis")
+    y: Names = required("column on the vertical axis; with lines one or several, each in a panel")
     colour: Names = Field(
         default_factory=list,
         description="of heatmaps one or several, each in a panel; of lines what tells them apart",
@@ -42,12 +42,12 @@ class Figure(Section):
         default_factory=dict, description="of heatmaps: by column the level at which a line is drawn"
     )
     log: list[Literal["x", "y", "colour"]] = Field(
-        default_factory=list, description="what has logarithmic scales"
+        default_factory=list, description="columns with logarithmic scales"
     )
     labels: Texts = Field(
         default_factory=dict, description="by name, or by what a line is called, other words for it"
     )
-    title: str = Field(default="", description="what stands above")
+    title: str = Field(default="", description="title above the picture")
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -17,9 +17,9 @@ from impactopt.sweeps.cluster import connected, on_cluster
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
+from impactopt.sweeps.progress import ProgressCounter, SweepProgress
 from impactopt.sweeps.store import Store
 from impactopt.sweeps.table import Part, merge_kinds, pyarrow, write_table
-from impactopt.sweeps.tally import Progress, Tally
 from impactopt.sweeps.units import Found, Unit, Work
 from impactopt.transcription.transcription import block_functions
 
@@ -27,7 +27,7 @@ __all__ = ["SweepResult", "sweep"]
 
 ACCIDENTS = {"crashed", "error", "time_limit"}  # what another run may do better
 Engine = Generator[tuple[Unit, Found], None, None]
-TOGETHER = {"collision": 16384}  # the most cases in a unit; one of the other grains
+TOGETHER = {"collision": 16384}  # the most cases in a unit; one of the other kinds
 UNITS = 64  # at least, where there are cases for them, so that workers end together
 
 
@@ -69,9 +69,9 @@ def sweep(
     client: Any = None,
     again: bool = False,
     report: Callable[[str], None] | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[SweepProgress], None] | None = None,
 ) -> SweepResult:
-    """Do every case of a sweep and write one table; done again, it goes on where it was ended.
+    """Do every case of a sweep and write one table. If it is called again, it resumes what was not finished.
 
     source : a sweep file, its data as tables, or what :func:`impactopt.sweeps.read_sweep_file` gave.
     out : directory of the results: see `impactopt.sweeps.store`. Every finished case is on disk at once.
@@ -119,50 +119,50 @@ def _run(
     engine: Callable[[Work, Iterator[Unit]], Engine],
     again: bool,
     tell: Callable[[str], None],
-    progress: Callable[[Progress], None] | None,
+    progress: Callable[[SweepProgress], None] | None,
 ) -> SweepResult:
     journal = store.journal
-    together = min(TOGETHER.get(chosen.grain, 1), -(-chosen.design.cases // UNITS))
+    together = min(TOGETHER.get(chosen.case_kind, 1), -(-chosen.design.cases // UNITS))
     if journal.damaged:
         tell(f"{journal.damaged} units in {journal.path} are damaged; they are done again")
-    tally, finished = Tally(chosen.design.cases), set[int]()
+    counter, finished = ProgressCounter(chosen.design.cases), set[int]()
     for entry in journal.read():
         if again and not ACCIDENTS.isdisjoint(entry.columns.get("status", ())):
             continue
         finished.add(entry.unit)
-        tally.add(entry.unit * together, entry.columns, entry.peak_mb)
-    tally.begin()
-    if tally.resumed:
-        tell(f"{tally.resumed} of {tally.cases} cases are there from before")
+        counter.add(entry.unit * together, entry.columns, entry.peak_mb)
+    counter.begin()
+    if counter.resumed:
+        tell(f"{counter.resumed} of {counter.cases} cases are there from before")
     work = _work(chosen)
-    if tally.done < tally.cases:
+    if counter.done < counter.cases:
         _compile(chosen, problem, work, tell)
     left = _units(chosen, together, finished)
     with contextlib.closing(engine(work, left)) as found:
         try:
             for unit, result in found:
                 store.keep(unit.index, result)
-                tally.add(unit.first, result.columns, result.peak_mb)
+                counter.add(unit.first, result.columns, result.peak_mb)
                 if progress is not None:
-                    progress(tally.progress())
+                    progress(counter.progress())
         except KeyboardInterrupt:
             found.close()
-            _write(chosen, problem, store, together, tally)
+            _write(chosen, problem, store, together, counter)
             raise
-    _write(chosen, problem, store, together, tally)
-    seconds = tally.seconds
+    _write(chosen, problem, store, together, counter)
+    seconds = counter.seconds
     return SweepResult(
-        cases=tally.cases,
-        done=tally.done,
-        failed=tally.failed,
-        resumed=tally.resumed,
+        cases=counter.cases,
+        done=counter.done,
+        failed=counter.failed,
+        resumed=counter.resumed,
         seconds=seconds,
-        rate_per_second=(tally.done - tally.resumed) / seconds,
-        peak_worker_mb=tally.peak_mb,
+        rate_per_second=(counter.done - counter.resumed) / seconds,
+        peak_worker_mb=counter.peak_mb,
         table=store.table,
-        best=tally.best,
-        best_case=tally.best_case,
-        reasons=dict(tally.reasons.most_common()),
+        best=counter.best,
+        best_case=counter.best_case,
+        reasons=dict(counter.reasons.most_common()),
     )
 
 
@@ -174,7 +174,7 @@ def _read(source: Sweep | Mapping[str, Any] | str | os.PathLike[str]) -> Sweep:
 
 def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, tell: Callable[[str], None]) -> None:
     """Build functions here, so that it is done once, and said; workers find them on disk."""
-    if chosen.grain == "collision":
+    if chosen.case_kind == "collision":
         tell("building the collision (compiles for a minute the first time)")
         evaluate(work, Unit(index=0, first=0, count=1, columns=chosen.design.columns(0, 1)))
     else:
@@ -185,7 +185,7 @@ def _work(chosen: Sweep) -> Work:
     return Work(
         data=chosen.problem.data,
         path=chosen.problem.path.resolve(),
-        grain=chosen.grain,
+        case_kind=chosen.case_kind,
         seed=chosen.seed,
         start=chosen.start,
         starts=chosen.starts,
@@ -207,7 +207,9 @@ def _units(chosen: Sweep, together: int, finished: set[int]) -> Iterator[Unit]:
             yield Unit(index=index, first=first, count=last - first, columns=columns)
 
 
-def _write(chosen: Sweep, problem: ImpactProblem, store: Store, together: int, tally: Tally) -> None:
+def _write(
+    chosen: Sweep, problem: ImpactProblem, store: Store, together: int, counter: ProgressCounter
+) -> None:
     """The table of all that is finished."""
 
     def parts() -> Iterator[Part]:
@@ -221,16 +223,16 @@ def _write(chosen: Sweep, problem: ImpactProblem, store: Store, together: int, t
         merge_kinds(kinds, {axis.key: axis.values})
     metadata = {
         "name": chosen.name,
-        "grain": chosen.grain,
-        "cases": str(tally.cases),
-        "done": str(tally.done),
+        "case_kind": chosen.case_kind,
+        "cases": str(counter.cases),
+        "done": str(counter.done),
         "sweep_hash": chosen.hash,
         "problem_hash": problem.hash,
         "versions": json.dumps(versions()),
         "sweep": chosen.text,
         "problem": chosen.problem.text,
     }
-    write_table(store.table, parts(), {**kinds, **tally.kinds}, metadata)
+    write_table(store.table, parts(), {**kinds, **counter.kinds}, metadata)
 
 
 def _cores() -> int:

@@ -11,9 +11,9 @@ from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import Positive
 from impactopt.sweeps.figure import Figure
 
-__all__ = ["File", "Grain", "SpanSection", "of_other_grains"]
+__all__ = ["CaseKind", "SpanSection", "SweepFile", "of_other_kinds"]
 
-Grain = Literal["solve", "strike", "collision"]
+CaseKind = Literal["solve", "strike", "collision"]
 AtLeastOne = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0)]
 
@@ -23,15 +23,21 @@ class SweepSection(Section):
 
     problem: str = required("a problem's name, or a file beside this one")
     name: str = Field(default="", description="what reports call the sweep")
-    grain: Grain = Field(default="solve", description="a whole motion, the blow alone, or one collision")
-    seed: Seed = Field(default=0, description="of the draws, and of solves from several starts")
-    start: Literal["reach", "strike"] = Field(default="reach", description="of solves: where they start from")
-    starts: AtLeastOne = Field(default=1, description="of solves and strikes: so many, the best is kept")
-    time_limit: Positive = optional("of the solver in each case [s]", "time_limit_s")
+    case_kind: CaseKind = Field(
+        default="solve", description="a whole motion, the blow alone, or one collision"
+    )
+    seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")
+    start: Literal["reach", "strike"] = Field(
+        default="reach", description="what a solve starts from: a plain reach, or the strike alone"
+    )
+    starts: AtLeastOne = Field(
+        default=1, description="starts of each solve or strike, of which the best is kept"
+    )
+    time_limit: Positive = optional("longest time of the solver in each case [s]", "time_limit_s")
     trajectories: bool = Field(default=False, description="keep the result of each case whole")
     outputs: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         default=("impulse_Ns", "peak_force_N", "freeze_error_pct"),
-        description="of collisions: the columns of the table",
+        description="columns of the table, of collisions",
     )
 
 
@@ -40,36 +46,42 @@ class SpanSection(Section):
 
     first: float = required("the first", "from")
     last: float = required("the last, included", "to")
-    count: AtLeastOne | None = optional("so many; not of those that are drawn")
-    scale: Literal["linear", "log"] = Field(default="linear", description="equal steps, or equal factors")
+    count: AtLeastOne | None = optional("how many; left out where they are drawn")
+    scale: Literal["linear", "log"] = Field(
+        default="linear", description="equal steps (linear) or equal factors (log)"
+    )
 
 
 class DrawSection(Section):
     """Points drawn over ranges."""
 
-    method: Literal["random", "sobol", "latin hypercube"] = Field(default="sobol", description="how")
-    count: AtLeastOne = required("so many")
-    over: dict[str, Any] = required("by key, a range or a list to choose from")
+    method: Literal["random", "sobol", "latin hypercube"] = Field(
+        default="sobol", description="how points are drawn"
+    )
+    count: AtLeastOne = required("how many points")
+    over: dict[str, Any] = required("by key path, a range or a list to choose from")
 
 
-class File(Section):
+class SweepFile(Section):
     """A sweep file; keys below [set], [grid], [list] and [draw.over] are the problem file's."""
 
     sweep: SweepSection
-    at_contact: dict[str, Any] = Field(
-        default_factory=dict, description="of collisions: the state at contact"
+    at_contact: dict[str, Any] = Field(default_factory=dict, description="state at contact, of collisions")
+    set: dict[str, Any] = Field(default_factory=dict, description="values that are the same in every case")
+    grid: dict[str, Any] = Field(
+        default_factory=dict, description="values of which every combination is a case"
     )
-    set: dict[str, Any] = Field(default_factory=dict, description="the same in every case")
-    grid: dict[str, Any] = Field(default_factory=dict, description="every combination")
-    list: dict[str, Any] = Field(default_factory=dict, description="read side by side")
+    list: dict[str, Any] = Field(
+        default_factory=dict, description="values of which those at the same place of each list are a case"
+    )
     draw: DrawSection = optional("what is drawn")
     figure: Figure | None = optional("the picture of the table")
 
 
-def of_other_grains(content: File) -> list[Mistake]:
-    """What the file says and the sweep's grain has no use for."""
+def of_other_kinds(content: SweepFile) -> list[Mistake]:
+    """What the file says and the sweep's kind of case has no use for."""
     given, found = content.sweep, list[Mistake]()
-    collisions = given.grain == "collision"
+    collisions = given.case_kind == "collision"
     for name in sorted(given.model_fields_set):
         key = SweepSection.model_fields[name].alias or name
         if collisions and name in ("start", "starts", "time_limit", "trajectories"):
@@ -78,5 +90,5 @@ def of_other_grains(content: File) -> list[Mistake]:
             text = "of collisions only; all numbers of a solve are kept"
             found.append(Mistake(place=("sweep", key), sections=1, text=text))
     if content.at_contact and not collisions:
-        found.append(Mistake(place=("at_contact",), sections=1, text='of grain = "collision" only'))
+        found.append(Mistake(place=("at_contact",), sections=1, text='of case_kind = "collision" only'))
     return found

@@ -25,14 +25,14 @@ class Work:
     """What all units of a sweep share.
 
     data, path : of the problem's file with the sweep's [set].  folder : of the sweep's file.
-    grain, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
+    case_kind, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
     grace [s] : after the time limit, until the worker is killed.
     version : of impactopt, which workers have to have too.
     """
 
     data: Mapping[str, Any]
     path: Path
-    grain: str
+    case_kind: str
     seed: int = 0
     start: str = "reach"
     starts: int = 1

@@ -54,8 +54,8 @@ def sizes(c: StanceCoordinates, target: Target, block: str) -> dict[str, int]:
             "penetration": 1,
             "separation": 1,
             "speed": 1,
-            "event": int(bool(target.events)),
-            "lasting": int(bool(target.events)),
+            "event": int(bool(target.guards)),
+            "lasting": int(bool(target.guards)),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
         "join": {"travel": 1},
@@ -203,7 +203,7 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -
     state, slope = ca.SX.sym("state", n), ca.SX.sym("slope", n)
     x, rate_x, x1, rate_p = (ca.SX.sym(s) for s in ("x", "rate_x", "x1", "rate_p"))
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("n", 3)
-    restituting, phases = ca.SX.sym("restituting"), range(len(target.phases) if target.events else 0)
+    restituting, phases = ca.SX.sym("restituting"), range(len(target.phases) if target.guards else 0)
     within, shortest = ca.SX.sym("within", len(phases)), ca.SX.sym("shortest", min(len(phases), 1))
     of_law = ca.SX.sym("law", len(law.parameters))
     of_target = ca.SX.sym("target", len(target.parameters))
@@ -219,12 +219,12 @@ def force(c: StanceCoordinates, striker: str, law: ContactLaw, target: Target) -
     def of_phase(parts: list[list[Any]]) -> Any:
         return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
 
-    if target.events:
+    if target.guards:
         speed, moves = of_phase([[v] for v, _ in pieces]), of_phase([rates for _, rates in pieces])
         event = of_phase(
-            [[target.event(state, f, T - shortest, k, numbers)] for k in range(len(target.events))]
+            [[target.guard(state, f, T - shortest, k, numbers)] for k in range(len(target.guards))]
         )
-        lasting = of_phase([target.lasting(state, f, k, numbers) for k in phases])
+        lasting = of_phase([target.invariant(state, f, k, numbers) for k in phases])
     penetration = ca.dot(normal, place - point) - gone
     rate = ca.dot(normal, twist) - speed
     compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
@@ -366,7 +366,7 @@ def builders(
     }
     if c.legs:
         hit["coasting"] = lambda: coasting(c)
-    if target.events:
+    if target.guards:
         hit["join"] = join
     return {
         "node": lambda: node(c),

@@ -87,7 +87,7 @@ class Collision:
         self.legs = add("collision legs", b.nl, **limits.of_legs)
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
-        least = 0.0 if p.target.events or pulls_apart(p.law) or guarded else np.where(last, 0.0, -np.inf)
+        least = 0.0 if p.target.guards or pulls_apart(p.law) or guarded else np.where(last, 0.0, -np.inf)
         # what is driven and rattles is held on to meanwhile: see `rattle`; of no use where forces are wanted
         self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
         if self.holds:
@@ -99,7 +99,7 @@ class Collision:
         self.xt = add("target travel", 1)
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
-        joined = int(bool(p.target.events))
+        joined = int(bool(p.target.guards))
         self.joined = b.layout.add(f"{named}travel in compression", joined, b.ny, labels=c.labels)
         self.joined_x = b.layout.add(f"{named}target travel in compression", joined, 1)
         wanted = int(after is not None)
@@ -129,7 +129,7 @@ class Collision:
         y, u0, ff = self.contact.state.y, self.contact.u0[0], self.contact.feedforward[0]
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
         phases = np.column_stack([np.eye(len(self.end)), self.shortest])
-        within = phases if p.target.events else phases[:, :0]
+        within = phases if p.target.guards else phases[:, :0]
         gains = np.concatenate([r.kp, r.kd, r.torque_limit, b.limits.units])
         coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
         for i, s in enumerate(self.stages):
@@ -155,7 +155,7 @@ class Collision:
         }
         if b.coordinates.legs:
             out["coasting"] = coasting, coasting_p
-        if p.target.events:
+        if p.target.guards:
             out["join"] = self._join(), [np.zeros(0)] * (b.ny + 1)
         return out
 
@@ -215,11 +215,11 @@ class Collision:
         start, size = at["force"]
         part, where = self._b.parts("force"), self.suffix.lstrip(", ")
         target, order = self._b.problem.target, percent("off")
-        if target.events:  # first, as they determine variables of their own
+        if target.guards:  # first, as they determine variables of their own
             names = [*self._b.coordinates.labels, "target"]
             outputs = at["join"][0] + np.arange(self._b.ny + 1)
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
-        ends = [(name, "target", k, "event", order) for k, name in enumerate(target.events)]
+        ends = [(name, "target", k, "event", order) for k, name in enumerate(target.guards)]
         if target.turns:
             still = Measure("m/s", 1.0, "left")
             ends.append(("end of compression", "approach speed", len(ends), "rate", still))
@@ -290,7 +290,7 @@ class Collision:
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
         if i in self.end:
             return
-        if switches(b.problem.law) and target.events:
+        if switches(b.problem.law) and target.guards:
             back = self._restitution(i)
             b.rows.add(
                 term="approach speed",
@@ -302,9 +302,9 @@ class Collision:
                 measure=Measure("m/s", 1.0, "the other way"),
             )
         k, still = self.stages[i].phase, [0.0] * target.n_states
-        if target.lasting(still, 0.0, k):
+        if target.invariant(still, 0.0, k):
             b.rows.add(
-                term=target.events[min(k, len(target.events) - 1)],
+                term=target.guards[min(k, len(target.guards) - 1)],
                 place=place,
                 components=["target"],
                 outputs=first + part["lasting"],
@@ -352,7 +352,7 @@ class Collision:
         self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
         self.p.write(x, found.impulse[:, None])
-        if p.target.events:
+        if p.target.guards:
             share = times[:2, None] / before[2]
             self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
             self.joined_x.write(x, (share * self.xt.read(x)[self.end[:2]]).sum(axis=0))

@@ -141,7 +141,7 @@ class _Again:
             held += [group.index(0) for group in new.T]
             held += [new.after.index(0)] if new.after.count else []
         free = np.setdiff1d(np.arange(program.n), np.concatenate(held))
-        ends = {*self._builder.problem.target.events, "end of compression", "separation"}
+        ends = {*self._builder.problem.target.guards, "end of compression", "separation"}
         equal = program.g_lower == program.g_upper
         rows = np.flatnonzero([e and o.term not in ends for e, o in zip(equal, program.origins, strict=True)])
         self._newton(z, free, rows)

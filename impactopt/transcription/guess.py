@@ -111,7 +111,7 @@ def parting(law: ContactLaw, target: Target, mass: float, fastest: float) -> Par
     factors = [10.0**n for k in DECADES for n in (-k, k)] if "stiffness" in numbers else []
     other = (numbers["stiffness"] * factor for factor in factors)
     return Parting(
-        event=target.events[-1],
+        event=target.guards[-1],
         time=float(time[-1]),
         needed=next((v for v in faster if whole(law, v)), None),
         stiffness=next((k for k in other if whole(type(law)(**{**numbers, "stiffness": k}), fastest)), None),
@@ -125,14 +125,14 @@ def blow(
 
     A target with events is met as fast, or as slowly, as it takes for all of them to happen.
     """
-    for k in range(2 * TRIES if target.events else 1):
+    for k in range(2 * TRIES if target.guards else 1):
         at = speed * FASTER ** ((k + 1) // 2 * (1 if k % 2 else -1))
         time, rows = _histories(law, target, mass, at)
         ends = _phases(time, rows, target)
         if ends is not None:
             break
     if ends is None:  # somewhere, where the solver has to mend it
-        ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.events else [0.0, 0.5, 1.0])
+        ends = time[-1] * np.array([0.0, 0.4, 0.5, 1.0] if target.guards else [0.0, 0.5, 1.0])
     times = ends[phase] + place * np.diff(ends)[phase]
 
     def sample(values: Array) -> Array:
@@ -210,9 +210,9 @@ def _phases(time: Array, rows: Array, target: Target) -> Array | None:
         if not moves.size:
             return None
         ends = [0.0, max(time[moves[0] - 1], AT_ONCE), time[moves[-1]], time[-1]]
-    elif target.events:
+    elif target.guards:
         after = [
-            k for k in range(deepest) if float(target.event(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
+            k for k in range(deepest) if float(target.guard(rows[3:-1, k], rows[-1, k], time[k], 0)) >= 0
         ]
         if not after:
             return None

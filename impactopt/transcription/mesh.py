@@ -70,7 +70,7 @@ def contact_elements(problem: ImpactProblem) -> Elements:
     Where an event may come at once, the phase before it is one element.
     """
     target, (first, last) = problem.target, problem.collision_elements
-    if target.events:
+    if target.guards:
         first, last = halved((first, last))
     before = [first] * (len(target.phases) - 1)
     if target.at_once:

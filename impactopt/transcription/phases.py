@@ -19,7 +19,7 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     target, shortest = problem.target, problem.contact_duration[0]
     if not shortest:  # no bound: far below what a blow takes, as rows are over these times
         shortest = min(OF_NATURAL * natural, LEAST)
-    shares = [SHARE if target.events else 1.0] * (len(target.phases) - 1) + [1.0]
+    shares = [SHARE if target.guards else 1.0] * (len(target.phases) - 1) + [1.0]
     if target.at_once:
         shares[0] = AT_ONCE
     return [share * shortest for share in shares]

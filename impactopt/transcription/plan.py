@@ -113,8 +113,8 @@ class Plan:
     there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
     through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
     [N s] to the target. scenarios: what is predicted of other targets, in the problem's order; a missing one
-    is not hit, so it is not among them. brake, brake_wrench: as follow, after a blow that met nothing; None
-    if the problem does not ask for it.
+    is not hit, so it is not among them. brake, brake_wrench: the abort motion, as follow, for a blow that
+    hits nothing; None if the problem does not ask for it.
     """
 
     problem: ImpactProblem
@@ -168,7 +168,7 @@ class Plan:
 
         time (k,) [s] : since the motion's start.
         phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
-        then rest; ``missed``: the brake instead.
+        then rest; ``missed``: the abort motion instead.
         """
         ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
         if phase == 1:
@@ -185,7 +185,7 @@ class Plan:
 
     def way(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
         """Spline, start [s], nodes and sole wrenches there of the swing (phase 0) or the follow-through (2);
-        ``missed``: of the brake.
+        ``missed``: of the abort motion.
         """
         if phase == 0:
             return self.swing, 0.0, self.swing_nodes, self.swing_wrench
@@ -202,8 +202,7 @@ class Plan:
     def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
 
-        missed : the one that a robot goes on with which has felt nothing: the same until its contact_end, and
-        then the brake.
+        missed : the reference of a robot that hits nothing: the same until it notices, then the abort motion.
 
         Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
         dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.

@@ -19,10 +19,10 @@ from support.small_plans import arm_problem
 
 from impactopt import (
     SDC,
-    Conditions,
     FreeMass,
     InputError,
     KelvinVoigt,
+    Perturbation,
     Robot,
     Tool,
     load_robot,
@@ -193,13 +193,13 @@ def test_tools_that_are_no_bodies(inertia: list[float], head: list[float]) -> No
 @pytest.mark.parametrize("name", ["mass", "payload", "distance", "missing", "delay"])
 @pytest.mark.parametrize("value", ["x", None, [1.0, 2.0], np.nan, 1e300])
 def test_conditions_are_numbers(name: str, value: Any) -> None:
-    with pytest.raises(InputError, match=f"conditions: {name}"):
-        Conditions(**{name: value})
+    with pytest.raises(InputError, match=f"perturbation: {name}"):
+        Perturbation(**{name: value})
 
 
 def test_a_payload_that_no_engine_takes() -> None:
     with pytest.raises(InputError, match="payload is 1e-12"):
-        Conditions(payload=1e-12)
+        Perturbation(payload=1e-12)
 
 
 @pytest.mark.parametrize("plan", [solve, optimize_strike])

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from support import small_robots
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
 from impactopt.contact import (
     Board,
     ContactLaw,
@@ -77,7 +77,7 @@ def test_steps_in_numpy_are_those_in_c(contact: str, monkeypatch: pytest.MonkeyP
     variants: list[dict[str, Any]] = [
         {},
         {"freezes": 2},
-        {"terms": Terms.paper(friction=True), "friction": FRICTION},
+        {"effects": Effects.paper(friction=True), "friction": FRICTION},
     ]
     models = [arm(contact, **options) for options in variants]
     given = [situation(seed) for seed in range(len(models))]

@@ -13,7 +13,7 @@ from support.frozen_by_scipy import FrozenCollision
 from support.native_cases import ROBOTS, X, robot_named, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, JointFriction, Terms
+from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.collision.contact_slopes import law_is_linear
 from impactopt.collision.dense_step import Contact
 from impactopt.collision.graph import collision_graph
@@ -55,11 +55,11 @@ MODELS: dict[str, dict[str, Any]] = {
     "matrices of gains": {"kp": 10 * GAINS, "kd": GAINS},
     "drag": {"target": Dragged(mass=1.0)},
     "all of them": {"law": CUBIC, "target": Dragged(mass=1.0), "kp": 10 * GAINS, "kd": GAINS},
-    "joints that slide": {"law": HUNT, "terms": Terms(friction=True), "friction": FRICTION},
+    "joints that slide": {"law": HUNT, "effects": Effects(friction=True), "friction": FRICTION},
     "a nail": {
         "law": HUNT,
         "target": Nail(mass=0.2, resistance=80.0, hardening=1e4),
-        "terms": Terms(feedforward=False),
+        "effects": Effects(feedforward=False),
         "kp": 10.0,
         "kd": 1.0,
     },
@@ -72,7 +72,7 @@ def case(name: str, tolerance: float = 1e-7) -> tuple[SDC, list[Any]]:
     given = {"robot": robot_named("arm"), "striker": ROBOTS["arm"][1], "normal": X, "law": SPRING}
     model = SDC(**{**given, "target": MASS, "tolerance": tolerance, "accuracy": None, **MODELS[name]})
     values = situation("arm", model)
-    first = 3 if model.terms.feedforward else 2
+    first = 3 if model.effects.feedforward else 2
     names = [*model.settings]
     if "reference" in names:
         values[first + names.index("reference")] = 0.0 * model.settings["reference"]
@@ -80,7 +80,7 @@ def case(name: str, tolerance: float = 1e-7) -> tuple[SDC, list[Any]]:
 
 
 def settings_of(model: SDC, values: list[Any]) -> tuple[Any, dict[str, Any]]:
-    first = 3 if model.terms.feedforward else 2
+    first = 3 if model.effects.feedforward else 2
     return (values[2] if first == 3 else None), dict(zip(model.settings, values[first:], strict=True))
 
 

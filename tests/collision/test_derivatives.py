@@ -12,7 +12,7 @@ from support.implicit_cases import gradient, implicit
 from support.native_cases import FRICTION, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.contact import FreeMass, SpringDamper
 from impactopt.errors import InputError
 from impactopt.robots.arms import planar_arm
@@ -36,7 +36,7 @@ LEAST = {
 CASES: dict[str, tuple[str, dict[str, Any], tuple[str, ...]]] = {
     "tangents": ("arm", {}, ("impulse", "torque", "velocity", "separated")),
     "an adjoint": ("arm", {}, ("impulse",)),
-    "friction": ("arm", {"terms": Terms(friction=True), "friction": FRICTION}, ("impulse", "duration")),
+    "friction": ("arm", {"effects": Effects(friction=True), "friction": FRICTION}, ("impulse", "duration")),
     "three freezes": ("arm", {"freezes": 3}, ("impulse", "demand")),
     "Runge-Kutta": ("arm", {"method": "rk4", "step": 1e-4}, ("impulse", "configuration")),
     "a point mass": ("arm", {"kind": VirtualMass}, ("impulse", "force")),

@@ -13,7 +13,7 @@ from support.exact_reference import random_case, robot_named
 from support.frozen_cases import two_masses
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
 from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
 from impactopt.collision.graph import collision_graph
 from impactopt.collision.implicit import STAGES, gamma, polynomials
@@ -39,9 +39,9 @@ BOARD = Board(mass=0.5, stiffness=3e4, breaking_force=150.0, damping=20.0)
 FRICTION = JointFriction(viscous=1.0, coulomb=2.0, transition=0.1)
 MODELS: dict[str, dict[str, Any]] = {
     "mass": {"law": LAW, "target": TARGET},
-    "nail": {"law": LAW, "target": NAIL, "terms": Terms(jdot=False)},
+    "nail": {"law": LAW, "target": NAIL, "effects": Effects(jdot=False)},
     "board": {"law": KelvinVoigt(stiffness=2e4, damping=100.0), "target": BOARD},
-    "wall": {"law": LAW, "target": RigidWall(), "terms": Terms(friction=True), "friction": FRICTION},
+    "wall": {"law": LAW, "target": RigidWall(), "effects": Effects(friction=True), "friction": FRICTION},
 }
 
 
@@ -212,7 +212,7 @@ def test_two_masses_in_closed_form() -> None:
     options: dict[str, Any] = {"striker": "tip", "normal": X, "law": LAW, "target": TARGET}
     robot = small_robots.slider(mass)
     for model in (
-        SDC(robot=robot, **options, terms=Terms.none(), kd=0.0, tolerance=1e-12),
+        SDC(robot=robot, **options, effects=Effects.none(), kd=0.0, tolerance=1e-12),
         VirtualMass(robot=robot, **options, tolerance=1e-12),
     ):
         found = model.collide([0.1], [speed], [0.0])

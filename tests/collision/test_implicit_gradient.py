@@ -15,7 +15,7 @@ from support.implicit_cases import exact, gradient, implicit
 from support.native_cases import FRICTION, LAW, TARGET, X, call, inputs, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.contact import Board, KelvinVoigt, Nail, RigidWall
 
 pytestmark = [
@@ -69,15 +69,15 @@ def with_values(model: Any, values: list[Any], **others: Any) -> list[Any]:
 
 # ------------------------------------------------------------ against exact collisions
 # servos that push on would not let go of a wall, nor of a nail
-SOFT = {"kp": 10.0, "kd": 1.0, "terms": Terms(feedforward=False)}
+SOFT = {"kp": 10.0, "kd": 1.0, "effects": Effects(feedforward=False)}
 WALL = {"target": RigidWall(), "law": KelvinVoigt(stiffness=1e4, damping=50.0), **SOFT}
 ARMS = {
     "all terms but friction": (("impulse", "duration", "energy"), {}),
-    "nothing but damping": (("peak_force",), {"terms": Terms.none()}),
+    "nothing but damping": (("peak_force",), {"effects": Effects.none()}),
     "a nail": (("energy",), {"target": Nail(mass=0.2, resistance=80.0, hardening=1e4), **SOFT}),
     "a board that breaks": (
         ("energy",),
-        {"target": Board(mass=0.5, stiffness=2e4, breaking_force=60.0), "terms": Terms(bias=False)},
+        {"target": Board(mass=0.5, stiffness=2e4, breaking_force=60.0), "effects": Effects(bias=False)},
     ),
     "a wall": (("peak_force", "duration"), WALL),
     "a wall, to the horizon": (("impulse", "peak_force"), {**WALL, "horizon": 0.003}),
@@ -102,7 +102,7 @@ LIMIT = np.array([30.0, 36.0, 8.0, 3.5])
 def sliding(**options: Any) -> tuple[Any, list[Any]]:
     """An arm with joints that saturate and slide on the way."""
     friction = dataclasses.replace(FRICTION, transition=0.33)
-    model = implicit("arm", terms=Terms(friction=True), friction=friction, **options)
+    model = implicit("arm", effects=Effects(friction=True), friction=friction, **options)
     values = situation("arm", model)
     return model, with_values(model, values, feedforward=np.zeros(4), torque_limit=LIMIT)
 
@@ -143,7 +143,7 @@ def test_a_standins_gradient_is_that_of_differences():
 
 
 def test_a_stiff_servos_gradient_is_that_of_differences():
-    model = implicit("arm", kp=1e5, kd=2e3, terms=Terms(saturation=False))
+    model = implicit("arm", kp=1e5, kd=2e3, effects=Effects(saturation=False))
     values = situation("arm", model)
     outputs = ("impulse", "peak_force")
     assert_slopes(stepped(model, outputs, values), outputs, model, values, rel=1e-8)
@@ -159,7 +159,7 @@ def test_the_default_tolerance_is_enough_for_a_gradient():
 # ------------------------------------------------------------ against closed forms
 def test_a_sliders_gradient_is_that_of_two_masses():
     robot = small_robots.slider(3.0)
-    model = SDC(robot=robot, striker="tip", normal=X, law=LAW, target=TARGET, terms=Terms.none())
+    model = SDC(robot=robot, striker="tip", normal=X, law=LAW, target=TARGET, effects=Effects.none())
     assert model.stepping == "implicit"
     values = inputs(model, [0.1], [1.2], [0.0])
     impulse, _ = two_masses(3.0, TARGET.mass, LAW.stiffness, LAW.damping, 1.2)

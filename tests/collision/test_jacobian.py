@@ -17,7 +17,7 @@ from support.implicit_cases import exact, gradient, implicit
 from support.native_cases import FRICTION, call, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import Terms, VirtualMass
+from impactopt.collision import Effects, VirtualMass
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.contact import Board, KelvinVoigt, Nail, RigidWall
 from impactopt.errors import InputError
@@ -29,7 +29,7 @@ pytestmark = [
 ]
 
 SHORT: dict[str, Any] = {"step": 2e-3, "horizon": 0.03}
-SLIDING = {"terms": Terms(friction=True), "friction": dataclasses.replace(FRICTION, transition=0.33)}
+SLIDING = {"effects": Effects(friction=True), "friction": dataclasses.replace(FRICTION, transition=0.33)}
 
 
 def differentiable(model: Any) -> tuple[str, ...]:
@@ -96,7 +96,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "an arm, a board": ("arm", {"target": Board(mass=0.5, stiffness=2e4, breaking_force=60.0), "step": 1e-3}),
     "an arm, a wall": ("arm", {"target": RigidWall(), "law": KelvinVoigt(stiffness=1e4, damping=50.0)}),
     "a biped that slides": ("biped", SLIDING),
-    "a biped without drifts": ("biped", {"terms": Terms(bias=False, jdot=False)}),
+    "a biped without drifts": ("biped", {"effects": Effects(bias=False, jdot=False)}),
 }
 
 

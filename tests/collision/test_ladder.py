@@ -17,7 +17,7 @@ from support.frozen_cases import (
     two_masses,
 )
 
-from impactopt.collision import SDC, Collision, Terms, VirtualMass, effective_mass
+from impactopt.collision import SDC, Collision, Effects, VirtualMass, effective_mass
 from impactopt.contact import FreeMass, HuntCrossley, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import BothSoles
@@ -38,7 +38,7 @@ def models(robot, **options):
     steps = {"tolerance": 1e-10, "step": 2.5e-4}
     return {
         "point": VirtualMass(**given, **steps),
-        "paper": SDC(**given, **steps, terms=Terms.paper()),
+        "paper": SDC(**given, **steps, effects=Effects.paper()),
         "repaired": SDC(**given, **steps),
         "frozen again": SDC(**given, **steps, freezes=4),
         "full": FullDynamics(**given),
@@ -115,8 +115,10 @@ def test_freezes_converge_to_full_dynamics_with_their_square(name, seed, speed):
 def test_histories_of_several_freezes_go_on_from_one_to_the_next():
     robot = robot_named("talos")
     q, v, torque = situation(robot, seed=7, speed=3.0)
-    all_terms = Terms(friction=True)
-    sdc = dataclasses.replace(models(robot)["frozen again"], terms=all_terms, friction=FRICTION, horizon=0.1)
+    all_effects = Effects(friction=True)
+    sdc = dataclasses.replace(
+        models(robot)["frozen again"], effects=all_effects, friction=FRICTION, horizon=0.1
+    )
     result = sdc.collide(q, v, torque)
     assert result.time[0] == 0.0 and result.time[-1] == pytest.approx(result.duration, abs=1e-15)
     assert (np.diff(result.time) > 0).all() and np.diff(result.time).max() <= sdc.step_length * (1 + 1e-9)

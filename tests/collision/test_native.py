@@ -27,7 +27,7 @@ from support.native_cases import (
 
 from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.collision.graph import collision_graph, gradient_graph
 from impactopt.collision.native import native_gradient
 from impactopt.contact import (
@@ -71,22 +71,22 @@ def assert_same(model: Any, values: list[Any], outputs: tuple[str, ...], every: 
 # ------------------------------------------------------------ against the graphs
 GAINS = 0.5 * np.ones((4, 4)) + np.diag([20.0, 30.0, 20.0, 10.0])
 ARMS = {
-    "friction": {"terms": Terms(friction=True), "friction": FRICTION},
-    "friction only": {"terms": dataclasses.replace(Terms.none(), friction=True), "friction": FRICTION},
-    "nothing but damping": {"terms": Terms.none()},
+    "friction": {"effects": Effects(friction=True), "friction": FRICTION},
+    "friction only": {"effects": dataclasses.replace(Effects.none(), friction=True), "friction": FRICTION},
+    "nothing but damping": {"effects": Effects.none()},
     "matrices of gains": {"kp": 10 * GAINS, "kd": GAINS},
-    "a nail": {"target": Nail(mass=0.2, resistance=80.0, hardening=1e4), "terms": Terms(bias=False)},
+    "a nail": {"target": Nail(mass=0.2, resistance=80.0, hardening=1e4), "effects": Effects(bias=False)},
     "a board, hardening": {
         "target": Board(mass=0.5, stiffness=2e4, breaking_force=60.0),
         "law": HARDENING,
-        "terms": Terms(jdot=False),
+        "effects": Effects(jdot=False),
     },
     "a wall": {"target": RigidWall(), "law": KelvinVoigt(stiffness=1e4, damping=50.0)},
     "a rounded hand": {"law": HuntCrossley(stiffness=1e6, dissipation=0.3)},
     "freezes": {"freezes": 3, "target": Nail(mass=0.2, resistance=80.0)},
     "freezes and friction": {
         "freezes": 2,
-        "terms": Terms(friction=True),
+        "effects": Effects(friction=True),
         "friction": FRICTION,
     },
 }
@@ -102,7 +102,7 @@ def test_an_arm_in_c_is_the_graph(name):
 
 def test_joints_that_saturate_and_slide_on_the_way_are_those_of_the_graph():
     friction = dataclasses.replace(FRICTION, transition=0.33)
-    model = sdc("arm", terms=Terms(friction=True), friction=friction)
+    model = sdc("arm", effects=Effects(friction=True), friction=friction)
     values = situation("arm", model)
     names = ["q", "v", "feedforward", *model.settings]
     values[names.index("feedforward")] = np.zeros(4)
@@ -123,7 +123,11 @@ def test_a_point_mass_in_c_is_the_graph():
     "options",
     [
         {},
-        {"stance": OneSole("left", base_mass=1e4, base_inertia=1e4), "method": "rk4", "terms": Terms.paper()},
+        {
+            "stance": OneSole("left", base_mass=1e4, base_inertia=1e4),
+            "method": "rk4",
+            "effects": Effects.paper(),
+        },
         {"horizon": 0.004, "freezes": 1},
     ],
     ids=["both soles", "one sole on a virtual base", "not separated"],
@@ -147,9 +151,9 @@ def gradient(model: Any, output: str) -> Any:
 
 
 GRADIENTS = {
-    "all terms": ("impulse", {"terms": Terms(friction=True), "friction": FRICTION}),
-    "nothing but damping": ("impulse", {"terms": Terms.none()}),
-    "matrices of gains": ("impulse", {"kp": 10 * GAINS, "kd": GAINS, "terms": Terms(jdot=False)}),
+    "all terms": ("impulse", {"effects": Effects(friction=True), "friction": FRICTION}),
+    "nothing but damping": ("impulse", {"effects": Effects.none()}),
+    "matrices of gains": ("impulse", {"kp": 10 * GAINS, "kd": GAINS, "effects": Effects(jdot=False)}),
     "a nail": ("energy", {"target": Nail(mass=0.2, resistance=80.0, hardening=1e4)}),
     "a wall, to the horizon": (
         "peak_force",
@@ -157,7 +161,7 @@ GRADIENTS = {
     ),
     "longer steps": (
         "energy",
-        {"step": 5e-4, "terms": Terms(friction=True, bias=False), "friction": FRICTION},
+        {"step": 5e-4, "effects": Effects(friction=True, bias=False), "friction": FRICTION},
     ),
     "a rounded hand": ("peak_force", {"law": HuntCrossley(stiffness=1e6, dissipation=0.3)}),
 }
@@ -214,7 +218,7 @@ def test_a_gradient_says_where_it_has_no_numbers():
 # ------------------------------------------------------------ against closed forms
 def test_a_slider_in_c_is_two_masses():
     robot = small_robots.slider(3.0)
-    options = {"law": LAW, "target": TARGET, "terms": Terms.none(), "tolerance": 1e-11}
+    options = {"law": LAW, "target": TARGET, "effects": Effects.none(), "tolerance": 1e-11}
     model = SDC(robot=robot, striker="tip", normal=X, **options)
     found = call(native(model, ("impulse", "duration")), inputs(model, [0.1], [1.2], [0.0]))
     impulse, duration = two_masses(3.0, TARGET.mass, LAW.stiffness, LAW.damping, 1.2)

@@ -27,7 +27,7 @@ from support.frozen_cases import (
     with_heavy_feet,
 )
 
-from impactopt.collision import SDC, Terms, effective_mass
+from impactopt.collision import SDC, Effects, effective_mass
 from impactopt.contact import ContactLaw, FreeMass, SpringDamper, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
@@ -58,13 +58,13 @@ def when_met(sdc, q, v, *, mass=None):
 def reference(sdc, q, v0, feedforward=None, *, rtol=1e-11, **changes):
     """The frozen collision by solve_ivp, phase by phase: impulse, duration, number of phases, velocity,
     displacement."""
-    robot, terms = sdc.robot, sdc.terms
+    robot, effects = sdc.robot, sdc.effects
     n, nv = robot.n, robot.nv
     k = Kinematics(robot, q, v0, sdc.held_by.constraint_frames(robot), sdc.striker, np.asarray(sdc.normal))
-    kp = changes.get("kp", robot.kp) * terms.stiffness
+    kp = changes.get("kp", robot.kp) * effects.stiffness
     kd = changes.get("kd", robot.kd)
-    limit = robot.torque_limit if terms.saturation else np.full(n, np.inf)
-    ff = feedforward if terms.feedforward else np.zeros(n)
+    limit = robot.torque_limit if effects.saturation else np.full(n, np.inf)
+    ff = feedforward if effects.feedforward else np.zeros(n)
     stiffness, damping = changes.get("contact_stiffness", LAW.stiffness), LAW.damping
     mass = changes.get("target_mass", TARGET.mass)
     c = len(k.Jc)
@@ -72,9 +72,9 @@ def reference(sdc, q, v0, feedforward=None, *, rtol=1e-11, **changes):
     kkt = np.block([[k.H, -k.Jc.T], [k.Jc, np.diag(compliance)]])
     inverse = np.linalg.inv(kkt)
     met = when_met(sdc, q, v0, mass=mass)
-    gamma = met.gamma if terms.jdot else np.zeros(c)
-    hand_drift = met.hand_drift if terms.jdot else 0.0
-    bias = met.bias if terms.bias else np.zeros(nv)
+    gamma = met.gamma if effects.jdot else np.zeros(c)
+    hand_drift = met.hand_drift if effects.jdot else 0.0
+    bias = met.bias if effects.bias else np.zeros(nv)
     friction = sdc.friction
     viscous, coulomb = friction.arrays(n) if friction else (np.zeros(n), np.zeros(n))
     band = friction.transition if friction else 1.0
@@ -212,12 +212,12 @@ def test_two_free_masses_give_the_papers_table_iii():
 
 
 # ------------------------------------------------------------ independent integration
-ALL = Terms(friction=True)
-PAPER = Terms.paper()
+ALL = Effects(friction=True)
+PAPER = Effects.paper()
 
 
 @pytest.mark.parametrize(
-    "terms",
+    "effects",
     [
         PAPER,
         dataclasses.replace(PAPER, saturation=False),
@@ -227,17 +227,17 @@ PAPER = Terms.paper()
         dataclasses.replace(PAPER, bias=True),
         dataclasses.replace(PAPER, jdot=True),
         dataclasses.replace(ALL, saturation=False),
-        Terms(),
+        Effects(),
         ALL,
     ],
-    ids=lambda terms: "+".join(name for name, on in dataclasses.asdict(terms).items() if on) or "damping",
+    ids=lambda effects: "+".join(name for name, on in dataclasses.asdict(effects).items() if on) or "damping",
 )
-def test_each_term_against_an_independent_integration(terms):
+def test_each_term_against_an_independent_integration(effects):
     robot = robot_named("talos")
-    sdc = make(robot, terms=terms, friction=FRICTION if terms.friction else None)
+    sdc = make(robot, effects=effects, friction=FRICTION if effects.friction else None)
     q, v, torque = situation(robot, seed=1, speed=1.5)
     expected = reference(sdc, q, v, torque)
-    result = sdc.collide(q, v, torque if terms.feedforward else None)
+    result = sdc.collide(q, v, torque if effects.feedforward else None)
     assert result.separated
     assert result.impulse == pytest.approx(expected["impulse"], rel=1e-7)
     assert result.duration == pytest.approx(expected["duration"], rel=1e-6)
@@ -263,7 +263,7 @@ def test_impulse_over_postures_speeds_and_gains(speed, gain, seed):
 def test_infinite_torque_limits_are_no_limits():
     robot, sdc = robot_named("talos"), default_sdc("talos")
     q, v, torque = situation(robot, seed=15, speed=2.0)
-    unlimited = make(robot, terms=Terms(saturation=False)).collide(q, v, torque)
+    unlimited = make(robot, effects=Effects(saturation=False)).collide(q, v, torque)
     result = sdc.collide(q, v, torque, torque_limit=np.inf)
     assert result.impulse == pytest.approx(unlimited.impulse, rel=1e-10)
     assert abs(result.impulse / sdc.collide(q, v, torque).impulse - 1.0) > 1e-5
@@ -370,30 +370,30 @@ def test_a_nonlinear_law_and_target_against_an_independent_integration():
 
 
 # ------------------------------------------------------------ balances
-@pytest.mark.parametrize("terms", [PAPER, Terms(), ALL], ids=["paper", "default", "all"])
-def test_ground_wrench_is_what_the_robots_momentum_needs(terms):
+@pytest.mark.parametrize("effects", [PAPER, Effects(), ALL], ids=["paper", "default", "all"])
+def test_ground_wrench_is_what_the_robots_momentum_needs(effects):
     """d/dt of the centroidal momentum (Pinocchio) = ground + weight + reaction at the hand, at every step."""
     robot = robot_named("talos")
-    sdc = make(robot, terms=terms, friction=FRICTION if terms.friction else None)
+    sdc = make(robot, effects=effects, friction=FRICTION if effects.friction else None)
     q, v, torque = situation(robot, seed=5, speed=1.0)
-    result = sdc.collide(q, v, torque if terms.feedforward else None)
+    result = sdc.collide(q, v, torque if effects.feedforward else None)
     k = Kinematics(robot, q, v, [s.frame for s in robot.soles], "right_hand", X)
     drifts_at = v
-    if terms.bias:
+    if effects.bias:
         k = when_met(sdc, q, v)
         drifts_at = k.velocity
     model, data = robot.model, robot.model.createData()
     viscous, coulomb = FRICTION.arrays(robot.n)
     for i in range(0, len(result.time), 40):
         tau = result.torque[i].copy()
-        if terms.friction:
+        if effects.friction:
             rate = result.joint_velocity[i]
             tau -= viscous * rate + coulomb * np.clip(rate / FRICTION.transition, -1.0, 1.0)
-        push = -k.j * result.force[i] - (k.bias if terms.bias else 0.0)
+        push = -k.j * result.force[i] - (k.bias if effects.bias else 0.0)
         push[6:] += tau
         wrench = result.sole_wrench[i]
         a = np.linalg.solve(k.H, push + k.Jc.T @ wrench.ravel())
-        np.testing.assert_allclose(k.Jc @ a, -k.gamma if terms.jdot else np.zeros(12), atol=1e-8)
+        np.testing.assert_allclose(k.Jc @ a, -k.gamma if effects.jdot else np.zeros(12), atol=1e-8)
         rate = pin.computeCentroidalMomentumTimeVariation(model, data, q, drifts_at, a)
         com = pin.centerOfMass(model, data, q)
         weight = pin.computeTotalMass(model) * model.gravity.linear
@@ -403,7 +403,7 @@ def test_ground_wrench_is_what_the_robots_momentum_needs(terms):
         moment = ground[3:] - np.cross(com, ground[:3]) + np.cross(k.hand_position - com, f_hand)
         np.testing.assert_allclose(force, rate.linear, atol=1e-7)
         np.testing.assert_allclose(moment, rate.angular, atol=1e-7)
-        if terms.bias:
+        if effects.bias:
             of_soles = sum(wrench[:, :3])
             np.testing.assert_allclose(of_soles, ground[:3], atol=1e-8)
         point = np.array([*result.zmp[i], 0.0])
@@ -574,10 +574,10 @@ def test_stable_step_is_where_the_method_turns_unstable():
     q, v, torque = situation(robot, seed=14, speed=0.2)
     kd = np.full(robot.n, 2000.0)
     longest = make(robot).stable_step(q, kd=kd)
-    free = dataclasses.replace(Terms(), saturation=False)
+    free = dataclasses.replace(Effects(), saturation=False)
 
     def final_speed(step):
-        sdc = make(robot, terms=free, step=step, method="rk4", horizon=120 * step)
+        sdc = make(robot, effects=free, step=step, method="rk4", horizon=120 * step)
         return np.abs(np.array(sdc.function(("velocity",), parameters=("kd",))(q, v, 0 * torque, kd))).max()
 
     assert final_speed(0.95 * longest) < 10.0
@@ -599,8 +599,8 @@ def test_stable_step_is_where_the_method_turns_unstable():
         ({"step": 0.0}, r"step"),
         ({"step": 0.5}, r"longer than the horizon"),
         ({"horizon": -0.1}, r"horizon"),
-        ({"terms": Terms(friction=True)}, r"JointFriction"),
-        ({"friction": FRICTION}, r"terms.friction is off"),
+        ({"effects": Effects(friction=True)}, r"JointFriction"),
+        ({"friction": FRICTION}, r"effects.friction is off"),
     ],
 )
 def test_bad_models_are_refused_before_anything_is_built(options, message):

@@ -376,8 +376,12 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
     for kind in (Phase, Scenario, Tool, *described):
         keys = set(kinds[kind].model_fields) - {kinds[kind].choice, *kinds[kind].apart}
         assert {f.name for f in dataclasses.fields(kind)} == keys
-    keys = {*sections.File.model_fields, *sections.Problem.model_fields, *sections.Objective.model_fields}
-    keys |= {*sections.Collision.model_fields, "law", "collision_elements", *kinds[FreeMass].apart}
+    keys = {
+        *sections.File.model_fields,
+        *sections.ProblemSection.model_fields,
+        *sections.ObjectiveSection.model_fields,
+    }
+    keys |= {*sections.CollisionSection.model_fields, "law", "collision_elements", *kinds[FreeMass].apart}
     assert {f.name for f in dataclasses.fields(ImpactProblem)} <= keys
 
 

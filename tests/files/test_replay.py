@@ -19,9 +19,9 @@ from impactopt.cli.validate import validate
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, record_of, save_record
 from impactopt.files.replay import Planned, Replay, load_planned, replay
-from impactopt.pictures.animation import AROUND, FPS, SLOW, _Stage, save_animation, shown_times
+from impactopt.pictures.animation import AROUND, FPS, SLOW, _Drawing, save_animation, shown_times
 from impactopt.planning.solution import Solution
-from impactopt.simulation import Conditions
+from impactopt.simulation import Perturbation
 from impactopt.simulation.result import REPORT
 
 FLAT = REPORT[:13]  # numbers for the whole motion; after them, what is by phase or by sole
@@ -86,7 +86,7 @@ def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
 
 def test_every_condition_is_an_option_with_its_default() -> None:
     options = inspect.signature(validate).parameters
-    for f in dataclasses.fields(Conditions):
+    for f in dataclasses.fields(Perturbation):
         assert options[f.name].default == f.default, f.name
 
 
@@ -149,7 +149,7 @@ def still() -> Replay:
     problem = still_problem()
     solution = still_solution(problem=problem)
     planned = Planned(record=record_of(solution), problem=problem, reference=solution.trajectory)
-    return replay(planned, conditions=Conditions(distance=-0.001), step=5e-4, settle=0.05)
+    return replay(planned, perturbation=Perturbation(distance=-0.001), step=5e-4, settle=0.05)
 
 
 def test_a_replay_takes_the_place_of_an_older_one(still: Replay) -> None:
@@ -160,11 +160,11 @@ def test_a_replay_takes_the_place_of_an_older_one(still: Replay) -> None:
 
 def test_the_animation_draws_the_world_where_the_replay_has_it(still: Replay) -> None:
     problem = still.planned.problem
-    (target,) = _Stage(still).look(0).world
+    (target,) = _Drawing(still).look(0).world
     ahead = np.sort((target - problem.point) @ problem.normal)
     assert ahead == pytest.approx(np.repeat([-0.001, 0.179], 4)), "1 mm nearer, 18 cm deep"
-    gone = dataclasses.replace(still, conditions=Conditions(missing=True))
-    assert _Stage(gone).look(0).world == []
+    gone = dataclasses.replace(still, perturbation=Perturbation(missing=True))
+    assert _Drawing(gone).look(0).world == []
 
 
 def test_the_animation_is_a_gif_with_every_instant(still: Replay, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from impactopt.collision import effective_mass
 from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of
 from impactopt.kinematics.support import zmp
-from impactopt.pictures import PICTURES, ladder, overview
+from impactopt.pictures import PICTURES, hierarchy, overview
 from impactopt.pictures.ellipsoid import effective_masses
 from impactopt.pictures.style import DPI, PAGE, Picture
 from impactopt.planning.solution import Solution
@@ -197,7 +197,7 @@ def test_the_torque_map_is_the_demand_over_the_limit(arm_record: Record) -> None
     assert largest == pytest.approx(np.abs(a["simulated_demand"] / a["torque_limit"]).max(), rel=1e-6)
 
 
-# ---------------------------------------------------------------- the ladder
+# ---------------------------------------------------------------- the hierarchy
 def blow(force: float, end: float) -> Any:
     time = np.linspace(0.0, end, 200)
     return SimpleNamespace(
@@ -207,7 +207,7 @@ def blow(force: float, end: float) -> Any:
 
 def test_the_ladder_holds_each_model_against_the_reference() -> None:
     models = {"coarse": blow(300.0, 0.04), "fine": blow(399.0, 0.05), "full dynamics": blow(400.0, 0.05)}
-    picture = ladder({"one": models, "two": models})
+    picture = hierarchy({"one": models, "two": models})
     assert frowns(picture) == []
     left, right = picture.axes[:2]
     assert len(left.lines) == 3
@@ -221,9 +221,9 @@ def test_the_ladder_holds_each_model_against_the_reference() -> None:
 
 def test_a_ladder_without_its_reference_is_refused() -> None:
     with pytest.raises(InputError, match="needs the model 'full dynamics'"):
-        ladder({"one": {"coarse": blow(300.0, 0.04)}})
+        hierarchy({"one": {"coarse": blow(300.0, 0.04)}})
     with pytest.raises(InputError, match="at most 7 models"):
-        ladder({"one": {**{str(k): blow(1.0, 0.1) for k in range(8)}, "full dynamics": blow(1.0, 0.1)}})
+        hierarchy({"one": {**{str(k): blow(1.0, 0.1) for k in range(8)}, "full dynamics": blow(1.0, 0.1)}})
 
 
 # ---------------------------------------------------------------- of a solution

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from impactopt import Solution, coasting_reference, load_problem, optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Terms
+from impactopt.collision import SDC, Effects
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
@@ -141,7 +141,7 @@ def test_engines_and_batches_agree() -> None:
 def test_who_has_no_reference_says_so() -> None:
     scene: dict[str, Any] = {"robot": robot_named("arm"), "striker": "hand", "normal": X, "law": LAW}
     scene |= {"target": FreeMass(mass=1.0)}
-    assert "reference" not in SDC(**scene, terms=Terms.paper()).settings
+    assert "reference" not in SDC(**scene, effects=Effects.paper()).settings
     assert "reference" in SDC(**scene).settings
     with pytest.raises(InputError, match="reference"):
         SDC(**scene).settings.override({"reference": np.zeros((4, 2))})

@@ -266,7 +266,7 @@ def test_what_determines_no_variables_of_its_own_is_where_and_when(target: Targe
     )
     left = {program.row_name(int(i)).split(",")[0] for i in condenser.rows[condenser.equal]}
     turn = {"end of compression"} if target.turns else set()
-    assert left == {"hit point", "separation", *target.events, *turn}
+    assert left == {"hit point", "separation", *target.guards, *turn}
 
 
 def test_plans_of_an_arm_drive_nails_and_break_boards() -> None:

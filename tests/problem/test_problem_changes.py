@@ -1,4 +1,4 @@
-"""Problem files as data: other values by dotted keys, text and back, and the hash of what came out."""
+"""Problem files as data: other values by key paths, text and back, and the hash of what came out."""
 
 from __future__ import annotations
 

@@ -22,9 +22,16 @@ from impactopt.kinematics.support import margin
 from impactopt.planning.solution import Solution
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
-from impactopt.simulation import Conditions, Scene, Simulation, simulate, simulate_mujoco, simulate_pinocchio
+from impactopt.simulation import (
+    Perturbation,
+    Scene,
+    Simulation,
+    simulate,
+    simulate_mujoco,
+    simulate_pinocchio,
+)
 from impactopt.simulation.mujoco_engine import _Replay
-from impactopt.simulation.mujoco_world import Solver
+from impactopt.simulation.mujoco_world import MujocoOptions
 
 Array = NDArray[np.float64]
 
@@ -91,13 +98,13 @@ def test_an_arm_hits_as_in_pinocchio() -> None:
 # ---- the same robot in both engines
 
 
-def world_of(robot: Robot, **conditions: Any) -> _Replay:
+def world_of(robot: Robot, **perturbation: Any) -> _Replay:
     posture = next(iter(robot.postures.values()))
     soles = tuple(sole.frame for sole in robot.soles)
     striker = next(iter(robot.strikers.values())).model_frame
     still = reference([0.0, 1.0], posture, nv=robot.nv, n=robot.n)
     there = scene(striker, soles=soles, corners=tuple(sole.polygon for sole in robot.soles))
-    return _Replay(robot, still, there, Conditions(**conditions), Solver())
+    return _Replay(robot, still, there, Perturbation(**perturbation), MujocoOptions())
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +220,7 @@ def test_a_robot_falls_when_its_centre_of_mass_is_not_over_its_soles() -> None:
         together = (mass * centre + load * hand) / (mass + load)
         assert (margin(there.polygon, together[None, :2])[0] > 0) == inside
         sim = simulate_mujoco(
-            robot, motion, there, step=5e-4, settle=2.0, conditions=Conditions(payload=load)
+            robot, motion, there, step=5e-4, settle=2.0, perturbation=Perturbation(payload=load)
         )
         assert sim.standing == inside
         if inside:
@@ -227,7 +234,7 @@ def test_a_robot_falls_when_its_centre_of_mass_is_not_over_its_soles() -> None:
 def test_a_summary_of_a_fall_and_a_report() -> None:
     robot = biped()
     motion, there, _ = standing(robot)
-    sim = simulate_mujoco(robot, motion, there, step=1e-3, conditions=Conditions(payload=60.0))
+    sim = simulate_mujoco(robot, motion, there, step=1e-3, perturbation=Perturbation(payload=60.0))
     known = {"torque_limit": robot.torque_limit, "polygon": there.polygon, "planned_impulse": 1.0}
     summary, report = sim.summary(**known), sim.report(**known)
     assert summary["standing"] is False and summary["reason"] == sim.fall
@@ -288,7 +295,7 @@ def test_soles_slide_with_as_much_force_as_friction_gives(blow: tuple[Robot, Any
     slips = []
     for friction in (0.9, 0.02):
         sim = simulate_mujoco(
-            robot, motion, there, step=5e-4, settle=0.0, conditions=Conditions(friction=friction)
+            robot, motion, there, step=5e-4, settle=0.0, perturbation=Perturbation(friction=friction)
         )
         across = np.linalg.norm(sim.sole_ground[:, :, :2], axis=2)
         assert (across <= friction * sim.sole_normal * (1 + 1e-6) + 1e-6).all()
@@ -312,29 +319,29 @@ def test_the_servo_samples_and_holds_and_comes_late() -> None:
             step=step,
             settle=0.0,
             record=1,
-            conditions=Conditions(period=period, delay=delay),
+            perturbation=Perturbation(period=period, delay=delay),
         )
         hold, lag = max(1, round(period / step)), round(delay / step)
         read = np.maximum((np.arange(20) - lag) // hold * hold, 0)  # steps
         np.testing.assert_allclose(sim.demand[:, 0], 1e3 * step * read, atol=1e-9)
 
 
-# ---- conditions
+# ---- perturbations
 
 
 def test_conditions_change_the_target() -> None:
     """Mass, stiffness and damping are factors: the closed form of the changed collision holds."""
-    changed = Conditions(mass=2.0, stiffness=1.0, damping=0.5)
+    changed = Perturbation(mass=2.0, stiffness=1.0, damping=0.5)
 
     def run(*args: Any, **options: Any) -> Simulation:
-        return simulate_mujoco(*args, **options, conditions=changed)
+        return simulate_mujoco(*args, **options, perturbation=changed)
 
     sim, _ = strike(200.0, simulate=run)
     _, exact = strike(100.0, mass=10.0, simulate=simulate_mujoco)
     assert sim.outcome == {"speed_m_s": pytest.approx(sim.impulse / 10.0, rel=1e-9)}
     assert sim.impulse == pytest.approx(exact["impulse"], rel=2e-3)
     stiff, _ = strike(
-        0.0, simulate=lambda *a, **o: simulate_mujoco(*a, **o, conditions=Conditions(stiffness=4.0))
+        0.0, simulate=lambda *a, **o: simulate_mujoco(*a, **o, perturbation=Perturbation(stiffness=4.0))
     )
     soft, exact = strike(0.0, simulate=simulate_mujoco)
     assert stiff.contact_end - stiff.contact_start == pytest.approx(exact["duration"] / 2, abs=2.1e-4)
@@ -342,9 +349,9 @@ def test_conditions_change_the_target() -> None:
 
 
 def test_a_target_that_waits_elsewhere_or_not_at_all() -> None:
-    def start(**conditions: Any) -> Simulation:
-        world = Conditions(**conditions)
-        return strike(0.0, simulate=lambda *a, **o: simulate_mujoco(*a, **o, conditions=world))[0]
+    def start(**perturbation: Any) -> Simulation:
+        world = Perturbation(**perturbation)
+        return strike(0.0, simulate=lambda *a, **o: simulate_mujoco(*a, **o, perturbation=world))[0]
 
     for distance in (0.012, -0.012):
         late = start(distance=distance).contact_start - start().contact_start
@@ -368,9 +375,14 @@ def test_gains_limits_and_loads_are_factors_of_the_robots() -> None:
     rate = np.array([0.0, 0.2, 0.0, 0.0])
     motion = reference([0.0, 1e-4], [q, ahead], [rate, rate], np.zeros(4), nv=4, n=4, end=2e-3)
 
-    def run(**conditions: Any) -> Simulation:
+    def run(**perturbation: Any) -> Simulation:
         return simulate_mujoco(
-            robot, motion, scene("striker:hand"), settle=0.0, record=1, conditions=Conditions(**conditions)
+            robot,
+            motion,
+            scene("striker:hand"),
+            settle=0.0,
+            record=1,
+            perturbation=Perturbation(**perturbation),
         )
 
     plain, stiff, damped = run(), run(kp=2.0), run(kd=3.0)
@@ -390,7 +402,7 @@ def test_a_softer_floor_is_sunk_into_deeper() -> None:
     depth = []
     for floor_time in (4e-3, 8e-3):
         sim = simulate_mujoco(
-            robot, motion, there, step=5e-4, settle=0.3, conditions=Conditions(floor_time=floor_time)
+            robot, motion, there, step=5e-4, settle=0.3, perturbation=Perturbation(floor_time=floor_time)
         )
         depth.append(motion.q[0, 2] - sim.q[-1, 2])
     assert depth[1] == pytest.approx(4 * depth[0], rel=0.1)  # as the square of the time constant
@@ -398,15 +410,15 @@ def test_a_softer_floor_is_sunk_into_deeper() -> None:
 
 def test_every_condition_has_its_range_and_the_defaults_are_the_plan() -> None:
     there = scene()
-    same = Conditions().scene(there)
+    same = Perturbation().scene(there)
     for f in fields(Scene):
         assert np.array_equal(getattr(same, f.name), getattr(there, f.name)), f.name
-    for f in fields(Conditions):
-        with pytest.raises(InputError, match=f"conditions: {f.name}.*nan"):
-            Conditions(**{f.name: float("nan")})
+    for f in fields(Perturbation):
+        with pytest.raises(InputError, match=f"perturbation: {f.name}.*nan"):
+            Perturbation(**{f.name: float("nan")})
         if f.name not in ("distance", "missing"):
-            with pytest.raises(InputError, match=f"conditions: {f.name} is -1"):
-                Conditions(**{f.name: -1.0})
+            with pytest.raises(InputError, match=f"perturbation: {f.name} is -1"):
+                Perturbation(**{f.name: -1.0})
 
 
 # ---- what cannot be replayed
@@ -449,13 +461,13 @@ def test_engines_by_name_refuse_what_they_do_not_have(punch: Solution) -> None:
     problem, motion = punch.problem, punch.trajectory
     with pytest.raises(InputError, match=r"unknown engine 'mujco' \(did you mean 'mujoco'"):
         simulate(problem, motion, engine="mujco")
-    with pytest.raises(InputError, match="no other conditions; take engine 'mujoco'"):
-        simulate(problem, motion, engine="pinocchio", conditions=Conditions(mass=2.0))
+    with pytest.raises(InputError, match="no perturbation; take engine 'mujoco'"):
+        simulate(problem, motion, engine="pinocchio", perturbation=Perturbation(mass=2.0))
     with pytest.raises(InputError, match="has no option 'stp'"):
         simulate(problem, motion, engine="mujoco", stp=1e-4)
 
 
 def test_a_replay_far_from_the_plan_does_not_pass_for_one_that_stands(punch: Solution) -> None:
-    sim = punch.validate(engine="mujoco", step=1e-3, conditions=Conditions(torque_limit=0.3))
+    sim = punch.validate(engine="mujoco", step=1e-3, perturbation=Perturbation(torque_limit=0.3))
     assert sim.standing is False
     assert sim.saturated > 0.1

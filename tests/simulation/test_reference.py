@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp, trapezoid
 from support import small_robots
 from support.frozen_cases import Kinematics, robot_named, two_masses, with_heavy_feet
 
-from impactopt.collision import SDC, JointFriction, Terms
+from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.contact import Board, FreeMass, HuntCrossley, KelvinVoigt, Nail, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
@@ -254,7 +254,7 @@ def test_frozen_dynamics_is_the_limit_of_short_collisions():
         step = 0.02 / np.sqrt(stiffness)
         options = {"robot": biped(), "striker": "fist", "normal": X, "target": FreeMass(mass=1.0)}
         options |= {"law": SpringDamper(stiffness=stiffness, damping=0.0)}
-        full, frozen = FullDynamics(**options, step=step), SDC(**options, terms=Terms(), step=step)
+        full, frozen = FullDynamics(**options, step=step), SDC(**options, effects=Effects(), step=step)
         q, v, torque = blow(full)
         soft = {"kp": 200.0, "kd": 5.0}
         exact, found = full.collide(q, v, torque, **soft), frozen.collide(q, v, torque, **soft)

@@ -33,7 +33,7 @@ from impactopt.errors import InputError
 from impactopt.report.console import replay_table
 from impactopt.robots.robot import Robot
 from impactopt.simulation import (
-    Conditions,
+    Perturbation,
     Scene,
     Simulation,
     robustness,
@@ -42,7 +42,7 @@ from impactopt.simulation import (
     simulate_pinocchio,
 )
 from impactopt.simulation.accuracy import check_steps, with_step_error
-from impactopt.simulation.robustness import Spread
+from impactopt.simulation.robustness import PerturbationRanges
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
 from impactopt.transcription.start import first_iterate
@@ -195,9 +195,9 @@ def test_draws_whose_steps_leave_the_impulse_uncertain_have_no_result() -> None:
     law, target = SpringDamper(stiffness=5e5, damping=20.0), FreeMass(mass=1e-3)
     robot, motion, world = hammer(target, law)
     shared = robustness.Shared(robot=robot, reference=motion, scene=world, step=robustness.STEP)
-    trusted = robustness.replay(shared, Conditions())
+    trusted = robustness.replay(shared, Perturbation())
     assert trusted.impulse == pytest.approx(integrated(law, target)[0], rel=1e-2)
-    doubtful = robustness.replay(dataclasses.replace(shared, step=0.06), Conditions())
+    doubtful = robustness.replay(dataclasses.replace(shared, step=0.06), Perturbation())
     assert not doubtful.standing and np.isnan(doubtful.impulse)
     assert "not to be trusted: steps of 0.06 s" in doubtful.reason
 
@@ -215,31 +215,31 @@ def test_a_nail_goes_as_deep_as_the_work_on_its_head_lasts(engine: Engine) -> No
     assert depth > 3e-3 and (sim.target_speed >= 0).all()
 
 
-# ---- conditions
+# ---- perturbations
 
 
 def test_conditions_change_numbers_that_there_are() -> None:
     there = scene(law=KelvinVoigt(stiffness=1e4, damping=10.0), target=BOARD)
-    other = Conditions(mass=2.0, stiffness=3.0, damping=0.5).scene(there)
+    other = Perturbation(mass=2.0, stiffness=3.0, damping=0.5).scene(there)
     assert other.law == KelvinVoigt(stiffness=3e4, damping=5.0)
     assert other.target == dataclasses.replace(BOARD, mass=0.6)
     wall = scene(law=HuntCrossley(stiffness=1e6, dissipation=0.1), target=RigidWall())
-    assert Conditions(stiffness=2.0).scene(wall).law == HuntCrossley(stiffness=2e6, dissipation=0.1)
-    with pytest.raises(InputError, match="conditions: the target RigidWall has no mass; leave it out"):
-        Conditions(mass=2.0).scene(wall)
-    with pytest.raises(InputError, match="conditions: the law HuntCrossley has no damping"):
-        Conditions(damping=2.0).scene(wall)
+    assert Perturbation(stiffness=2.0).scene(wall).law == HuntCrossley(stiffness=2e6, dissipation=0.1)
+    with pytest.raises(InputError, match="perturbation: the target RigidWall has no mass; leave it out"):
+        Perturbation(mass=2.0).scene(wall)
+    with pytest.raises(InputError, match="perturbation: the law HuntCrossley has no damping"):
+        Perturbation(damping=2.0).scene(wall)
 
 
 def test_what_a_target_does_not_have_is_not_drawn() -> None:
-    wall = Spread(mass=(0.5, 2.0)).of(scene(target=RigidWall()))
-    assert wall == dataclasses.replace(Spread(), mass=(1.0, 1.0))
-    assert Spread().of(scene(target=NAIL)) == Spread()
+    wall = PerturbationRanges(mass=(0.5, 2.0)).of(scene(target=RigidWall()))
+    assert wall == dataclasses.replace(PerturbationRanges(), mass=(1.0, 1.0))
+    assert PerturbationRanges().of(scene(target=NAIL)) == PerturbationRanges()
 
 
 def test_a_nail_that_is_not_there_stays_as_it_was() -> None:
     law = SpringDamper(stiffness=1e5, damping=50.0)
-    sim = blow(simulate_mujoco, law, NAIL, step=2e-4, conditions=Conditions(missing=True))
+    sim = blow(simulate_mujoco, law, NAIL, step=2e-4, perturbation=Perturbation(missing=True))
     assert sim.impulse == 0 and sim.outcome == {"depth_m": 0.0} and np.isnan(sim.contact_start)
 
 

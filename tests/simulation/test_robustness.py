@@ -1,4 +1,4 @@
-"""Drawn conditions, and replays under them: in range, reproducible, and a bad draw is a row of its own."""
+"""Drawn perturbations, and replays under them: in range, reproducible, and a bad draw is a row of its own."""
 
 from __future__ import annotations
 
@@ -17,9 +17,15 @@ from support.fake_solution import still_problem, still_solution
 
 from impactopt.contact import CustomLaw, RigidWall, SpringDamper
 from impactopt.errors import InputError
-from impactopt.simulation import Conditions
+from impactopt.simulation import Perturbation
 from impactopt.simulation import workers as _workers
-from impactopt.simulation.robustness import LOGARITHMIC, Robustness, Spread, draw_conditions, robustness
+from impactopt.simulation.robustness import (
+    LOGARITHMIC,
+    PerturbationRanges,
+    Robustness,
+    draw_perturbations,
+    robustness,
+)
 from impactopt.simulation.workers import map_on_workers
 
 STEP = 1e-3
@@ -27,9 +33,9 @@ STEP = 1e-3
 
 # ---------------------------------------------------------------- draws
 def test_draws_are_in_range_and_fill_it() -> None:
-    draws = draw_conditions(400, seed=3)
+    draws = draw_perturbations(400, seed=3)
     assert all(draw.period == 1e-3 and draw.delay == 0 and not draw.missing for draw in draws)
-    for name, (low, high) in Spread().ranges().items():
+    for name, (low, high) in PerturbationRanges().bounds().items():
         value = np.array([getattr(draw, name) for draw in draws])
         assert low <= value.min() and value.max() <= high
         x, ends = (np.log(a) if name in LOGARITHMIC else a for a in (value, np.array([low, high])))
@@ -39,29 +45,33 @@ def test_draws_are_in_range_and_fill_it() -> None:
 
 
 def test_factors_are_as_often_halved_as_doubled() -> None:
-    mass = np.array([draw.mass for draw in draw_conditions(2000, seed=1)])
+    mass = np.array([draw.mass for draw in draw_perturbations(2000, seed=1)])
     assert np.mean(mass < 1.0) == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(len(mass)))
 
 
 def test_a_seed_makes_the_draws_and_fewer_are_the_first_of_more() -> None:
-    assert draw_conditions(5, seed=7) == draw_conditions(9, seed=7)[:5]
-    assert draw_conditions(5, seed=7) != draw_conditions(5, seed=8)
+    assert draw_perturbations(5, seed=7) == draw_perturbations(9, seed=7)[:5]
+    assert draw_perturbations(5, seed=7) != draw_perturbations(5, seed=8)
 
 
 def test_parameters_are_drawn_independently() -> None:
-    table = np.array([[getattr(d, n) for n in Spread().ranges()] for d in draw_conditions(2000)])
+    table = np.array(
+        [[getattr(d, n) for n in PerturbationRanges().bounds()] for d in draw_perturbations(2000)]
+    )
     correlation = np.corrcoef(table.T) - np.eye(table.shape[1])
     assert np.abs(correlation).max() < 5 / np.sqrt(len(table))
 
 
 def test_a_range_without_width_is_that_number() -> None:
-    draws = draw_conditions(20, spread=Spread(mass=(1.3, 1.3), distance=(0.0, 0.0), period=0.0))
+    draws = draw_perturbations(
+        20, ranges=PerturbationRanges(mass=(1.3, 1.3), distance=(0.0, 0.0), period=0.0)
+    )
     assert {draw.mass for draw in draws} == {1.3}
     assert {(draw.distance, draw.period) for draw in draws} == {(0.0, 0.0)}
 
 
 def test_every_range_is_a_condition() -> None:
-    assert set(Spread().ranges()) <= {f.name for f in fields(Conditions)}
+    assert set(PerturbationRanges().bounds()) <= {f.name for f in fields(Perturbation)}
 
 
 @pytest.mark.parametrize(
@@ -77,15 +87,15 @@ def test_every_range_is_a_condition() -> None:
 )
 def test_a_spread_that_cannot_be_is_refused(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        Spread(**changes)
+        PerturbationRanges(**changes)
 
 
 # ---------------------------------------------------------------- what is made of the rows
 def made_up(standing: list[bool], *, impulse: list[float] | None = None, reasons: Any = None) -> Robustness:
     n = len(standing)
     return Robustness(
-        conditions=tuple(draw_conditions(n)),
-        spread=Spread(),
+        perturbations=tuple(draw_perturbations(n)),
+        drawn_from=PerturbationRanges(),
         standing=np.array(standing),
         reason=reasons if reasons is not None else tuple("" if s else "fell" for s in standing),
         impulse=np.array(impulse) if impulse is not None else np.full(n, 10.0),
@@ -137,7 +147,7 @@ def test_reasons_are_counted_without_their_numbers() -> None:
 
 
 def test_separation_finds_the_parameter_that_decides() -> None:
-    heavy = [draw.mass > 1.0 for draw in draw_conditions(200)]
+    heavy = [draw.mass > 1.0 for draw in draw_perturbations(200)]
     result = made_up(heavy)
     apart = {name: abs(v["apart"]) for name, v in result.separation().items()}
     assert max(apart, key=lambda name: apart[name]) == "mass" and apart["mass"] > 1.5
@@ -148,8 +158,8 @@ def test_separation_finds_the_parameter_that_decides() -> None:
 
 
 def test_thirds_show_a_middle_that_means_hide() -> None:
-    spread = Spread().ranges()["friction"]
-    result = made_up([abs(d.friction - np.mean(spread)) < 0.06 for d in draw_conditions(300)])
+    spread = PerturbationRanges().bounds()["friction"]
+    result = made_up([abs(d.friction - np.mean(spread)) < 0.06 for d in draw_perturbations(300)])
     low, middle, high = result.by_third()["friction"]
     assert middle > 0.8 and low == high == 0.0
 
@@ -173,18 +183,20 @@ def test_one_worker_and_two_give_the_same_numbers(still: tuple[Any, Any]) -> Non
     two = robustness(*still, 1.0, draws=3, workers=2, progress=lambda done, of: told.append((done, of)))
     assert np.isfinite(one.impulse).all()
     assert rows_of(one) == rows_of(two)
-    assert one.conditions == two.conditions == tuple(draw_conditions(3))
+    assert one.perturbations == two.perturbations == tuple(draw_perturbations(3))
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:
     """A still robot stands by its servo, and falls without it; the payload is not the reason."""
-    calm = Spread(mass=(1.0, 1.0), payload=(0.0, 0.0), distance=(0.1, 0.1), kp=(1.0, 1.0), kd=(1.0, 1.0))
-    stands = robustness(*still, 1.0, draws=1, spread=calm, workers=1, step=STEP)
+    calm = PerturbationRanges(
+        mass=(1.0, 1.0), payload=(0.0, 0.0), distance=(0.1, 0.1), kp=(1.0, 1.0), kd=(1.0, 1.0)
+    )
+    stands = robustness(*still, 1.0, draws=1, ranges=calm, workers=1, step=STEP)
     assert stands.rate == 1.0 and stands.reason == ("",)
     assert stands.impulse[0] == 0.0  # the target waits farther than the fist gets
-    weak = Spread(torque_limit=(0.01, 0.01), distance=(0.1, 0.1))
-    falls = robustness(*still, 1.0, draws=1, spread=weak, workers=1, step=STEP)
+    weak = PerturbationRanges(torque_limit=(0.01, 0.01), distance=(0.1, 0.1))
+    falls = robustness(*still, 1.0, draws=1, ranges=weak, workers=1, step=STEP)
     assert falls.rate == 0.0 and falls.reason[0].startswith("fell")
     assert falls.lift[0] >= 0.0 and np.isfinite(falls.slip[0])
 
@@ -192,9 +204,11 @@ def test_what_is_drawn_reaches_the_replay(still: tuple[Any, Any]) -> None:
 def test_of_a_wall_no_mass_is_drawn(still: tuple[Any, Any]) -> None:
     _, motion = still
     wall = still_problem(target=RigidWall())
-    result = robustness(wall, motion, 1.0, draws=2, spread=Spread(distance=(0.1, 0.1)), workers=1, step=STEP)
-    assert [c.mass for c in result.conditions] == [1.0, 1.0] and result.spread.mass == (1.0, 1.0)
-    assert len({c.stiffness for c in result.conditions}) == 2
+    result = robustness(
+        wall, motion, 1.0, draws=2, ranges=PerturbationRanges(distance=(0.1, 0.1)), workers=1, step=STEP
+    )
+    assert [c.mass for c in result.perturbations] == [1.0, 1.0] and result.drawn_from.mass == (1.0, 1.0)
+    assert len({c.stiffness for c in result.perturbations}) == 2
     assert np.isfinite(result.impulse).all(), result.reason
 
 
@@ -209,8 +223,8 @@ def test_a_replay_that_diverges_is_a_row(still: tuple[Any, Any]) -> None:
     """The fist, pressed into a target far stiffer than the step can follow."""
     _, motion = still
     problem = still_problem(law=SpringDamper(stiffness=1e9, damping=300.0))
-    hard = Spread(stiffness=(1e6, 1e6), distance=(-0.01, -0.01))
-    result = robustness(problem, motion, 1.0, draws=2, spread=hard, workers=1, step=STEP)
+    hard = PerturbationRanges(stiffness=(1e6, 1e6), distance=(-0.01, -0.01))
+    result = robustness(problem, motion, 1.0, draws=2, ranges=hard, workers=1, step=STEP)
     assert not result.standing.any()
     assert all("diverged" in reason for reason in result.reason)
     assert np.isnan(result.impulse).all() and np.isnan(result.slip).all() and np.isnan(result.lift).all()

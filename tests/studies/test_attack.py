@@ -24,7 +24,7 @@ from impactopt import (
     Robot,
     TargetBody,
     collide_many,
-    draw_conditions,
+    draw_perturbations,
     load_robot,
 )
 from impactopt.cli.app import app, program
@@ -251,7 +251,7 @@ def test_the_bench_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ["files", "urdfs", "commands", "calls", "tracebacks", "slow", "unsound"]
     assert [found[name] for name in names] == [3, 3, 0, 3, 0, 0, 0]
     assert {"collisions", "off", "refused", "seconds"} <= found.keys()
-    assert {"compiler", "clang"} <= {*found["compilers"]["ways"], *found["compilers"]["absent"]}
+    assert {"compiler", "clang"} <= {*found["compilers"]["builds"], *found["compilers"]["absent"]}
     assert found["replays"] == {"replays": 0, "off": 0, "refused": 0}
 
 
@@ -278,15 +278,19 @@ def test_the_bench_counts(monkeypatch: pytest.MonkeyPatch) -> None:
         ("JointFriction", "transition"),
         ("JointFriction", "viscous"),
         ("FreeMass", "mass"),
-        ("Spread", "mass"),
-        ("Spread", "payload"),
+        ("PerturbationRanges", "mass"),
+        ("PerturbationRanges", "payload"),
         ("Scenario", "mass"),
     ],
 )
 def test_numbers_that_are_none(name: str, key: str, value: Any) -> None:
     needed: dict[str, Any] = {"Phase": {"intervals": 12}, "Scenario": {"name": "s"}}.get(name, {})
     pair = isinstance(value, list) and len(value) == 2
-    if pair and (name, key) in (("Phase", "duration"), ("Spread", "mass"), ("Spread", "payload")):
+    if pair and (name, key) in (
+        ("Phase", "duration"),
+        ("PerturbationRanges", "mass"),
+        ("PerturbationRanges", "payload"),
+    ):
         pytest.skip("a range")
     if isinstance(value, list) and key == "viscous":
         pytest.skip("one a joint")
@@ -313,7 +317,7 @@ def test_numbers_of_numpy_are_kept_as_numbers() -> None:
 @pytest.mark.parametrize("draws", [0, 1.5, "x", 2**40, None])
 def test_draws_are_a_number_of_them(draws: Any) -> None:
     with pytest.raises(InputError, match="draws"):
-        draw_conditions(draws)
+        draw_perturbations(draws)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The benches of models: the ladder against full dynamics, virtual bases against held soles."""
+"""The benches of models: the hierarchy against full dynamics, virtual bases against held soles."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import PAPER_SPEEDS
 from impactopt.studies.bench import fidelity, virtual_base
 from impactopt.studies.bench.fidelity import Task
-from impactopt.studies.bench.ladder import GAINS, HORIZON, MASS_RATIOS, TARGETS, Rung, situations
+from impactopt.studies.bench.hierarchy import GAINS, HORIZON, MASS_RATIOS, TARGETS, Fidelity, situations
 from impactopt.studies.bench.virtual_base import _body, exact_inverse_mass
 from impactopt.studies.report import Report
 
@@ -109,12 +109,12 @@ def test_the_command_virtual_base(monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 
 
 # ---------------------------------------------------------------- fidelity
-SHORT = (Rung(model="virtual-mass"), Rung(model="sdc", freezes=0), Rung(model="sdc", freezes=2))
+SHORT = (Fidelity(model="virtual-mass"), Fidelity(model="sdc", freezes=0), Fidelity(model="sdc", freezes=2))
 
 
 @pytest.fixture(scope="module")
 def short() -> Report:
-    return fidelity.run(silent, ladder=SHORT, workers=1, quick=True)
+    return fidelity.run(silent, hierarchy=SHORT, workers=1, quick=True)
 
 
 def made_up(errors: dict[int | None, list[float | None]]) -> list[dict[str, Any]]:
@@ -163,7 +163,7 @@ def test_mujoco_gets_each_pair_of_posture_speed_and_gains_once() -> None:
 
 def test_freezing_again_makes_it_better_and_a_point_mass_is_far_off(short: Report) -> None:
     rows = {(row["model"], row["freezes"]): row for row in short.numbers["rows"]}
-    virtual, once, again = (rows[rung.model, rung.freezes] for rung in SHORT)
+    virtual, once, again = (rows[fidelity.model, fidelity.freezes] for fidelity in SHORT)
     assert virtual["worst_impulse_error_pct"] > 10.0
     assert virtual["worst_zmp_error_mm"] is None and virtual["worst_torque_error_at"] is None
     assert once["worst_impulse_error_pct"] < 2.0
@@ -181,20 +181,20 @@ def test_mujoco_agrees_with_the_reference(short: Report) -> None:
 
 
 def test_the_order_is_minus_the_slope_of_the_logarithms() -> None:
-    rungs = [Rung(model="sdc", freezes=n) for n in (0, 1, 2, 4, 8)]
+    fidelities = [Fidelity(model="sdc", freezes=n) for n in (0, 1, 2, 4, 8)]
     errors: dict[int | None, list[float | None]] = {
         n: [-9.0 / n**2, 1.0 / n**3, 0.5 / n**3] if n else [9.0] * 3 for n in (0, 1, 2, 4, 8)
     }
-    found = fidelity.orders(made_up(errors), rungs)
+    found = fidelity.orders(made_up(errors), fidelities)
     assert found["order_in_freezes"] == pytest.approx(2.0)
     assert found["order_in_freezes_median"] == pytest.approx(3.0)
     assert found["orders"]["r"]["order_in_freezes"] == pytest.approx(2.0)
-    assert fidelity.orders(made_up({0: [1.0]}), rungs[:1])["order_in_freezes"] is None
+    assert fidelity.orders(made_up({0: [1.0]}), fidelities[:1])["order_in_freezes"] is None
 
 
 def test_a_row_has_the_worst_and_where_and_drops_nothing() -> None:
     collisions = made_up({4: [0.1, -0.7, None, 0.3]})
-    row = fidelity.row_of("r", Rung(model="sdc", freezes=4), collisions)
+    row = fidelity.row_of("r", Fidelity(model="sdc", freezes=4), collisions)
     assert row["worst_impulse_error_pct"] == 0.7 and row["worst_impulse_error_at"] == "case 1"
     assert row["worst_torque_joint"] == "joint 1"
     assert row["median_impulse_error_pct"] == 0.3
@@ -212,9 +212,9 @@ def test_a_model_that_refuses_a_collision_is_its_reason(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         fidelity,
         "_model",
-        lambda robot, rung: whole(robot, rung) if rung.model == "reference" else Refusing(),
+        lambda robot, fidelity: whole(robot, fidelity) if fidelity.model == "reference" else Refusing(),
     )
-    task = Task(robot="standin", index=0, ladder=SHORT[1:2], mujoco=True)
+    task = Task(robot="standin", index=0, hierarchy=SHORT[1:2], mujoco=True)
     found = fidelity.measured(None, task)
     assert found["reason"] == "mujoco: no" and found["mujoco_vs_pinocchio_pct"] is None
     assert found["models"][0]["reason"] == "no" and found["models"][0]["impulse_error_pct"] is None

@@ -20,8 +20,8 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
-from impactopt.simulation import Conditions, Simulation
-from impactopt.simulation.robustness import Robustness, Spread, draw_conditions
+from impactopt.simulation import Perturbation, Simulation
+from impactopt.simulation.robustness import PerturbationRanges, Robustness, draw_perturbations
 from impactopt.solvers.program import Status
 from impactopt.studies.bench import margins
 from impactopt.studies.bench.margins import OPTIONS, Option
@@ -37,7 +37,7 @@ class World:
     def __init__(self, solution: Solution, simulation: Simulation) -> None:
         self.solution, self.simulation = solution, simulation
         self.problems: list[ImpactProblem] = []
-        self.conditions: list[Conditions] = []
+        self.perturbation: list[Perturbation] = []
         self.status: dict[int, Status] = {}  # of the k-th plan, where it is not solved
         self.error: InputError | None = None
 
@@ -52,18 +52,18 @@ class World:
         return replace(self.solution, result=result)
 
     def simulate(
-        self, _problem: ImpactProblem, _reference: Any, *, conditions: Any = None, **_options: Any
+        self, _problem: ImpactProblem, _reference: Any, *, perturbation: Any = None, **_options: Any
     ) -> Simulation:
-        self.conditions.append(conditions if conditions is not None else Conditions())
-        return replace(self.simulation, fall="fell" if self.conditions[-1].missing else "")
+        self.perturbation.append(perturbation if perturbation is not None else Perturbation())
+        return replace(self.simulation, fall="fell" if self.perturbation[-1].missing else "")
 
     def robustness(
         self, _problem: ImpactProblem, _reference: Any, impulse: float, **_options: Any
     ) -> Robustness:
         n = len(EXPECTED_SLIP)
         return Robustness(
-            conditions=draw_conditions(n),
-            spread=Spread(),
+            perturbations=draw_perturbations(n),
+            drawn_from=PerturbationRanges(),
             standing=np.array([True, False, True, True]),
             reason=("", "fell", "", ""),
             impulse=np.full(n, impulse),
@@ -157,7 +157,7 @@ def test_the_short_sweep_has_fewer_values(world: World) -> None:
 # ---------------------------------------------------------------- a row
 def test_a_plan_is_replayed_as_planned_without_target_and_under_draws(world: World) -> None:
     row = measured().numbers["rows"][0]
-    assert [conditions.missing for conditions in world.conditions[:2]] == [False, True]
+    assert [perturbation.missing for perturbation in world.perturbation[:2]] == [False, True]
     assert row["status"] == "solved" and row["impulse_planned_Ns"] == IMPULSE
     assert row["impulse_replayed_Ns"] == pytest.approx(1.01 * IMPULSE)  # as the made-up replay has it
     assert row["standing"] is True and row["standing_missing"] is False

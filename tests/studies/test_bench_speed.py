@@ -13,7 +13,7 @@ from support import small_robots
 from support.native_cases import FRICTION, LAW, TARGET, sdc, situation
 
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision import SDC, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.collision.describe import independent_joints
 from impactopt.errors import InputError
 from impactopt.pictures.pareto import front, pareto_picture
@@ -23,7 +23,7 @@ from impactopt.pictures.style import STYLE
 from impactopt.robots.presets import standin
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench import clock, collision, scaling, skip
-from impactopt.studies.bench.scene import Scene
+from impactopt.studies.bench.setup import Setup
 from impactopt.studies.registry import run_bench
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -55,7 +55,7 @@ def assert_one_by_one(model: Any, found: dict[str, Any], one: Any, outputs: tupl
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_batch_is_its_collisions_one_by_one(threads: int) -> None:
-    model = sdc("arm", terms=Terms(friction=True), friction=FRICTION)
+    model = sdc("arm", effects=Effects(friction=True), friction=FRICTION)
     q, v, torque = cases("arm", model, 9)
     outputs = ("impulse", "velocity", "time", "force", "torque")
     found = model.batch(q, v, torque, outputs=outputs, threads=threads)
@@ -129,7 +129,12 @@ def test_what_is_wrong_in_a_batch_is_said() -> None:
 def test_without_a_compiler_a_batch_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
     model = SDC(
-        robot=small_robots.slider(3.0), striker="tip", normal=X, law=LAW, target=TARGET, terms=Terms.none()
+        robot=small_robots.slider(3.0),
+        striker="tip",
+        normal=X,
+        law=LAW,
+        target=TARGET,
+        effects=Effects.none(),
     )
     q, v = np.zeros((2, 1)), np.array([[1.0], [2.0]])
     found = model.batch(q, v, outputs=("impulse", "force"))
@@ -139,20 +144,20 @@ def test_without_a_compiler_a_batch_takes_longer(monkeypatch: pytest.MonkeyPatch
 
 # ---------------------------------------------------------------- descriptions
 def test_a_description_says_what_is_in_and_what_is_not() -> None:
-    model = sdc("biped", terms=Terms(saturation=False, bias=False))
+    model = sdc("biped", effects=Effects(saturation=False, bias=False))
     told = model.describe(("impulse", "zmp"), parameters=("kd",))
     numbers = told.as_dict()
-    assert numbers["terms"] == ["damping", "stiffness", "feedforward", "jdot"]
+    assert numbers["effects"] == ["damping", "stiffness", "feedforward", "jdot"]
     assert len(numbers["held"]) == 2 and numbers["inputs"] == ["q", "v", "feedforward", "kd"]
     assert {"saturation", "bias", "friction", "peak force", "derivatives"} <= {*numbers["left_out"]}
     assert not {"stiffness", "histories", "wrenches and ZMP"} & {*numbers["left_out"]}
-    assert "terms.saturation is off" in str(told) and "zmp" in str(told)
+    assert "effects.saturation is off" in str(told) and "zmp" in str(told)
     json.dumps(numbers)
 
 
 def test_what_is_left_out_is_not_computed() -> None:
-    lean = sdc("biped", terms=Terms.none()).describe(("impulse",)).as_dict()["instructions"]
-    full = sdc("biped", terms=Terms(friction=True), friction=FRICTION)
+    lean = sdc("biped", effects=Effects.none()).describe(("impulse",)).as_dict()["instructions"]
+    full = sdc("biped", effects=Effects(friction=True), friction=FRICTION)
     rich = full.describe(full.available).as_dict()["instructions"]
     # of a Runge-Kutta step the four products with A stay
     assert lean["freeze"] < 0.9 * rich["freeze"] and lean["step"] < 0.7 * rich["step"]
@@ -160,7 +165,7 @@ def test_what_is_left_out_is_not_computed() -> None:
 
 def test_a_point_mass_has_no_servo() -> None:
     numbers = sdc("arm", VirtualMass).describe().as_dict()
-    assert numbers["terms"] == [] and "servo" in numbers["left_out"]
+    assert numbers["effects"] == [] and "servo" in numbers["left_out"]
     with pytest.raises(InputError, match="point mass"):
         sdc("arm", VirtualMass).describe(("torque",))
 
@@ -190,7 +195,7 @@ def quiet(_text: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def setup() -> Setup:
     """A small arm's blow: the benches take any."""
     model = sdc("arm")
     q, v, torque = situation("arm", model, seed=3)[:3]
@@ -205,7 +210,7 @@ def scene() -> Scene:
         effective_mass=np.nan,
         speed=1.5,
     )
-    return Scene(name="arm", case=case, law=LAW, target=TARGET, horizon=0.05)
+    return Setup(name="arm", case=case, law=LAW, target=TARGET, horizon=0.05)
 
 
 def test_what_is_timed_in_turns_keeps_its_ratio() -> None:
@@ -220,8 +225,8 @@ def test_what_takes_long_is_timed_less() -> None:
 
 
 @compiled
-def test_the_bench_of_collisions_has_each_method_and_the_default_s_ratios(scene: Scene) -> None:
-    numbers = collision.run(quiet, scenes=[scene], quick=True, repeats=3).numbers
+def test_the_bench_of_collisions_has_each_method_and_the_default_s_ratios(setup: Setup) -> None:
+    numbers = collision.run(quiet, setups=[setup], quick=True, repeats=3).numbers
     rows = {(r["method"], r["setting"]): r for r in numbers["rows"]}
     keys = {"robot", "method", "setting", "time_us", "note", *collision.KEYS}
     assert all({*r} == keys for r in rows.values())
@@ -250,18 +255,18 @@ def test_a_front_is_of_what_nothing_beats() -> None:
 
 
 @compiled
-def test_a_step_that_is_unstable_has_a_row_that_says_so(scene: Scene) -> None:
+def test_a_step_that_is_unstable_has_a_row_that_says_so(setup: Setup) -> None:
     from impactopt.studies.bench import methods
 
     found, refused = [], []
-    maker = methods._ours(scene, quiet, found, refused)
-    maker("sdc", "0.01 s", lambda: scene.model(SDC, method="rk4", step=0.01, kd=1e3))
+    maker = methods._ours(setup, quiet, found, refused)
+    maker("sdc", "0.01 s", lambda: setup.model(SDC, method="rk4", step=0.01, kd=1e3))
     assert not found and "unstable" in refused[0]["note"]
 
 
 @compiled
-def test_the_bench_of_skipping_says_what_each_saves(scene: Scene) -> None:
-    numbers = skip.run(quiet, scene=scene, repeats=3).numbers
+def test_the_bench_of_skipping_says_what_each_saves(setup: Setup) -> None:
+    numbers = skip.run(quiet, setup=setup, repeats=3).numbers
     rows = {r["skipped"]: r for r in numbers["rows"]}
     whole = rows["everything"]
     assert whole["speedup"] == 1.0
@@ -294,13 +299,13 @@ def test_joints_that_are_locked_keep_their_places() -> None:
 
 
 @compiled
-def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -> None:
+def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(setup: Setup) -> None:
     numbers = scaling.run(
         quiet,
         chains=(2, 4),
         trees=(8,),
         humanoids=(),
-        scene=scene,
+        setup=setup,
         steps=(2.5e-4,),
         tolerances=(1e-3, 1e-7),
         batches=(1, 20),
@@ -321,15 +326,15 @@ def test_the_bench_of_scaling_goes_over_joints_steps_and_batches(scene: Scene) -
 
 
 def test_the_humanoids_of_scaling_strike_with_their_hand() -> None:
-    scenes = scaling.humanoid_scenes(scaling.HUMANOIDS, quiet)
-    assert [scene.name for scene in scenes] == list(scaling.HUMANOIDS)
-    for scene in scenes:
-        assert len(scene.case.robot.soles) == 2 and scene.case.striker == "right_hand"
-    assert scaling.humanoid_scenes(("no such robot",), quiet) == []
+    setups = scaling.humanoid_setups(scaling.HUMANOIDS, quiet)
+    assert [setup.name for setup in setups] == list(scaling.HUMANOIDS)
+    for setup in setups:
+        assert len(setup.case.robot.soles) == 2 and setup.case.striker == "right_hand"
+    assert scaling.humanoid_setups(("no such robot",), quiet) == []
 
 
 def test_a_hand_that_goes_away_is_frozen_and_no_more() -> None:
-    for one in (scaling.tip_scene("chain", 4), scaling.tip_scene("tree", 8)):
+    for one in (scaling.tip_setup("chain", 4), scaling.tip_setup("tree", 8)):
         model = one.model(SDC)
         case = scaling.parted(one.case)
         away = model.collide(case.q, case.v, case.torque)

@@ -12,7 +12,7 @@ import pytest
 from support.exact_reference import Case, random_case, robot_named
 from support.small_robots import slider
 
-from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
 from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
 from impactopt.contact import FreeMass, HuntCrossley, KelvinVoigt, SpringDamper
 from impactopt.errors import InputError
@@ -104,7 +104,7 @@ def test_random_collisions_against_an_independent_integration(name: str, seeds: 
 
 
 def test_histories_are_at_phases_ends_and_on_a_grid() -> None:
-    case = smooth_case("arm", Terms(friction=True))
+    case = smooth_case("arm", Effects(friction=True))
     coarse, fine = case.collide(spacing=1e-3), case.collide(spacing=2.5e-4)
     assert coarse.impulse == fine.impulse and coarse.peak_force == fine.peak_force
     grid = np.arange(0.0, fine.duration, 2.5e-4)
@@ -116,16 +116,16 @@ def test_histories_are_at_phases_ends_and_on_a_grid() -> None:
 
 
 # ------------------------------------------------------------ orders
-def smooth_case(name: str, terms: Terms) -> Case:
+def smooth_case(name: str, effects: Effects) -> Case:
     case, robot = random_case(8, name), robot_named(name)
-    friction = JointFriction(viscous=1.0, coulomb=1.0, transition=0.1) if terms.friction else None
+    friction = JointFriction(viscous=1.0, coulomb=1.0, transition=0.1) if effects.friction else None
     sdc = SDC(
         robot=robot,
         striker=case.sdc.striker,
         normal=case.sdc.normal,
         law=LAW,
         target=TARGET,
-        terms=terms,
+        effects=effects,
         friction=friction,
     )
     return dataclasses.replace(case, sdc=sdc, gains={"kd": robot.kd, "kp": robot.kp})
@@ -141,7 +141,7 @@ def deepening(case: Case, time: float, **options: Any) -> float:
 
 def test_order_of_runge_kutta_without_events() -> None:
     method, order, steps = "rk4", 4, (2.5e-4, 6.25e-5)
-    case, time = smooth_case("arm", Terms(saturation=False)), 2e-3
+    case, time = smooth_case("arm", Effects(saturation=False)), 2e-3
     exact = deepening(case, time, spacing=time)
     errors = [abs(deepening(case, time, step=step, method=method) - exact) for step in steps]
     measured = np.log(errors[0] / errors[1]) / np.log(steps[0] / steps[1])
@@ -152,7 +152,7 @@ def test_order_of_runge_kutta_without_events() -> None:
 def test_order_of_runge_kutta_with_events() -> None:
     """Of the impulse, over several speeds, as where in its step an event falls is chance."""
     method, order, steps = "rk4", 2, (2.5e-4, 3.125e-5)
-    case = smooth_case("arm", Terms(friction=True))
+    case = smooth_case("arm", Effects(friction=True))
     cases = [dataclasses.replace(case, v=scale * case.v) for scale in np.linspace(0.8, 1.2, 8)]
     exact = [each.collide() for each in cases]
     assert all(found.separated for found in exact)

@@ -50,7 +50,7 @@ TABLE_2 = {
     "impulse_paper_Ns",
     "f_max_paper_N",
 }
-SHORT = tuple(rung for rung in motions.LADDER if not rung.freezes)
+SHORT = tuple(fidelity for fidelity in motions.HIERARCHY if not fidelity.freezes)
 
 runner = CliRunner()
 
@@ -200,7 +200,7 @@ def test_table1_measures_masses_and_speeds(small: list[Case]) -> None:
 
 
 def test_table2_and_fig7_have_every_model_beside_the_papers_numbers(small: list[Case]) -> None:
-    report = table2.run(quiet, rungs=SHORT)
+    report = table2.run(quiet, fidelities=SHORT)
     rows, numbers = report.numbers["rows"], report.numbers
     assert [row["model"] for row in rows] == ["virtual-mass", "sdc-paper", "sdc"]
     assert all(row.keys() >= TABLE_2 for row in rows)
@@ -215,7 +215,7 @@ def test_table2_and_fig7_have_every_model_beside_the_papers_numbers(small: list[
     assert numbers["reference"][0]["last_halving_changed_Ns"] < 1e-5
     json.dumps(dict(numbers))
     # the same collisions, as a picture
-    report = fig7.run(quiet, rungs=SHORT)
+    report = fig7.run(quiet, fidelities=SHORT)
     found = {row["model"]: row for row in report.numbers["rows"]}
     true = found["full dynamics"]
     assert found["SDC, frozen at contact"]["impulse_Ns"] == sdc["impulse_Ns"]

@@ -16,7 +16,7 @@ import pinocchio as pin
 from scipy.integrate import DOP853, solve_ivp
 from scipy.optimize import brentq
 
-from impactopt.collision import SDC, JointFriction, Terms
+from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall, SpringDamper
 from impactopt.kinematics.stance import BothSoles
 from impactopt.robots.presets import standin, talos
@@ -56,22 +56,22 @@ def frozen_numbers(sdc: SDC, q: Any, v: Any, mass: float) -> dict[str, Any]:
     inverse = np.linalg.inv(kkt)
     P = inverse[: robot.nv, : robot.nv]
     met = v
-    if sdc.terms.bias or sdc.terms.jdot:
+    if sdc.effects.bias or sdc.effects.jdot:
         met = v - P @ j * (j @ v) / (j @ P @ j + 1.0 / mass)
     _, drift, _, hand_drift = kinematics(met)
     free = np.zeros(robot.nv)
-    if sdc.terms.jdot:
+    if sdc.effects.jdot:
         free = -inverse[: robot.nv, robot.nv :] @ drift
-    if sdc.terms.bias:
+    if sdc.effects.bias:
         free = free - P @ pin.nonLinearEffects(model, model.createData(), q, met)
-    return {"P": P, "j": j, "Jc": Jc, "free": free, "hand_drift": hand_drift if sdc.terms.jdot else 0.0}
+    return {"P": P, "j": j, "Jc": Jc, "free": free, "hand_drift": hand_drift if sdc.effects.jdot else 0.0}
 
 
 class Reference:
     """One collision; y = (v, displacement, hand speed, penetration, impulse, target's state)."""
 
     def __init__(self, sdc: SDC, q: Any, v: Any, torque: Any, gains: dict[str, Any]) -> None:
-        robot, terms = sdc.robot, sdc.terms
+        robot, effects = sdc.robot, sdc.effects
         self.sdc, self.n, self.nv, self.v0 = sdc, robot.n, robot.nv, v
         target = sdc.target
         self.mass = target.mass if isinstance(target, (FreeMass, Board)) else np.inf
@@ -79,9 +79,9 @@ class Reference:
         self.P, self.j, self.free = frozen["P"], frozen["j"], frozen["free"]
         self.hand_drift = frozen["hand_drift"]
         self.kd = gains["kd"] if np.ndim(gains["kd"]) == 2 else np.diag(gains["kd"])
-        self.kp = np.diag(gains["kp"]) * terms.stiffness
-        self.limit = robot.torque_limit if terms.saturation else np.full(self.n, np.inf)
-        self.ff = torque if terms.feedforward else np.zeros(self.n)
+        self.kp = np.diag(gains["kp"]) * effects.stiffness
+        self.limit = robot.torque_limit if effects.saturation else np.full(self.n, np.inf)
+        self.ff = torque if effects.feedforward else np.zeros(self.n)
         friction = sdc.friction or JointFriction(transition=1e9)
         (self.viscous, self.coulomb), self.band = friction.arrays(self.n), friction.transition
         self.k, self.d = sdc.law.stiffness, sdc.law.damping
@@ -273,8 +273,8 @@ class Case:
         """Exact, or by steps where options of the model are given."""
         exact = ExactCollision(self.sdc, spacing=spacing)
         sdc = dataclasses.replace(self.sdc, **options) if options else exact
-        gains = self.gains if self.sdc.terms.stiffness else {"kd": self.gains["kd"]}
-        torque = self.torque if self.sdc.terms.feedforward else None
+        gains = self.gains if self.sdc.effects.stiffness else {"kd": self.gains["kd"]}
+        torque = self.torque if self.sdc.effects.feedforward else None
         return sdc.collide(self.q, self.v, torque, require_separation=False, **gains)
 
 
@@ -282,7 +282,7 @@ def random_case(seed: int, name: str) -> Case:
     """A robot's random collision, whose servo saturates and whose joints stick and slide."""
     rng, robot = np.random.default_rng(seed), robot_named(name)
     model = robot.model
-    terms = Terms(**{field.name: bool(rng.random() < 0.75) for field in dataclasses.fields(Terms)})
+    effects = Effects(**{field.name: bool(rng.random() < 0.75) for field in dataclasses.fields(Effects)})
     friction = JointFriction(
         viscous=rng.uniform(0.0, 3.0, robot.n),
         coulomb=rng.uniform(0.0, 3.0, robot.n),
@@ -314,8 +314,8 @@ def random_case(seed: int, name: str) -> Case:
         normal=normal,
         law=law,
         target=target,
-        terms=terms,
-        friction=friction if terms.friction else None,
+        effects=effects,
+        friction=friction if effects.friction else None,
         stance=BothSoles(base_mass=1e4, base_inertia=1e3) if heavy else None,
         horizon=0.2,
     )

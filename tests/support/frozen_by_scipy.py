@@ -45,14 +45,14 @@ class FrozenCollision:
         return float(hand - self.hit.velocity([*y[2 : 2 + self.k]]))
 
     def flow(self, t: float, y: Any, compressing: bool) -> Any:
-        terms, values, rate = self.model.terms, self.values, self.rate(t, y)
+        effects, values, rate = self.model.effects, self.values, self.rate(t, y)
         force = float(self.law.branch(float(y[0]), rate, compressing))
         force = max(force, 0.0) if compressing else force
         u = self.A @ y[2 + self.k : 2 + self.k + self.n] - self.s * y[1] + self.d * t
         tau = self.torque - self.kd @ u + self.kp @ y[2 + self.k + self.n :]
-        if terms.saturation:
+        if effects.saturation:
             tau = np.clip(tau, -values["torque_limit"], values["torque_limit"])
-        if terms.friction:
+        if effects.friction:
             w = self.joint_velocity + u
             slips = np.clip(w / self.model.joint_friction.transition, -1.0, 1.0)
             tau = tau - values["viscous"] * w - values["coulomb"] * slips

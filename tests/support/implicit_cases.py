@@ -26,7 +26,7 @@ def gradient(model: Any, output: str, values: list[Any]) -> tuple[float, Any, An
 def exact(model: Any, values: list[Any]) -> Callable[[Any, Any], Any]:
     """The collision at q and v, exact; what it is for the gradient's functions is in `values`."""
     true = ExactCollision(model)
-    first = 3 if model.terms.feedforward else 2
+    first = 3 if model.effects.feedforward else 2
     torque = values[2] if first == 3 else None
     others = dict(zip(model.settings, values[first:], strict=True))
     return lambda q, v: true.collide(q, v, torque, require_separation=False, **others)

@@ -77,7 +77,7 @@ def inputs(model: Any, q: Any, v: Any, torque: Any) -> list[Any]:
         random = np.random.default_rng(7).normal(size=values["reference"].shape)
         values["reference_until"] = np.array(0.02)
         values["reference"] = 0.5 * random * 50.0 ** np.arange(1, random.shape[1] + 1)
-    return [q, v, *([torque] if model.terms.feedforward else []), *values.values()]
+    return [q, v, *([torque] if model.effects.feedforward else []), *values.values()]
 
 
 def native(model: Any, outputs: tuple[str, ...], every: int = 1) -> Any:

@@ -21,12 +21,12 @@ def unlucky(folder: Path, number: int) -> Any:
 def slow(limit: float, _: int) -> None:
     import numpy as np
 
-    from impactopt.sweeps.alarm import Alarm
+    from impactopt.sweeps.watchdog import Watchdog
 
-    alarm = Alarm(limit, 0.1)
+    watchdog = Watchdog(limit, 0.1)
     for _ in range(3):  # news put it off
         time.sleep(0.8 * limit)
-        alarm.iteration(None)
+        watchdog.iteration(None)
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     while True:  # no Python between: as compiled code does not come back
         np.linalg.matrix_power(np.eye(400), 10**9)
@@ -41,7 +41,7 @@ def pools(_: None, number: int) -> int:
     def count(*_: Any) -> Any:
         return {"reason": [""], "threads": [max(pool["num_threads"] for pool in threadpool_info())]}, {}
 
-    evaluate.GRAINS["solve"] = count
+    evaluate.CASE_KINDS["solve"] = count
     unit = Unit(index=number, first=0, count=1, columns={})
-    found = evaluate.evaluate(Work(data={}, path=Path("p"), grain="solve"), unit)
+    found = evaluate.evaluate(Work(data={}, path=Path("p"), case_kind="solve"), unit)
     return int(found.columns["threads"][0])

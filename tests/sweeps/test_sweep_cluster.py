@@ -17,7 +17,7 @@ import pytest
 from support.sweep_workers import unlucky
 
 from impactopt.errors import InputError
-from impactopt.sweeps import Progress, sweep, sweep_from_data
+from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.cluster import on_cluster
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.units import Unit, Work
@@ -25,7 +25,7 @@ from impactopt.sweeps.units import Unit, Work
 TIMES = ("seconds", "solve_seconds", "build_seconds")
 RESISTANCES = [500.0, 650.0, 9e3, 600.0, 800.0]
 SWEEP = {
-    "sweep": {"problem": "arm_planar", "grain": "strike"},
+    "sweep": {"problem": "arm_planar", "case_kind": "strike"},
     "grid": {"target.resistance": RESISTANCES},
 }
 
@@ -44,10 +44,10 @@ def client() -> Iterator[Any]:
 
 def test_a_worker_of_the_cluster_that_is_killed_costs_nothing(tmp_path: Path, client: Any) -> None:
     chosen = sweep_from_data(SWEEP)
-    work = Work(data=chosen.problem.data, path=chosen.problem.path, grain="strike")
-    told: list[Progress] = []
+    work = Work(data=chosen.problem.data, path=chosen.problem.path, case_kind="strike")
+    told: list[SweepProgress] = []
 
-    def kill_one(now: Progress) -> None:
+    def kill_one(now: SweepProgress) -> None:
         told.append(now)
         if len(told) == 1:
             busy = next(address for address, tasks in client.processing().items() if tasks)
@@ -92,7 +92,7 @@ def lethal(folder: Path, unit: Unit) -> Any:
 
 
 def test_workers_of_another_version_are_refused(client: Any) -> None:
-    work = Work(data={}, path=Path("p"), grain="solve", version="0.0.0")
+    work = Work(data={}, path=Path("p"), case_kind="solve", version="0.0.0")
     with pytest.raises(InputError, match=r"a worker has impactopt .*, the sweep 0\.0\.0"):
         list(on_cluster(work, [Unit(index=0, first=0, count=1, columns={})], client, print))
 

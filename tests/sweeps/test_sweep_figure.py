@@ -150,7 +150,7 @@ def test_text_is_no_number() -> None:
 # ---------------------------------------------------------------- sweep files
 def collisions_data(**figure: Any) -> dict[str, Any]:
     return {
-        "sweep": {"problem": "arm7", "grain": "collision", "outputs": ["impulse_Ns"]},
+        "sweep": {"problem": "arm7", "case_kind": "collision", "outputs": ["impulse_Ns"]},
         "grid": {"at_contact.speed": {"from": 0.1, "to": 0.5, "count": 3}, "target.mass": [0.1, 0.2]},
         "figure": {"kind": "heatmap", "x": "at_contact.speed", "y": "target.mass", **figure},
     }
@@ -180,7 +180,7 @@ def test_the_command_draws(tmp_path: Path) -> None:
         """
         [sweep]
         problem = "arm7"
-        grain = "collision"
+        case_kind = "collision"
         [grid]
         at_contact.speed = {from = 0.1, to = 0.5, count = 3}
         target.mass = [0.1, 0.2]
@@ -204,4 +204,4 @@ def test_the_command_draws(tmp_path: Path) -> None:
 @pytest.mark.parametrize("file", STUDIES, ids=lambda file: file.stem)
 def test_studies_are_sound(file: Path) -> None:
     study = read_sweep_file(file)
-    assert study.grain == "collision" and study.figure is not None
+    assert study.case_kind == "collision" and study.figure is not None

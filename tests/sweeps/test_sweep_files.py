@@ -98,7 +98,7 @@ def test_nothing_varied_is_one_case_and_whole_numbers_stay_whole() -> None:
 TEXT = """\
 [sweep]
 problem = "arm.toml"
-grain = "strike"
+case_kind = "strike"
 seed = 3
 
 [grid]
@@ -123,7 +123,7 @@ def message(path: Path) -> str:
 
 def test_a_file_names_its_problem_relative_to_itself(tmp_path: Path) -> None:
     found = read_sweep_file(written(tmp_path))
-    assert (found.name, found.grain, found.seed) == ("sweep", "strike", 3)
+    assert (found.name, found.case_kind, found.seed) == ("sweep", "strike", 3)
     assert cases(found) == [(0.05, 100.0), (0.1, 100.0)]
     assert found.problem.path == tmp_path / "arm.toml"
 
@@ -136,7 +136,7 @@ def test_settings_stand_in_for_what_the_file_says(tmp_path: Path) -> None:
     again = tmp_path / "as_it_was_kept.toml"
     again.write_text(found.text, encoding="utf-8")
     assert read_sweep_file(again).hash == found.hash != read_sweep_file(written(tmp_path)).hash
-    for key, value in (("sweep.grain", "collisions"), ("grid", 3), ("draw", "much"), ("draw.over", 1)):
+    for key, value in (("sweep.case_kind", "collisions"), ("grid", 3), ("draw", "much"), ("draw.over", 1)):
         with pytest.raises(InputError, match=key.split(".")[-1]):
             read_sweep_file(written(tmp_path), {key: value})
 
@@ -153,9 +153,9 @@ def test_sweeps_of_the_package_go_by_name(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_all_mistakes_are_told_with_their_lines(tmp_path: Path) -> None:
-    text = TEXT.replace('grain = "strike"', 'grain = "strik"\nworkers = 2')
+    text = TEXT.replace('case_kind = "strike"', 'case_kind = "strik"\nworkers = 2')
     said = message(written(tmp_path, text))
-    assert "line 3, [sweep] grain: 'strik' is unknown (did you mean 'strike'?)" in said
+    assert "line 3, [sweep] case_kind: 'strik' is unknown (did you mean 'strike'?)" in said
     assert "line 4, [sweep] workers: unknown key" in said
 
 

@@ -24,19 +24,19 @@ from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.output import load_record
 from impactopt.simulation.workers import Died, each_on_workers
-from impactopt.sweeps import Progress, sweep, sweep_from_data
-from impactopt.sweeps.alarm import RANG
+from impactopt.sweeps import SweepProgress, sweep, sweep_from_data
 from impactopt.sweeps.collisions import collide_many
 from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.journal import Entry, Journal
 from impactopt.sweeps.running import TOGETHER
 from impactopt.sweeps.units import Found, Unit, Work
+from impactopt.sweeps.watchdog import ENDED_BY_WATCHDOG
 
 TIMES = ("seconds", "solve_seconds", "build_seconds")  # which no two runs share
 RESISTANCES = [500.0, 650.0, 9e3, 600.0]
 SWEEP = {
-    "sweep": {"problem": "arm_planar", "grain": "strike", "name": "nails"},
+    "sweep": {"problem": "arm_planar", "case_kind": "strike", "name": "nails"},
     "grid": {"target.resistance": RESISTANCES},
 }
 
@@ -54,7 +54,7 @@ def failures(found: list[dict[str, Any]]) -> int:
 def undisturbed() -> list[dict[str, Any]]:
     """The rows, one after the other in this process."""
     chosen = sweep_from_data(SWEEP)
-    work = Work(data=chosen.problem.data, path=chosen.problem.path, grain="strike")
+    work = Work(data=chosen.problem.data, path=chosen.problem.path, case_kind="strike")
     out = []
     for case, value in enumerate(RESISTANCES):
         unit = Unit(index=case, first=case, count=1, columns={"target.resistance_N": [value]})
@@ -67,16 +67,16 @@ def undisturbed() -> list[dict[str, Any]]:
 def test_ctrl_c_and_a_worker_that_is_killed_cost_nothing_and_the_table_tells_all(
     tmp_path: Path, undisturbed: list[dict[str, Any]]
 ) -> None:
-    def stop(now: Progress) -> None:
+    def stop(now: SweepProgress) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # Ctrl-C
         sweep(SWEEP, tmp_path / "out", workers=1, progress=stop)
     assert multiprocessing.active_children() == []
     assert rows(tmp_path / "out" / "table.parquet") == undisturbed[:1]
-    told: list[Progress] = []
+    told: list[SweepProgress] = []
 
-    def kill_one(now: Progress) -> None:
+    def kill_one(now: SweepProgress) -> None:
         told.append(now)
         if len(told) == 1:
             victim = multiprocessing.active_children()[0]
@@ -119,7 +119,7 @@ def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(
     file, out = tmp_path / "nails.toml", tmp_path / "out"
     values = ", ".join(map(str, RESISTANCES))
     file.write_text(
-        f'[sweep]\nproblem = "arm_planar"\ngrain = "strike"\n[grid]\ntarget.resistance = [{values}]\n',
+        f'[sweep]\nproblem = "arm_planar"\ncase_kind = "strike"\n[grid]\ntarget.resistance = [{values}]\n',
         encoding="utf-8",
     )
     parent = subprocess.Popen(
@@ -147,7 +147,7 @@ def test_a_parent_that_is_killed_leaves_no_orphans_and_its_rows(
 def test_a_failure_is_a_row_with_its_reason_and_results_are_kept_on_demand(tmp_path: Path) -> None:
     points = [[0.7, 0.0, 0.75], [30.0, 0.0, 0.75]]
     given = {
-        "sweep": {"problem": "arm_planar", "grain": "strike", "trajectories": True},
+        "sweep": {"problem": "arm_planar", "case_kind": "strike", "trajectories": True},
         "grid": {"problem.point": points},
     }
     out = tmp_path / "out"
@@ -179,11 +179,11 @@ def test_an_input_is_tried_again_so_often_and_no_more(tmp_path: Path) -> None:
 
 def test_a_case_that_does_not_stop_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     began = time.perf_counter()
-    assert dict(each_on_workers(slow, 0.3, [(0, 0)], workers=1)) == {0: Died(code=RANG, tries=1)}
+    assert dict(each_on_workers(slow, 0.3, [(0, 0)], workers=1)) == {0: Died(code=ENDED_BY_WATCHDOG, tries=1)}
     assert time.perf_counter() - began > 3 * 0.8 * 0.3
-    work = Work(data={}, path=Path("p"), grain="solve", time_limit=0.5)
+    work = Work(data={}, path=Path("p"), case_kind="solve", time_limit=0.5)
     units = [Unit(index=k, first=k, count=1, columns={}) for k in range(2)]
-    ends = [Died(code=RANG, tries=1), Died(code=-signal.SIGSEGV, tries=3)]
+    ends = [Died(code=ENDED_BY_WATCHDOG, tries=1), Died(code=-signal.SIGSEGV, tries=3)]
     monkeypatch.setattr(
         "impactopt.sweeps.engines.each_on_workers",
         lambda *a, **k: zip(*[[0, 1], ends], strict=True) if list(a[2]) else None,
@@ -198,7 +198,7 @@ def test_workers_have_one_blas_thread() -> None:
 
 
 def test_a_worker_of_another_version_is_refused() -> None:
-    work = Work(data={}, path=Path("p"), grain="solve", version="0.0.0")
+    work = Work(data={}, path=Path("p"), case_kind="solve", version="0.0.0")
     with pytest.raises(InputError, match=r"the sweep 0\.0\.0; install the same"):
         evaluate(work, Unit(index=0, first=0, count=1, columns={}))
 
@@ -223,7 +223,7 @@ def test_collisions_go_in_chunks_and_are_the_same_one_by_one(
     given = {
         "sweep": {
             "problem": "arm7",
-            "grain": "collision",
+            "case_kind": "collision",
             "outputs": ["impulse_Ns", "peak_force_N", "contact_ms"],
         },
         "draw": {"method": "latin hypercube", "count": 150, "over": over},
@@ -244,10 +244,13 @@ def test_collisions_go_in_chunks_and_are_the_same_one_by_one(
 
 
 def test_what_collisions_do_not_have_is_said() -> None:
-    given = {"sweep": {"problem": "arm7", "grain": "collision", "starts": 2}, "grid": {"target.mass": [1.0]}}
+    given = {
+        "sweep": {"problem": "arm7", "case_kind": "collision", "starts": 2},
+        "grid": {"target.mass": [1.0]},
+    }
     with pytest.raises(InputError, match=r"\[sweep\] starts: collisions have none"):
         sweep_from_data(given)
     with pytest.raises(InputError, match=r"speed_m_s: missing"):
-        sweep_from_data({**given, "sweep": {"problem": "arm7", "grain": "collision"}})
+        sweep_from_data({**given, "sweep": {"problem": "arm7", "case_kind": "collision"}})
     with pytest.raises(InputError, match="of collisions only"):
         sweep_from_data({"sweep": {"problem": "arm7", "outputs": ["impulse_Ns"]}})

@@ -14,7 +14,7 @@ from impactopt.files.output import load_record, record_of, save_record
 from impactopt.files.replay import load_planned
 from impactopt.planning.solution import Solution
 from impactopt.problem.scenario import Scenario
-from impactopt.simulation import Conditions
+from impactopt.simulation import Perturbation
 from impactopt.transcription.transcription import Transcription
 
 PROBLEM = Path(__file__).resolve().parents[2] / "problems" / "punch.toml"
@@ -67,7 +67,7 @@ def test_its_nodes_have_the_rows_of_a_follow_through(biped_transcription: Transc
 
 
 def test_the_punch_into_the_air_stands(punch: Solution) -> None:
-    air = punch.validate(engine="mujoco", conditions=Conditions(missing=True))
+    air = punch.validate(engine="mujoco", perturbation=Perturbation(missing=True))
     assert air.standing, air.fall
     assert air.impulse == 0.0 and air.slip.max() < 5e-3 and air.lift.max() < 2e-3
     np.testing.assert_allclose(air.q[-1, 7:], punch.missed_trajectory.q[-1, 7:], atol=0.02)

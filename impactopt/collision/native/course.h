@@ -77,7 +77,7 @@ static const double *filled(const double *given, double *room, int n) {
 }
 
 #if FREEZES
-/* configuration and velocity at state y, from those at the begin of the stretch */
+/* configuration and velocity at state y, from those at the begin of the segment */
 static void moved(const Frozen *F, const double *q, const double *v, const State *y, double *q_then,
                   double *v_then) {
   double way[NV], change[NV], from[NQ];
@@ -96,17 +96,17 @@ static void moved(const Frozen *F, const double *q, const double *v, const State
 typedef struct {
   State final;
   double impulse, duration, in_contact;
-  double q[NQ], v[NV]; /* at the begin of the last stretch */
+  double q[NQ], v[NV]; /* at the begin of the last segment */
 } Course;
 
 #if FREEZES
-/* from contact, over n stretches of about that duration at all; the freeze at contact is in w */
-static void stretches(const double **arg, Work *w, Course *c, double duration, int n, Record *recorded) {
+/* from contact, over n segmentes of about that duration at all; the freeze at contact is in w */
+static void segmentes(const double **arg, Work *w, Course *c, double duration, int n, Record *recorded) {
   Frozen *F = &w->frozen;
   Data *d = &w->data;
   const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
   const double *normal = filled(arg[ARG_normal], w->normal, 3);
-  const int whole = n == FREEZES; /* else the one stretch of a trial */
+  const int whole = n == FREEZES; /* else the one segment of a trial */
   State start = {0}, reached = {0}, middle;
   double q_middle[NQ], v_middle[NV], q_then[NQ], v_then[NV];
   memcpy(c->q, q, sizeof c->q);
@@ -182,9 +182,9 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   run(d, &reached, STEPS_AT_ALL, 0, &w->tape);
   w->frozen_at_contact = *F;
   w->data_at_contact = *d;
-  stretches(arg, w, c, reached.time, 1, 0);
+  segmentes(arg, w, c, reached.time, 1, 0);
   *F = w->frozen_at_contact;
   *d = w->data_at_contact;
-  stretches(arg, w, c, c->duration, FREEZES, record);
+  segmentes(arg, w, c, c->duration, FREEZES, record);
 #endif
 }

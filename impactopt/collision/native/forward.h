@@ -20,7 +20,7 @@
 #define ROWS_OF_V (V * LANES)
 enum { BY_Q, BY_V, BY_FEEDFORWARD };
 #define KINDS (2 + FEEDFORWARD)
-#define WAYS(kind) ((kind) == BY_FEEDFORWARD ? N : NV)
+#define SEEDS(kind) ((kind) == BY_FEEDFORWARD ? N : NV)
 
 #define FOR_EACH(k) FOR(k, VD)
 

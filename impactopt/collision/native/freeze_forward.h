@@ -40,15 +40,15 @@ static void roots_forward(const double *q, const double *v, const double *normal
   FOR(i, NV) *lane(w->identity[i], i) = 1.0;
   const double *in[] = {q, v, normal};
   double *parts[] = {w->parts};
-  const vec *way[] = {w->identity[0]};
+  const vec *seed[] = {w->identity[0]};
   vec *by_q[] = {w->root[0], w->held[0], t->hand_speed[BY_Q], t->soles[0], t->unmodelled[BY_Q][0]};
   vec *by_v[] = {t->hand_speed[BY_V], t->unmodelled[BY_V][0]};
   tree_parts(in, parts, 0, 0, 0);
-  tree_forward(w->parts, way, by_q, VD);
+  tree_forward(w->parts, seed, by_q, VD);
   double few[APPROACH_PARTS];
   parts[0] = few;
   approach_parts(in, parts, 0, 0, 0);
-  approach_forward(few, way, by_v, VD);
+  approach_forward(few, seed, by_v, VD);
 
   /* P, U, E */
   memcpy(w->P, F->Z, sizeof w->P);
@@ -147,7 +147,7 @@ static void drifts_forward(const double *q, const double *normal, double yields,
     FOR(c, C) rest[r] += ((const double *)F->held[r])[c] * L_0[c];
   }
   FOR(kind, 2) {
-    const vec *way[] = {kind == BY_Q ? w->identity[0] : w->none[0], velocity[kind][0]};
+    const vec *seed[] = {kind == BY_Q ? w->identity[0] : w->none[0], velocity[kind][0]};
     vec *moved[] = {
 #if BIAS
       of_bias[0],
@@ -156,7 +156,7 @@ static void drifts_forward(const double *q, const double *normal, double yields,
       of_hand, of_held[0]
 #endif
     };
-    drift_forward(parts, way, moved, VD);
+    drift_forward(parts, seed, moved, VD);
     vec root[NV][VD], (*push)[VD] = t->L_0[kind], (*sum)[VD] = t->drift[kind];
     memset(root, 0, sizeof root);
 #if BIAS

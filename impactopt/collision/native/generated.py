@@ -15,11 +15,19 @@ from impactopt.collision.model import JointSpaceModel
 from impactopt.contact import ContactLaw
 from impactopt.kinematics.stance import Stance
 
-__all__ = ["Tree", "backwards", "c_code", "gamma_of", "scalar_functions", "tangent_back", "tree_functions"]
+__all__ = [
+    "TreeFunctions",
+    "backwards",
+    "c_code",
+    "gamma_of",
+    "scalar_functions",
+    "tangent_back",
+    "tree_functions",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tree:
+class TreeFunctions:
     """Functions of the robot's tree, and where their sparse results go.
 
     Attributes
@@ -35,7 +43,7 @@ class Tree:
     held: list[tuple[int, int]]
 
 
-def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> Tree:
+def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> TreeFunctions:
     """With what the ground's wrench needs, where it is wanted; n is the number of servos."""
     tree, robot = frozen._tree, frozen.robot
     rb, normal = tree.rb, tree.normal
@@ -59,7 +67,7 @@ def tree_functions(frozen: FrozenDynamics, n: int, *, ground: bool) -> Tree:
         ca.Function("integrate", [rb.q, d], [rb.integrate(d)]),
         ca.Function("hand_speed_at", known, [tree.hand_speed]),
     ]
-    return Tree(functions=functions, root=places, held=_nonzeros(held))
+    return TreeFunctions(functions=functions, root=places, held=_nonzeros(held))
 
 
 def _nonzeros(matrix: Any) -> list[tuple[int, int]]:

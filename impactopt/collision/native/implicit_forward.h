@@ -202,17 +202,17 @@ static void bend_forward(const Bend *b, const SeriesTangent *s, InputsTangent n)
         seen[o][k] += AT_NODES[i][j] * w;
       }
     }
-    FOR(way, NV) FOR(a, INPUTS) {
+    FOR(seed, NV) FOR(a, INPUTS) {
       double x = 0.0;
-      FOR(o, SEEN) x += b->by[i][a][o] * ((const double *)seen[o])[way];
-      at[way][a * NODES + i] = x;
+      FOR(o, SEEN) x += b->by[i][a][o] * ((const double *)seen[o])[seed];
+      at[seed][a * NODES + i] = x;
     }
   }
   memset(n, 0, sizeof(InputsTangent));
-  FOR(way, NV) {
-    solve_bend(b, at[way]);
+  FOR(seed, NV) {
+    solve_bend(b, at[seed]);
     FOR(j, TERMS) FOR(a, INPUTS) FOR(i, NODES)
-      *lane(n[j][a], way) += FROM_NODES[j][i] * at[way][a * NODES + i];
+      *lane(n[j][a], seed) += FROM_NODES[j][i] * at[seed][a * NODES + i];
   }
 }
 #endif

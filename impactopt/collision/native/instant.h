@@ -6,7 +6,7 @@ typedef struct {
   double target[NZ1];
 } State;
 
-/* what is constant during a stretch of the collision */
+/* what is constant during a segment of the collision */
 typedef struct {
   const Frozen *frozen;
   double hand_speed, until;

@@ -10,16 +10,16 @@ typedef struct {
 
 static void scalars_forward(const Course *c, const Data *d, int kind, const StateTangent *dy, double **by) {
 #ifdef OUT_impulse
-  if (by[OUT_impulse]) put(&dy->impulse, WAYS(kind), 1, 1, 0, by[OUT_impulse]);
+  if (by[OUT_impulse]) put(&dy->impulse, SEEDS(kind), 1, 1, 0, by[OUT_impulse]);
 #endif
 #ifdef OUT_peak_force
-  if (by[OUT_peak_force]) put(&dy->peak, WAYS(kind), 1, 1, 0, by[OUT_peak_force]);
+  if (by[OUT_peak_force]) put(&dy->peak, SEEDS(kind), 1, 1, 0, by[OUT_peak_force]);
 #endif
 #ifdef OUT_duration
-  if (by[OUT_duration]) put(&dy->time, WAYS(kind), 1, 1, 0, by[OUT_duration]);
+  if (by[OUT_duration]) put(&dy->time, SEEDS(kind), 1, 1, 0, by[OUT_duration]);
 #endif
 #ifdef OUT_separated
-  if (by[OUT_separated]) memset(by[OUT_separated], 0, WAYS(kind) * sizeof(double));
+  if (by[OUT_separated]) memset(by[OUT_separated], 0, SEEDS(kind) * sizeof(double));
 #endif
 #ifdef OUT_energy
   double slope[NZ1] = {0}, one = 1.0;
@@ -31,7 +31,7 @@ static void scalars_forward(const Course *c, const Data *d, int kind, const Stat
     sum[0][k] = (vec){0};
     FOR(i, NZ) sum[0][k] += slope[i] * dy->target[i][k];
   }
-  if (by[OUT_energy]) put(sum, WAYS(kind), 1, 1, 0, by[OUT_energy]);
+  if (by[OUT_energy]) put(sum, SEEDS(kind), 1, 1, 0, by[OUT_energy]);
 #endif
 }
 
@@ -61,5 +61,5 @@ static void evaluate(const double **arg, double **res, Whole *w) {
   FOR(kind, KINDS) if (wanted[kind]) scalars_forward(&c, d, kind, &w->run.states[kind], by[kind]);
   /* no number in, none out */
   if (c.final.impulse != c.final.impulse) FOR(kind, KINDS) FOR(i, N_VALUES)
-    FOR(k, (ROWS[i] ? ROWS[i] * N_COLUMNS[0] : 1) * WAYS(kind)) if (by[kind][i]) by[kind][i][k] = NAN;
+    FOR(k, (ROWS[i] ? ROWS[i] * N_COLUMNS[0] : 1) * SEEDS(kind)) if (by[kind][i]) by[kind][i][k] = NAN;
 }

@@ -4,7 +4,7 @@ typedef struct {
   double **out;
   const double *v; /* at contact */
   double since;
-  int column, columns; /* of the present stretch: the first, and how many */
+  int column, columns; /* of the present segment: the first, and how many */
 } Record;
 
 /* outputs that are no derivatives */

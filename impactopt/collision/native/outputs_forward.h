@@ -16,11 +16,11 @@ typedef struct {
   vec impulse[VD], penetration[VD], time[VD], peak[VD], rate[VD], force[VD], target_speed[VD];
 } StateTangent;
 
-INLINE void put(const vec (*x)[VD], int ways, int rows, int columns, int column, double *to) {
-  FOR(way, ways) FOR(i, rows) to[(long)way * rows * columns + (long)rows * column + i] = ((const double *)x[i])[way];
+INLINE void put(const vec (*x)[VD], int seeds, int rows, int columns, int column, double *to) {
+  FOR(seed, seeds) FOR(i, rows) to[(long)seed * rows * columns + (long)rows * column + i] = ((const double *)x[i])[seed];
 }
 #define PUT(name, rows, x) \
-  if (by[OUT_##name]) put((const vec(*)[VD])(x), WAYS(kind), rows, N_COLUMNS[0], column, by[OUT_##name])
+  if (by[OUT_##name]) put((const vec(*)[VD])(x), SEEDS(kind), rows, N_COLUMNS[0], column, by[OUT_##name])
 
 static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F, const vec (*P)[V], int kind,
                           const Instant *at, double force, const StateTangent *x, const RecordTangent *record,
@@ -131,7 +131,7 @@ static void repeat_tangent(const RecordTangent *record, int column) {
     const long rows = ROWS[i], size = rows * N_COLUMNS[0];
     double *to = record->by[kind][i];
     if (!rows || !to) continue;
-    FOR(way, WAYS(kind)) for (int k = column + 1; k < N_COLUMNS[0]; k++)
-      memcpy(to + way * size + rows * k, to + way * size + rows * column, rows * sizeof(double));
+    FOR(seed, SEEDS(kind)) for (int k = column + 1; k < N_COLUMNS[0]; k++)
+      memcpy(to + seed * size + rows * k, to + seed * size + rows * column, rows * sizeof(double));
   }
 }

@@ -14,7 +14,7 @@ from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model
 from impactopt.collision.implicit import NODES, STAGES, gamma, tables
 from impactopt.collision.loop import BLOCK
 from impactopt.collision.model import shape_of
-from impactopt.collision.native.generated import Tree, gamma_of
+from impactopt.collision.native.generated import TreeFunctions, gamma_of
 from impactopt.collision.outputs import HISTORIES, OF_SOLES, frozen_for
 from impactopt.collision.runge_kutta import LEFT_OUT_BY_RK4
 from impactopt.collision.stepped import SteppedModel, number_of_steps
@@ -35,7 +35,7 @@ def shapes_in(collision: SteppedModel) -> dict[str, tuple[int, int]]:
     """Shapes of the inputs by name."""
     robot = collision.robot
     shapes = {"q": (robot.nq, 1), "v": (robot.nv, 1)}
-    if collision.terms.feedforward:
+    if collision.effects.feedforward:
         shapes["feedforward"] = (robot.n, 1)
     return shapes | {name: shape_of(value) for name, value in collision.settings.items()}
 
@@ -87,7 +87,7 @@ def _rows(collision: SteppedModel, history: str) -> int:
 
 
 def _ends(collision: SteppedModel) -> list[float]:
-    """Where stretches end, as fractions of the contact's duration."""
+    """Where segmentes end, as fractions of the contact's duration."""
     return cuts(max(collision.n_freezes, 1))
 
 
@@ -99,7 +99,7 @@ def _blocks(collision: SteppedModel, fraction: float) -> int:
 
 
 def _steps(collision: SteppedModel) -> list[int]:
-    """Steps of each stretch; the last may take as long as the horizon."""
+    """Steps of each segment; the last may take as long as the horizon."""
     shares = [b - a for a, b in pairwise(_ends(collision))]
     return [_blocks(collision, share) for share in (*shares[:-1], 1.0)]
 
@@ -111,9 +111,9 @@ def _columns(collision: SteppedModel, every: int) -> list[int]:
     return [-(-count // every) + 1 for count in _steps(collision)]
 
 
-def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: Tree) -> str:
+def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: TreeFunctions) -> str:
     """Everything that the kernel has to know of the model, as macros and tables."""
-    robot, terms, settings, n = collision.robot, collision.terms, collision.settings, collision.n_servos
+    robot, effects, settings, n = collision.robot, collision.effects, collision.settings, collision.n_servos
     model = joint_space_model(collision, outputs, freezes=collision.n_freezes)
     held = collision.held_by.constraint_frames(robot)
     soles = collision.held_by.sole_frames(robot)
@@ -146,15 +146,15 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "GIVES_WAY": repr(GIVES_WAY),
         "HORIZON": repr(float(collision.horizon)),
         "TRANSITION": repr(float(model.transition)),
-        "STIFFNESS": int(terms.stiffness and n > 0),
-        "FEEDFORWARD": int(terms.feedforward and n > 0),
-        "SATURATION": int(terms.saturation and n > 0),
-        "FRICTION": int(terms.friction and n > 0),
+        "STIFFNESS": int(effects.stiffness and n > 0),
+        "FEEDFORWARD": int(effects.feedforward and n > 0),
+        "SATURATION": int(effects.saturation and n > 0),
+        "FRICTION": int(effects.friction and n > 0),
         "REFERENCE": settings["reference"].shape[1] if "reference" in settings else 0,
-        "BIAS": int(terms.bias),
-        "JDOT": int(terms.jdot),
+        "BIAS": int(effects.bias),
+        "JDOT": int(effects.jdot),
         "KD_MATRIX": int(n > 0 and settings["kd"].ndim == 2),
-        "KP_MATRIX": int(n > 0 and terms.stiffness and settings["kp"].ndim == 2),
+        "KP_MATRIX": int(n > 0 and effects.stiffness and settings["kp"].ndim == 2),
         "PEAK": int(model.peak),
         "STEP_ERROR": int(model.error),
         "LEFT_OUT_BY_RK4": repr(LEFT_OUT_BY_RK4),

@@ -18,7 +18,7 @@ from impactopt.collision.native.generated import (
     tangent_back,
     tree_functions,
 )
-from impactopt.collision.native.lanes import tree_in_lanes
+from impactopt.collision.native.simd import simd_tree
 from impactopt.collision.native.sizes import (
     directions,
     names_table,
@@ -155,7 +155,7 @@ def _code(
         shapes |= dict.fromkeys(by_both, (collision.robot.nv, 1))
     lanes: list[str] = []
     if jacobian:
-        moved = tree_in_lanes(frozen, tree, ground=ground)
+        moved = simd_tree(frozen, tree, ground=ground)
         of_tree = [*of_tree, *[parts for parts, _ in moved]]
         lanes = [_LANES[0], *[code for _, code in moved], _LANES[1]]
         scalars += backwards([f for f in scalars if f.name() == "target_energy"])

@@ -57,10 +57,10 @@ class ContactLaw(Described, ABC):
         """
 
     def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
-        """What falls through zero [N] where contact ends, with a slope there: the force of restitution.
+        """Expression [N] that falls through zero, with a slope, where contact ends: the force of restitution.
 
-        A law whose force leaves off without a slope gives something else that is zero there: plans end
-        contact on it.
+        Plans end contact on it. A law whose force has no slope there gives another expression that is zero at
+        the same place and has one.
         """
         return self.branch(penetration, rate, False, parameters)
 

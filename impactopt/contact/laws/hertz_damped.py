@@ -30,8 +30,8 @@ class HertzDamped(ContactLaw):
     """
 
     word: ClassVar[str] = "Hertz"
-    stiffness: float = field(metadata=about("k", unit="N/m^1.5", above=0))
-    damping: float = field(metadata=about("d", unit="N s/m^1.25", least=0))
+    stiffness: float = field(metadata=about("stiffness k", unit="N/m^1.5", above=0))
+    damping: float = field(metadata=about("damping d", unit="N s/m^1.25", least=0))
 
     @classmethod
     def of_spheres(

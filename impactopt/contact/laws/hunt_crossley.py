@@ -24,9 +24,9 @@ class HuntCrossley(ContactLaw):
     """
 
     word: ClassVar[str] = "Hunt-Crossley"
-    stiffness: float = field(metadata=about("k; p is the exponent", unit="N/m^p", above=0))
-    dissipation: float = field(metadata=about("alpha", unit="s/m", least=0))
-    exponent: float = field(default=1.5, metadata=about("p; 1.5 for a sphere on a plane", least=1))
+    stiffness: float = field(metadata=about("stiffness k; p is the exponent", unit="N/m^p", above=0))
+    dissipation: float = field(metadata=about("dissipation alpha", unit="s/m", least=0))
+    exponent: float = field(default=1.5, metadata=about("exponent p; 1.5 for a sphere on a plane", least=1))
 
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None

@@ -22,8 +22,8 @@ class KelvinVoigt(ContactLaw):
     """
 
     word: ClassVar[str] = "Kelvin-Voigt"
-    stiffness: float = field(metadata=about("k", unit="N/m", above=0))
-    damping: float = field(metadata=about("d", unit="N s/m", least=0))
+    stiffness: float = field(metadata=about("stiffness k", unit="N/m", above=0))
+    damping: float = field(metadata=about("damping d", unit="N s/m", least=0))
 
     def branch(
         self, penetration: Any, rate: Any, compressing: bool, parameters: Parameters | None = None

@@ -20,9 +20,9 @@ class Target(Described, ABC):
     """Something that is hit, at rest when contact begins; motion is along the contact normal only.
 
     To write one, make a frozen dataclass whose fields are its numbers, and give the methods below. They have
-    to be smooth but where one of `switches` changes its sign; `state` is a column of `n_states` numbers or
-    CasADi symbols, zero at rest. Fields with `impactopt.contact.fields.about` as metadata are checked when a
-    target is made.
+    to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states` numbers
+    or CasADi symbols; it is zero at rest. Fields with `impactopt.contact.fields.about` as metadata are
+    checked when a target is made.
 
     Attributes
     ----------
@@ -30,19 +30,20 @@ class Target(Described, ABC):
     n_states : size of the state.
     results : names of what `result` gives.
     typical : sizes of the state's numbers, for scaling; ones if not given.
-    events : what a plan has in the place of switches: what happens to it in a blow, in this order, each of
-        which ends a phase of the contact; see `smooth`.
-    phases : the contact's phases in a plan, three if there are events, which end the first of them; what is
-        left before the last ends with compression, the last with contact.
-    at_once : whether the first event may come with the first touch, so that the phase before it is none.
-    stays : whether it waits where a blow has left it, so that the striker must keep off it afterwards.
+    guards : names of the transitions that a plan goes through in place of switches, in this order. Each ends
+        a phase of the contact, where `guard` is zero; see `smooth`.
+    phases : names of the contact's phases in a plan: two, or three if there are guards. Guards end the first
+        ones. If one more is left before the last, it ends with compression. The last ends at separation.
+    at_once : whether the first guard may be met at the first touch, so that the phase before it has no
+        length.
+    stays : whether the target stays where the blow leaves it. The striker must then keep off it afterwards.
     """
 
     word: ClassVar[str] = ""
     n_states: int
     results: ClassVar[tuple[str, ...]] = ()
     typical: ClassVar[tuple[float, ...]] = ()
-    events: ClassVar[tuple[str, ...]] = ()
+    guards: ClassVar[tuple[str, ...]] = ()
     phases: ClassVar[tuple[str, ...]] = ("compression", "restitution")
     at_once: ClassVar[bool] = False
     stays: ClassVar[bool] = False
@@ -52,8 +53,8 @@ class Target(Described, ABC):
 
     @property
     def turns(self) -> bool:
-        """Whether a phase ends with compression: events do not end all phases but the last."""
-        return len(self.events) < len(self.phases) - 1
+        """Whether a phase of a plan ends with compression: guards do not end all phases but the last."""
+        return len(self.guards) < len(self.phases) - 1
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -73,23 +74,25 @@ class Target(Described, ABC):
 
     @abstractmethod
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Energy [J] that the target holds, or has used up in what it was hit for."""
+        """Energy [J] that the target has taken: what it holds, and the work done in it, as against wood."""
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        """Expressions whose changes of sign part the motion into smooth pieces; steps end on them."""
+        """Expressions whose changes of sign split the motion into smooth modes; steps end there."""
         return []
 
     def smooth(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> tuple[Any, list[Any]]:
-        """Velocity and d(state)/dt in a phase of the contact as a plan has them, where nothing may switch.
+        """Velocity [m/s] and d(state)/dt in one phase of a plan's contact, where nothing may switch.
 
-        A target without switches moves as it is. One with switches goes in a plan through `events` in a given
-        order, between which it is smooth.
+        Without switches they are `velocity` and `derivative`. With switches, the target goes through its
+        `guards` in their order in a plan, and is smooth in each phase between two of them.
+
+        phase : 0 for the first.
 
         Raises
         ------
-        InputError : it has switches and does not say.
+        InputError : it has switches, and no method `smooth` of its own.
         """
         if self.switches(state, force, parameters):
             raise InputError(
@@ -98,21 +101,23 @@ class Target(Described, ABC):
             )
         return self.velocity(state, parameters), self.derivative(state, force, parameters)
 
-    def event(
+    def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """Zero where a phase ends, of those that `events` end; of order 1.
+        """Expression of order 1 that is zero where a phase ends, of those that `guards` end.
 
-        late : by how much [s] it has lasted longer than it has to.
+        phase : 0 for the first.  late : how much longer the phase lasts than it has to [s].
         """
-        raise NotImplementedError(f"{type(self).__name__} has no events")
+        raise NotImplementedError(f"{type(self).__name__} has no guards")
 
-    def lasting(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
-        """What is not below zero while a phase lasts, one expression of order 1 or none."""
+    def invariant(
+        self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
+    ) -> list[Any]:
+        """Expressions of order 1 that are not negative while a phase lasts: one, or none."""
         return []
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
-        """What the blow has brought, from the state at separation; named by `results`."""
+        """What the blow has done to the target, from the state at separation; named by `results`."""
         return []
 
     def outcome(self, state: Any, parameters: Parameters | None = None) -> dict[str, float]:
@@ -133,13 +138,13 @@ class Target(Described, ABC):
             "switches": self.switches(state, force, numbers),
             "result": self.result(state, numbers),
         }
-        for k, phase in enumerate(self.phases if self.events else ()):
+        for k, phase in enumerate(self.phases if self.guards else ()):
             speed, rates = self.smooth(state, force, k, numbers)
             parts[phase] = [
                 speed,
                 *rates,
-                *([self.event(state, force, ca.SX.sym("T"), k, numbers)] if k < len(self.events) else []),
-                *self.lasting(state, force, k, numbers),
+                *([self.guard(state, force, ca.SX.sym("T"), k, numbers)] if k < len(self.guards) else []),
+                *self.invariant(state, force, k, numbers),
             ]
         made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
         return (*made, f"results: {', '.join(self.results)}")

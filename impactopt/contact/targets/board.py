@@ -16,24 +16,24 @@ __all__ = ["Board"]
 class Board(Target):
     """A board held at its edges: a modal mass on a spring that breaks.
 
-    m dv/dt = f - k w - d v up to the deflection w = breaking_force / k, and m dv/dt = f beyond it: the pieces
-    are a free mass. As f >= 0, and v > 0 at the break, they only move on: broken is broken. The state is
-    (v, w). Its result is `broken`, 1 where the board broke before separation, else 0; whether one that is
-    left swinging breaks later is not looked at.
+    m dv/dt = f - k w - d v up to the deflection w = breaking_force / k, and m dv/dt = f beyond it, where its
+    two halves are a free mass. As f >= 0, and v > 0 at the break, the deflection never comes back: a broken
+    board stays broken. The state is (v, w). Its result is `broken`: 1 if the board broke before separation,
+    else 0. A board that swings on and breaks after separation counts as not broken.
 
     Source: lowest mode of a brittle beam, as in Walker, "Karate strikes", Am. J. Phys. 43 (1975) 845-849.
     """
 
     word: ClassVar[str] = "board"
-    mass: float = field(metadata=about("modal mass where it is hit", unit="kg", above=0))
-    stiffness: float = field(metadata=about("of the bending", unit="N/m", above=0))
-    breaking_force: float = field(metadata=about("of the spring", unit="N", above=0))
-    damping: float = field(default=0.0, metadata=about("of the bending", unit="N s/m", least=0))
+    mass: float = field(metadata=about("modal mass at the hit point", unit="kg", above=0))
+    stiffness: float = field(metadata=about("stiffness of the bending", unit="N/m", above=0))
+    breaking_force: float = field(metadata=about("spring force at which it breaks", unit="N", above=0))
+    damping: float = field(default=0.0, metadata=about("damping of the bending", unit="N s/m", least=0))
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("broken",)
     typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
-    events: ClassVar[tuple[str, ...]] = ("break",)
+    guards: ClassVar[tuple[str, ...]] = ("break",)
     phases: ClassVar[tuple[str, ...]] = ("compression", "compression after the break", "restitution")
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
@@ -48,21 +48,23 @@ class Board(Target):
     def smooth(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> tuple[Any, list[Any]]:
-        """One branch until it breaks, one after."""
+        """On its spring until it breaks, free after that."""
         p = self.parameters if parameters is None else parameters
         bending = p["stiffness"] * state[1] + p["damping"] * state[0]
         return state[0], [(force - (0.0 if phase else bending)) / p["mass"], state[0]]
 
-    def event(
+    def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """The spring's force over that of the break, less 1."""
+        """The spring's force over the breaking force, less 1."""
         p = self.parameters if parameters is None else parameters
         return p["stiffness"] * state[1] / p["breaking_force"] - 1.0
 
-    def lasting(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
-        """It does not break too early."""
-        return [] if phase else [-self.event(state, force, 0.0, phase, parameters)]
+    def invariant(
+        self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
+    ) -> list[Any]:
+        """Before the break the spring's force is below the breaking force."""
+        return [] if phase else [-self.guard(state, force, 0.0, phase, parameters)]
 
     def _beyond(self, state: Any, p: Parameters) -> Any:
         return state[1] - p["breaking_force"] / p["stiffness"]
@@ -72,7 +74,7 @@ class Board(Target):
         return [self._beyond(state, self.parameters if parameters is None else parameters)]
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Kinetic energy, and that of bending: after the break, what it took to break."""
+        """Kinetic energy, and that of bending; after the break the energy that breaking took."""
         p = self.parameters if parameters is None else parameters
         beyond, at_break = self._beyond(state, p), p["breaking_force"] / p["stiffness"]
         bent = choose(beyond > 0, at_break + 0.0 * beyond, state[1])

@@ -21,7 +21,7 @@ class FreeMass(Target):
     """
 
     word: ClassVar[str] = "free mass"
-    mass: float = field(metadata=about("", unit="kg", above=0))
+    mass: float = field(metadata=about("mass of the target", unit="kg", above=0))
 
     n_states = 1
     results: ClassVar[tuple[str, ...]] = ("speed",)

@@ -11,35 +11,37 @@ from impactopt.contact.targets.base import Target
 
 __all__ = ["Nail"]
 
-SOON, LEFT = 1e-3, 1e-4  # of a plan's start: the unit of time [s], and what is left; see `Nail.event`
+SOON, LEFT = 1e-3, 1e-4  # of a plan's start: the unit of time [s], and what is left; see `Nail.guard`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Nail(Target):
     """A nail in wood, which resists with resistance + hardening x depth.
 
-    R = resistance + hardening (depth + z), z driven by this blow. m dv/dt = f - R while the nail moves
-    (v > 0) or is pushed harder than that (f > R); else it stands still, as the wood holds on to it. It never
-    comes back. The state is (v, z). Its result is `depth` [m], what the blow has driven once the nail has
-    stopped: after separation it coasts on until R has used up its energy. The next blow of a series begins at
-    this nail's `depth` plus that.
+    The resistance is R = resistance + hardening (depth + z), where z is how far this blow has driven the
+    nail. m dv/dt = f - R while the nail moves (v > 0) or is pushed harder than the wood holds (f > R).
+    Otherwise it stands still. It never comes back. The state is (v, z). Its result is `depth` [m]: how far
+    the blow drives it until it stops, with the way that it coasts after separation. The next blow of a
+    series begins at this nail's `depth` plus that.
 
     Kind of model: Tsujita et al., "Analysis of nailing task motion for a humanoid robot", IROS 2008,
     1570-1575 (the paper's [10]).
     """
 
     word: ClassVar[str] = "nail"
-    mass: float = field(metadata=about("", unit="kg", above=0))
-    resistance: float = field(metadata=about("of the wood at its surface", unit="N", above=0))
+    mass: float = field(metadata=about("mass of the nail", unit="kg", above=0))
+    resistance: float = field(metadata=about("resistance of the wood at its surface", unit="N", above=0))
     hardening: float = field(
         default=0.0, metadata=about("growth of the resistance with depth", unit="N/m", least=0)
     )
-    depth: float = field(default=0.0, metadata=about("in the wood before the blow", unit="m", least=0))
+    depth: float = field(
+        default=0.0, metadata=about("how deep it is in the wood before the blow", unit="m", least=0)
+    )
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("depth",)
     typical: ClassVar[tuple[float, ...]] = (1.0, 0.01)
-    events: ClassVar[tuple[str, ...]] = ("start", "stop")
+    guards: ClassVar[tuple[str, ...]] = ("start", "stop")
     phases: ClassVar[tuple[str, ...]] = ("press", "drive", "release")
     at_once: ClassVar[bool] = True
     stays: ClassVar[bool] = True
@@ -59,7 +61,7 @@ class Nail(Target):
         return [driven, self.velocity(state, p)]
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
-        """Of the nail that moves, v; of the one that stands, f - R."""
+        """v while the nail moves, f - R while it stands."""
         p = self.parameters if parameters is None else parameters
         beyond = force - self._resistance(state, p)
         return [choose(state[0] > 0, state[0], choose(beyond > 0, state[0], beyond))]
@@ -67,16 +69,16 @@ class Nail(Target):
     def smooth(
         self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
     ) -> tuple[Any, list[Any]]:
-        """It is pressed, driven, and let go; it moves once."""
+        """It stands, is driven, and stands again: it moves once in a blow."""
         p = self.parameters if parameters is None else parameters
         if phase != 1:
             return 0.0 * state[0], [0.0 * state[0], 0.0 * state[0]]
         return state[0], [(force - self._resistance(state, p)) / p["mass"], state[0]]
 
-    def event(
+    def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
     ) -> Any:
-        """It starts where the force is what the wood holds, or at once if it is more from the first touch on.
+        """The nail starts where the force reaches the resistance, or at once if the first force is above it.
 
         The first is f = R and late > 0, the second late = 0 and f > R: complementarity, relaxed to
         late (f / R - 1) = SOON LEFT, both above zero. It stops at v = 0.
@@ -88,8 +90,10 @@ class Nail(Target):
         wait, beyond = late / SOON, force / self._resistance(state, p) - 1.0
         return wait + beyond - ((wait - beyond) ** 2 + 4.0 * LEFT) ** 0.5
 
-    def lasting(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
-        """Driven it does not move back, and released it is not pushed hard enough to move again."""
+    def invariant(
+        self, state: Any, force: Any, phase: int, parameters: Parameters | None = None
+    ) -> list[Any]:
+        """While driven it does not move back; after that the force stays below the resistance."""
         p = self.parameters if parameters is None else parameters
         return [[], [state[0]], [1.0 - force / self._resistance(state, p)]][phase]
 

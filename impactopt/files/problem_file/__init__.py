@@ -7,7 +7,7 @@
 * values.py     ranges of the keys' values
 * mistakes.py   what is wrong in a file, in words: where, what was meant, what is allowed
 * reading.py    from file to problem
-* changes.py    other values by dotted keys
+* changes.py    other values by key paths
 * toml.py       text from and to plain data
 * robot_writing.py, writing.py   from problem to file
 * describing.py, reference.py, template.py   keys in words: comments, docs/problem_files.md, `impactopt new`

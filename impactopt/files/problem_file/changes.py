@@ -1,4 +1,4 @@
-"""Changes of a problem file's data by dotted keys: `target.mass`, `scenarios.missing.capture_margin`.
+"""Changes of a problem file's data by key paths: `target.mass`, `scenarios.missing.capture_margin`.
 
 A key may leave its unit out: `target.mass` is `target.mass_kg`. A part of a list is named by its index from 0
 (`problem.point.1`), an entry of a list of tables by its index or its name.
@@ -29,7 +29,7 @@ def change_data(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
     Parameters
     ----------
     data : of a problem file, a table in tables, as `impactopt.files.problem_file.read_toml` gives it.
-    settings : values by dotted key, set one after the other. A key of [robot] where the file names a preset
+    settings : values by key path, set one after the other. A key of [robot] where the file names a preset
         in [problem] makes a section [robot] of it.
 
     Raises
@@ -40,7 +40,7 @@ def change_data(data: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[st
 
 
 def key_place(data: Mapping[str, Any], key: str) -> Place:
-    """Where a dotted key is in a problem file's data, by the keys' full names and the entries' indices.
+    """Where a key path is in a problem file's data, by the keys' full names and the entries' indices.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _raise(wrong: list[str]) -> None:
 
 
 def _find(model: type[Section], data: Mapping[str, Any], key: str) -> Place:
-    """The place of a dotted key; KeyError with a message if there is none."""
+    """The place of a key path; KeyError with a message if there is none."""
     if len(key) > LONGEST_KEY:
         raise KeyError(f"{shortened(key)}: no key is so long")
     place: list[str | int] = []

@@ -183,5 +183,5 @@ def key_lines(text: str) -> dict[Place, int]:
     return lines
 
 
-def _split(dotted: str) -> Place:
-    return tuple(part.strip().strip("\"'") for part in dotted.split("."))
+def _split(path: str) -> Place:
+    return tuple(part.strip().strip("\"'") for part in path.split("."))

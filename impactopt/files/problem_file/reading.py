@@ -69,7 +69,7 @@ class ProblemFile:
     lines: Mapping[Place, int] = field(repr=False, default_factory=dict)
 
     def changed(self, settings: Mapping[str, Any]) -> ProblemFile:
-        """The file with other values, by dotted keys (`change_data`).
+        """The file with other values, by key paths (`change_data`).
 
         Raises
         ------
@@ -152,7 +152,7 @@ def problem_file_from_data(data: Mapping[str, Any], *, where: str | os.PathLike[
 def read_problem_file(path: str | os.PathLike[str], settings: Mapping[str, Any] | None = None) -> ProblemFile:
     """A problem file, by path or name, checked as far as that is possible without its robot.
 
-    settings : values by dotted key, in place of the file's (`change_data`).
+    settings : values by key path, in place of the file's (`change_data`).
 
     Raises
     ------

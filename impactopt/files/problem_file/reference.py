@@ -25,29 +25,29 @@ __all__ = ["reference"]
 _INTRODUCTION = """\
 # Problem files
 
-A problem file says in [TOML](https://toml.io) all that `impactopt.ImpactProblem` takes. It is data: nothing
-in it is run. Units are SI, and part of a key's name where the quantity has one. Keys and sections that are
+A problem file has all arguments of `impactopt.ImpactProblem`, in [TOML](https://toml.io). It is data: nothing
+in it is executed. Units are SI; the unit of a quantity is part of its key's name. Keys and sections that are
 left out keep their defaults.
 
 ```sh
-impactopt new                                 # which problems come with the package
-impactopt new punch > my.toml                 # a copy of one, with a comment to each key, and the other keys
-impactopt check my.toml                       # all mistakes at once: where, what was meant, what is allowed
-impactopt solve my.toml --set target.mass=8   # another value for once; a key's unit may be left out
+impactopt new                                 # lists the problems that come with the package
+impactopt new punch > my.toml                 # copies one, with a comment to each key, and the other keys
+impactopt check my.toml                       # names all mistakes: where, what was meant, what is allowed
+impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit may be left out
 ```
 
-`--set` takes a value as in TOML and can be repeated. A number of a list has its index from 0
-(`--set problem.point.1=-0.2`), one of several sections its index or its name
+`--set` takes a key path and a value as in TOML, and can be repeated. An entry of a list has its index from 0
+(`--set problem.point.1=-0.2`); one of several sections has its index or its name
 (`--set scenarios.missing.brake_after=0.03`).
 
-In Python: `impactopt.load_problem("my.toml")`, `impactopt.write_problem(problem)`, which leaves defaults out,
-and `problem.hash`, the same for the same problem, however it was written. A contact law, target, term or
-robot that is made of functions or models in Python is no data, and has no file.
+In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` writes one
+without defaults. `problem.hash` does not depend on how a problem was written. A contact law, target, term or
+robot that is made in Python, of functions or models, cannot be written to a file.
 
 ## Limits
 
-What is larger is a slip of a unit or of a key, or would keep a machine busy for hours: it is refused, with
-the limit, before work starts.
+Larger values are mistakes in a unit or a key, or would keep a machine busy for hours. They are refused before
+work starts, and the message names the limit.
 
 | what | at most | why |
 |---|---|---|

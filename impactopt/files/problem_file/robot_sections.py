@@ -32,13 +32,13 @@ class SoleSection(Section):
 
     kind = Sole
     name: str = required("what [stance] and messages call it")
-    frame: str = required("at the sole: z up out of the ground, x forward")
+    frame: str = required("frame at the sole, z up out of the ground, x forward")
     polygon: list[Point2] = required(
         "corners in the frame's x-y plane, counter-clockwise from above [m]", "polygon_m"
     )
-    parent: str = optional("frame of the model that a new `frame` is placed in")
-    position: Vector = optional("of a new frame, in its parent [m]", "position_m")
-    rotation: Rotation = optional("of a new frame, in its parent: a matrix by rows; left out: none")
+    parent: str = optional("frame of the model in which a new `frame` is placed")
+    position: Vector = optional("position of a new frame in its parent [m]", "position_m")
+    rotation: Rotation = optional("rotation of a new frame in its parent: a matrix by rows; left out: none")
 
     @model_validator(mode="after")
     def _placed_on_a_parent(self) -> SoleSection:
@@ -59,17 +59,17 @@ class StrikerSection(Section):
 
     kind = Striker
     name: str = required("what [problem] calls it")
-    frame: str = required("of the model")
-    point: Vector = required("in the frame [m]", "point_m")
+    frame: str = required("frame of the model")
+    point: Vector = required("position in the frame [m]", "point_m")
 
 
 class ToolSection(Section):
     """A rigid body that a link holds firmly, and the striker that it makes."""
 
     kind = Tool
-    name: str = required("of the tool and its striker")
-    frame: str = required("of the model, at the link that holds it")
-    mass: Positive = required("[kg]", "mass_kg")
+    name: str = required("name of the tool and of its striker")
+    frame: str = required("frame of the model at the link that holds the tool")
+    mass: Positive = required("mass [kg]", "mass_kg")
     center: Vector = required("centre of mass in the frame [m]", "center_m")
     inertia: Inertia = required(
         "about the centre of mass [kg m2]: its diagonal, or a matrix by rows", "inertia_kg_m2"
@@ -83,20 +83,22 @@ class RobotSection(Section):
     A preset keeps its own strikers beside the section's.
     """
 
-    preset: Preset = optional("its name: see `impactopt robots`")
-    urdf: str = optional("the robot's file, in place of a preset")
+    preset: Preset = optional("name of a preset: see `impactopt robots`")
+    urdf: str = optional("the robot's URDF, in place of a preset")
     srdf: str = optional("file with the URDF's named postures and rotors")
     name: str = optional("what reports call it")
-    floating: bool = optional("with a free base; false: the root link is fixed to the ground")
+    floating: bool = optional("true: the base is free; false: the root link is fixed to the ground")
     locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
     armature: PerJoint = optional(
         "reflected rotor inertia, of all joints or by joint [kg m2]", "armature_kg_m2"
     )
     kp: PerJoint = optional("servo stiffness, of all joints or by joint [N m/rad]", "kp_N_m_rad")
     kd: PerJoint = optional("servo damping, of all joints or by joint [N m s/rad]", "kd_N_m_s_rad")
-    torque_limit: PerJoint = optional("of all joints or by joint [N m]", "torque_limit_N_m")
-    velocity_limit: PerJoint = optional("of all joints or by joint [rad/s]", "velocity_limit_rad_s")
-    position_limit: dict[str, Range] = optional("[lower, upper] by joint [rad]", "position_limit_rad")
+    torque_limit: PerJoint = optional("torque limit, of all joints or by joint [N m]", "torque_limit_N_m")
+    velocity_limit: PerJoint = optional(
+        "velocity limit, of all joints or by joint [rad/s]", "velocity_limit_rad_s"
+    )
+    position_limit: dict[str, Range] = optional("limits [lower, upper] by joint [rad]", "position_limit_rad")
     disable_collisions: list[Pair] = optional("pairs of links that may pass through each other")
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
     strikers: list[StrikerSection] = optional("points that hit")

@@ -22,8 +22,8 @@ from impactopt.files.problem_file.contacts import Contact, Target
 from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.section import Section, optional, required
-from impactopt.files.problem_file.solver_sections import Solver
-from impactopt.files.problem_file.term_sections import Objectives, Terms
+from impactopt.files.problem_file.solver_sections import SolverSection
+from impactopt.files.problem_file.term_sections import ObjectiveSections, TermSections
 from impactopt.files.problem_file.values import (
     AtLeastOne,
     ContactDuration,
@@ -36,8 +36,7 @@ from impactopt.files.problem_file.values import (
     UnitVector,
     Vector,
 )
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
-from impactopt.kinematics.stance import Stance as Stances
+from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Robot
@@ -51,16 +50,16 @@ def _of_problem(section: type[Section]) -> dict[str, Any]:
     return {name: known[name] for name in section.model_fields if name in known}
 
 
-class Problem(Section):
-    """Who hits what, where."""
+class ProblemSection(Section):
+    """The robot, its striker, and where it hits."""
 
     name: str = optional("what reports call the problem")
     robot: Preset = optional("a preset: see `impactopt robots`; or there is a section [robot]")
-    striker: str = required("what hits: one of the robot's strikers")
+    striker: str = required("name of the robot's striker that hits")
     point: Vector = required(
         "where the striking point meets the target: x forward, y left, z up from the ground [m]", "point_m"
     )
-    normal: UnitVector = required("which way the target is pushed: a unit vector")
+    normal: UnitVector = required("direction in which the target is pushed: a unit vector")
     start: Posture = Field(
         default=ImpactProblem.start,
         description="posture to start from, at rest: its name, or a configuration, as Pinocchio has them",
@@ -71,8 +70,8 @@ class Problem(Section):
         return _of_problem(cls)
 
 
-class Stance(Section):
-    """What the robot stands on."""
+class StanceSection(Section):
+    """The soles that are held."""
 
     soles: str = Field(default="both", description='"both", or the name of the sole that is held')
 
@@ -84,30 +83,34 @@ class PhaseSection(Section):
     duration: Duration = required(
         "one number, or [shortest, longest] for the solver to choose [s]", "duration_s"
     )
-    intervals: int = optional("of the spline, at least 6: more make the motion freer, and the solve longer")
+    intervals: int = optional(
+        "number of the spline's intervals, at least 6; more make the motion freer and the solve longer"
+    )
     grading: AtLeastOne = optional("longest over shortest interval, the short ones at the contact")
 
 
-class Swing(PhaseSection):
+class SwingSection(PhaseSection):
     """Wind-up and strike, from rest to contact."""
 
 
-class Follow(PhaseSection):
-    """From the state that the impact leaves behind to rest."""
+class FollowSection(PhaseSection):
+    """From the state after the impact to rest."""
 
 
-class Collision(Section):
+class CollisionSection(Section):
     """How the collision is modelled and discretized."""
 
     collision: Literal["dynamics", "rigid", "virtual mass"] = optional(
         '"dynamics": the whole equation of motion; or an impact without duration, to compare with', "model"
     )
-    coefficient_of_restitution: Restitution = optional('of the model "rigid"')
+    coefficient_of_restitution: Restitution = optional(
+        'speed of separation over speed of approach, of the model "rigid"'
+    )
     contact_duration: ContactDuration = optional(
-        "[shortest, longest] of each of compression and restitution [s]; a shortest of 0 is no bound",
+        "[shortest, longest] time of compression and of restitution [s]; 0: no shortest time",
         "duration_s",
     )
-    collision_stages: Literal[2, 3] = optional("Radau IIA stages of an element", "stages")
+    collision_stages: Literal[2, 3] = optional("Radau IIA stages of each collocation element", "stages")
     compression: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
     restitution: Fractions = optional("lengths of its collocation elements, fractions that sum to 1")
 
@@ -120,12 +123,12 @@ ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
 
 
-class Objective(Section):
-    """Prices that only make the optimum unique, and its end natural."""
+class ObjectiveSection(Section):
+    """Small prices that make the optimum unique, and bring the robot back to its start."""
 
-    smoothness: NotNegative = optional("of accelerations [N s per (rad/s^2)^2 s]")
-    wrench_price: NotNegative = optional("of the soles' wrenches")
-    return_price: NotNegative = optional("of ending away from the start posture [N s per rad^2]")
+    smoothness: NotNegative = optional("price of accelerations [N s per (rad/s^2)^2 s]")
+    wrench_price: NotNegative = optional("price of the soles' wrenches")
+    return_price: NotNegative = optional("price of ending away from the start posture [N s per rad^2]")
 
     @classmethod
     def defaults(cls) -> dict[str, Any]:
@@ -135,20 +138,20 @@ class Objective(Section):
 class File(Section):
     """A whole problem file; its [target] and [contact] are of a kind (`with_kinds`)."""
 
-    problem: Problem
+    problem: ProblemSection
     robot: RobotSection = optional("")
     target: Target
     contact: Contact
-    stance: Stance = optional("")
-    swing: Swing = optional("")
-    follow: Follow = optional("")
-    collision: Collision = optional("")
+    stance: StanceSection = optional("")
+    swing: SwingSection = optional("")
+    follow: FollowSection = optional("")
+    collision: CollisionSection = optional("")
     scenarios: list[ScenarioSection] = optional("")
     obstacles: list[ObstacleSection] = optional("")
-    objectives: Objectives = optional("")
-    objective: Objective = optional("")
-    terms: Terms = optional("")
-    solver: Solver = optional("")
+    objectives: ObjectiveSections = optional("")
+    objective: ObjectiveSection = optional("")
+    terms: TermSections = optional("")
+    solver: SolverSection = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset that [problem] names."""
@@ -163,15 +166,15 @@ class File(Section):
 
     def given_terms(self) -> Iterator[tuple[str, Any]]:
         """The terms that the file has, by their sections' names."""
-        for name in Terms.model_fields if self.terms is not None else ():
+        for name in TermSections.model_fields if self.terms is not None else ():
             section = getattr(self.terms, name)
             if section is not None:
                 yield name, section.build()
 
-    def make_stance(self, robot: Robot) -> Stances:
+    def make_stance(self, robot: Robot) -> Stance:
         """What [stance] says of a robot; InputError for what it cannot stand on."""
         soles = self.stance.soles if self.stance else "both"
-        stance: Stances = BothSoles() if soles == "both" else OneSole(soles)
+        stance: Stance = BothSoles() if soles == "both" else OneSole(soles)
         if not robot.floating:
             if self.stance:
                 raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")

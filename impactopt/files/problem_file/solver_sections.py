@@ -20,7 +20,7 @@ def _sqp_keys() -> dict[str, Any]:
     return {name: (hints[name], optional(said[name])) for name in hints if name != "time_limit"}
 
 
-SQP: Any = create_model("SQP", __base__=Section, __doc__="Options of the SQP.", **_sqp_keys())
+SQP: Any = create_model("SQP", __base__=Section, __doc__="Options of the default solver.", **_sqp_keys())
 SQP.kind = SQPOptions
 
 
@@ -42,11 +42,13 @@ class SolverSettings:
         return {"solver": chosen, "options": self.options.get(chosen), "time_limit": limit}
 
 
-class Solver(Section):
+class SolverSection(Section):
     """Which solver, and its options."""
 
-    name: Literal["ipopt", "sqp"] = optional("of the solver")
-    time_limit: Positive = optional("after which its best iterate is kept [s]", "time_limit_s")
+    name: Literal["ipopt", "sqp"] = optional("name of the solver")
+    time_limit: Positive = optional(
+        "longest time of the solver, after which its best iterate is kept [s]", "time_limit_s"
+    )
     ipopt: IpoptOptions = optional("IPOPT's own options by name")
     sqp: SQP = optional("")
 

@@ -11,7 +11,7 @@ from impactopt.files.problem_file.names import problem_file, problem_summary
 from impactopt.files.problem_file.reading import read_problem_file
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
-from impactopt.files.problem_file.term_sections import Terms
+from impactopt.files.problem_file.term_sections import TermSections
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 
 __all__ = ["problem_template"]
@@ -64,7 +64,9 @@ def _left_out(data: dict[str, Any]) -> list[str]:
     """Sections that are not there, in a word each."""
     found = [(name, info) for name, info in File.model_fields.items() if name not in data]
     found += [
-        (f"terms.{name}", info) for name, info in Terms.model_fields.items() if name not in data["terms"]
+        (f"terms.{name}", info)
+        for name, info in TermSections.model_fields.items()
+        if name not in data["terms"]
     ]
     lines = ["# There may be more sections; `impactopt new --reference` says what is in them:"]
     for name, info in found:

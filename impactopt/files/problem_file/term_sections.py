@@ -7,18 +7,18 @@ from impactopt.files.problem_file.described import sections_of
 from impactopt.problem.objectives import OBJECTIVES
 from impactopt.problem.terms import DEFAULT_TERMS, TERMS
 
-__all__ = ["Objectives", "Terms"]
+__all__ = ["ObjectiveSections", "TermSections"]
 
 _TERMS = {snake_case(kind.__name__): kind for kind in TERMS}
 _FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
 
-Terms = sections_of(
-    "Terms",
-    f"What the plan must respect; of these, {_FIRST} to {_LAST} hold if left out too.",
+TermSections = sections_of(
+    "TermSections",
+    f"Constraints. Those from {_FIRST} to {_LAST} hold, with their defaults, if they are left out.",
     _TERMS,
 )
-Objectives = sections_of(
-    "Objectives",
-    "What is maximized; if there are any, only those that are given.",
+ObjectiveSections = sections_of(
+    "ObjectiveSections",
+    "What is maximized: the impulse, or if there are sections here, only these.",
     {snake_case(kind.__name__): kind for kind in OBJECTIVES},
 )

@@ -127,12 +127,12 @@ class _Writer:
             inner = (*place, key)
             if isinstance(value, list):
                 for i, entry in enumerate(value):
-                    self._header(f"[[{_dotted(inner)}]]", self.comment(inner) if i == 0 else "")
+                    self._header(f"[[{_key_path(inner)}]]", self.comment(inner) if i == 0 else "")
                     self._keys(entry, (*inner, i))
                 continue
             # a table of tables alone needs no line of its own; its comment stands above the first of them
             if not value or not all(_is_table(v) or _is_list_of_tables(v) for v in value.values()):
-                self._header(f"[{_dotted(inner)}]", self.comment(inner))
+                self._header(f"[{_key_path(inner)}]", self.comment(inner))
             elif self.comment(inner):
                 self.lines.extend(["", f"# {self.comment(inner)}"])
             self.table(value, inner)
@@ -159,7 +159,7 @@ def _is_list_of_tables(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(item, Mapping) for item in value)
 
 
-def _dotted(place: Place) -> str:
+def _key_path(place: Place) -> str:
     return ".".join(_key(str(part)) for part in place)
 
 

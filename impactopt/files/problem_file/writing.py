@@ -19,17 +19,17 @@ from impactopt.files.problem_file.robot_writing import robot_data
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import (
     ELEMENTS,
-    Collision,
+    CollisionSection,
     File,
-    Follow,
-    Objective,
+    FollowSection,
+    ObjectiveSection,
     ObstacleSection,
-    Problem,
+    ProblemSection,
     ScenarioSection,
-    Swing,
+    SwingSection,
 )
 from impactopt.files.problem_file.solver_sections import SolverSettings
-from impactopt.files.problem_file.term_sections import Objectives, Terms
+from impactopt.files.problem_file.term_sections import ObjectiveSections, TermSections
 from impactopt.files.problem_file.toml import plain_value, write_toml
 from impactopt.kinematics.stance import OneSole
 from impactopt.problem.problem import ImpactProblem
@@ -77,12 +77,12 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
         start = problem.start_posture.tolist()
     data: dict[str, Any] = {
         "problem": {
-            **_different(Problem, {"name": problem.name}),
+            **_different(ProblemSection, {"name": problem.name}),
             **({"robot": robot["preset"]} if named else {}),
             "striker": problem.striker,
             "point_m": problem.point.tolist(),
             "normal": problem.normal.tolist(),
-            **_different(Problem, {"start": start}),
+            **_different(ProblemSection, {"start": start}),
         },
         **({} if named else {"robot": robot}),
         "target": _of_kind("target", problem.target, TARGETS, "kind"),
@@ -90,17 +90,20 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     }
     if isinstance(problem.stance, OneSole):
         data["stance"] = {"soles": problem.stance.name}
-    for name, section, phase in (("swing", Swing, problem.swing), ("follow", Follow, problem.follow)):
+    for name, section, phase in (
+        ("swing", SwingSection, problem.swing),
+        ("follow", FollowSection, problem.follow),
+    ):
         if phase != usual[name]():
             data[name] = _section(section, phase)
     shape = dict(zip(ELEMENTS, problem.collision_elements, strict=True))
-    for name, part in (("collision", Collision), ("objective", Objective)):
+    for name, part in (("collision", CollisionSection), ("objective", ObjectiveSection)):
         values = {key: shape.get(key, getattr(problem, key, None)) for key in part.model_fields}
         data[name] = _different(part, values)
     data["scenarios"] = [_section(ScenarioSection, scenario) for scenario in problem.scenarios]
     if problem.objectives != ImpactProblem.objectives:
-        data["objectives"] = _parts(Objectives, problem.objectives)
-    data["terms"] = _parts(Terms, [term for term in problem.terms if term not in DEFAULT_TERMS])
+        data["objectives"] = _parts(ObjectiveSections, problem.objectives)
+    data["terms"] = _parts(TermSections, [term for term in problem.terms if term not in DEFAULT_TERMS])
     if problem.body != TargetBody():
         data["target"]["body"] = _section(Body, problem.body)
     data["obstacles"] = [_section(ObstacleSection, obstacle) for obstacle in problem.obstacles]

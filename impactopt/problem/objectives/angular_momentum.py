@@ -1,4 +1,4 @@
-"""The turning that a blow leaves behind."""
+"""Angular momentum after contact."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 class AngularMomentum(Objective):
     """Cost: angular momentum after contact, squared.
 
-    |angular momentum|^2 about the centre of mass [(N m s)^2]. Not for a robot on a fixed base, whose balance
-    nobody asks about.
+    |angular momentum|^2 about the centre of mass [(N m s)^2]. A robot on a fixed base has no
+    balance, and no such objective.
     """
 
     name: ClassVar[str] = "angular momentum after contact, squared"

@@ -16,17 +16,17 @@ from impactopt.problem.terms.base import check_known, kind_of
 
 __all__ = ["WEIGHT", "Objective", "check_objectives"]
 
-WEIGHT = about("what one unit of it is worth", unit="N s a unit", key="weight")
+WEIGHT = about("value of one unit of the quantity", unit="N s a unit", key="weight")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Objective(Described):
     """Base of all objectives: ``name`` is what reports call it, ``unit`` is that of its quantity.
 
-    One has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and ``needs_torques``
-    are as of :class:`impactopt.problem.terms.Term`.
+    An objective has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and
+    ``needs_torques`` are as in :class:`impactopt.problem.terms.Term`.
 
-    weight [N s a unit] : what one unit of it is worth, or of a cost, what it takes off.
+    weight [N s a unit] : value of one unit of the quantity; for a cost, its price.
 
     Raises
     ------

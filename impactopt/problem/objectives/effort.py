@@ -17,7 +17,7 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 class Effort(Objective):
     """Cost: integral of (torque / limit)^2 over swing and follow-through, summed over joints.
 
-    In s, by the trapezoidal rule on the nodes. To be kept small beside what is really wanted.
+    In s, by the trapezoidal rule on the nodes. A side objective: give it a small weight.
     """
 
     name: ClassVar[str] = "effort"

@@ -18,9 +18,9 @@ TYPICAL = 100.0  # [N]
 class PeakForce(Objective):
     """The largest contact force; a weight below zero keeps it small.
 
-    Of the collocated ones [N]. Smooth: sum f^9 / sum f^8 (Lehmer's mean). It is the largest where the others
-    are small beside it or as large, and never above it; of a half sine it is some 2 % below. The force in the
-    first instant of a law with damping is not among the collocated ones.
+    In N, of the forces at collocation points, as the smooth maximum sum f^9 / sum f^8 (Lehmer's mean). This
+    is never above the largest, and equal to it if the others are zero or as large; for a half sine it is
+    some 2 % below. The jump of force at first touch, of a law with damping, is not at a collocation point.
     """
 
     name: ClassVar[str] = "peak force"

@@ -1,4 +1,4 @@
-"""How far a hand goes in."""
+"""The deepest penetration."""
 
 from __future__ import annotations
 

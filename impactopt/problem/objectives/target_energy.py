@@ -15,7 +15,7 @@ from impactopt.problem.objectives.base import WEIGHT, Objective
 
 @dataclass(frozen=True, kw_only=True)
 class TargetEnergy(Objective):
-    """What the target holds at separation, or has used up in what it was hit for.
+    """The energy that the target has taken at separation, with the work done in it.
 
     In J: ``Target.energy``.
     """

@@ -1,4 +1,4 @@
-"""What the impact may leave behind."""
+"""Balance after the impact."""
 
 from __future__ import annotations
 
@@ -14,25 +14,31 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class Balance(Term):
-    """What the impact may leave behind, so that the robot stays up; inf: any."""
+    """Bounds on the state after the impact, so that the robot does not fall; inf: no bound."""
 
     name: ClassVar[str] = "balance after impact"
     unit: ClassVar[str] = "m, m/s, N m s"
     capture_margin: float | None = field(
         default=0.02,
         metadata=about(
-            'from the capture point to the support polygon\'s edges; "anywhere": none is asked',
+            'distance from the capture point to the support polygon\'s edges; "anywhere": no constraint',
             unit="m",
             least=0,
             none="anywhere",
         ),
     )
     vertical_speed: float = field(
-        default=0.2, metadata=about("of the centre of mass", unit="m/s", least=0, endless=True)
+        default=0.2,
+        metadata=about("largest vertical speed of the centre of mass", unit="m/s", least=0, endless=True),
     )
     angular_momentum: float = field(
         default=10.0,
-        metadata=about("about each axis through the centre of mass", unit="N m s", least=0, endless=True),
+        metadata=about(
+            "largest angular momentum about each axis through the centre of mass; inf: any",
+            unit="N m s",
+            least=0,
+            endless=True,
+        ),
     )
 
     def __post_init__(self) -> None:

@@ -21,13 +21,12 @@ _UNSAID = About(what="", least=0)  # of fields that do not say what they are
 class Term(Described):
     """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its rows.
 
-    A term has :meth:`add_rows`, and :meth:`blocks` if its rows are not linear. Only the rows of those that
-    every program is built with (DEFAULT_TERMS) are in the transcription. Fields say in their metadata
-    (`impactopt.contact.fields.about`) what they are, and are checked by it; numbers that do not are not
-    negative.
+    A term has :meth:`add_rows`, and :meth:`blocks` if its rows are not linear. The terms in DEFAULT_TERMS
+    have neither: the transcription has their rows. The metadata of fields (`impactopt.contact.fields.about`)
+    describes them, and they are checked by it; numbers without metadata must not be negative.
 
-    whole_motion : it says nothing of a strike alone, which is planned without it.
-    needs_torques : its rows take the torques at the nodes, which are variables then.
+    whole_motion : a strike alone is planned without this term.
+    needs_torques : its rows need the torques at the nodes as variables.
     """
 
     name: ClassVar[str] = ""

@@ -20,20 +20,22 @@ class ContactWrenchCone(Term):
 
     name: ClassVar[str] = "contact wrench cone"
     unit: ClassVar[str] = "of weight"
-    friction: float = field(default=0.6, metadata=about("coefficient that the soles may use", above=0))
+    friction: float = field(
+        default=0.6, metadata=about("friction coefficient that the plan may use", above=0)
+    )
     margin: float = field(
         default=0.02,
-        metadata=about("from the centre of pressure to the sole's edges", unit="m", least=0),
+        metadata=about("least distance from the centre of pressure to the sole's edges", unit="m", least=0),
     )
     collision_margin: float | None = field(
         default=0.02,
         metadata=about(
-            'the same, while in contact; "anywhere": the ground may then do what it cannot, to compare',
+            'the same in contact; "anywhere": no constraint on the wrenches in contact, to compare with',
             unit="m",
             least=0,
             none="anywhere",
         ),
     )
     minimum_force: float = field(
-        default=50.0, metadata=about("that each sole keeps on the ground", unit="N", least=0)
+        default=50.0, metadata=about("least normal force of each sole", unit="N", least=0)
     )

@@ -23,16 +23,21 @@ if TYPE_CHECKING:
 class Gaze(Term):
     """A frame, such as the head's, looks at the hit point in the swing.
 
-    From its origin at the problem's point: at the nodes of the swing from a fraction of it on, and at
-    contact.
+    It holds at the nodes of the swing after a fraction of it, and at contact, from the frame's origin to the
+    problem's point.
     """
 
     name: ClassVar[str] = "gaze"
     unit: ClassVar[str] = "rad"
-    frame: str = field(metadata=about("of the robot"))
-    axis: Vector = field(metadata=about("unit vector in the frame: the way it looks", direction=True))
-    angle: float = field(default=0.5, metadata=about("off the hit point, at most", unit="rad", above=0))
-    since: float = field(default=0.5, metadata=about("fraction of the swing from which it holds", least=0))
+    frame: str = field(metadata=about("name of the robot's frame"))
+    axis: Vector = field(metadata=about("direction of view: a unit vector in the frame", direction=True))
+    angle: float = field(
+        default=0.5,
+        metadata=about(
+            "largest angle between the axis and the direction to the hit point", unit="rad", above=0
+        ),
+    )
+    since: float = field(default=0.5, metadata=about("share of the swing after which it holds", least=0))
 
     def __post_init__(self) -> None:
         self.check_angle()

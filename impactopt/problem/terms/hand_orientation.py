@@ -20,16 +20,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class HandOrientation(Term):
-    """The hand looks some way at contact."""
+    """An axis of the hand points in a given direction at contact."""
 
     name: ClassVar[str] = "hand orientation"
     unit: ClassVar[str] = "rad"
-    axis: Vector = field(metadata=about("unit vector in the striker's frame", direction=True))
+    axis: Vector = field(
+        metadata=about("axis of the hand: a unit vector in the striker's frame", direction=True)
+    )
     direction: Vector | None = field(
         default=None,
-        metadata=about("where it looks, in the world; left out: along the normal", direction=True),
+        metadata=about(
+            "where the axis points at contact: a unit vector in the world frame; left out: the normal",
+            direction=True,
+        ),
     )
-    angle: float = field(default=0.2, metadata=about("between the two, at most", unit="rad", above=0))
+    angle: float = field(
+        default=0.2, metadata=about("largest angle between the axis and that direction", unit="rad", above=0)
+    )
 
     def __post_init__(self) -> None:
         self.check_angle()

@@ -24,11 +24,13 @@ TYPICAL = 1.0  # [m/s] of a strike
 
 @dataclass(frozen=True, kw_only=True)
 class HitCone(Term):
-    """The striking point's velocity at contact is near the normal; in place of `incidence`."""
+    """The striking point's velocity at contact lies in a cone about the normal; this replaces `incidence`."""
 
     name: ClassVar[str] = "hit cone"
     unit: ClassVar[str] = "m/s"
-    angle: float = field(default=0.1, metadata=about("between the two, at most", unit="rad", above=0))
+    angle: float = field(
+        default=0.1, metadata=about("largest angle between velocity and normal", unit="rad", above=0)
+    )
 
     def __post_init__(self) -> None:
         self.check_angle()

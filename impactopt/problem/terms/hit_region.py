@@ -25,7 +25,7 @@ REACH = 0.2  # [m] further off the replays' target has ended
 
 @dataclass(frozen=True, kw_only=True)
 class HitRegion(Term):
-    """The hit point is anywhere in a disc or a rectangle about `point_m`; give one of the keys.
+    """The hit point may be anywhere in a disc or a rectangle about `point_m`; give one of the two keys.
 
     In the plane of the normal: see :func:`impactopt.bodies.shapes.face_axes`. It reaches no further than
     0.2 m, where the replays' target ends.
@@ -33,9 +33,9 @@ class HitRegion(Term):
 
     name: ClassVar[str] = "hit region"
     unit: ClassVar[str] = "m"
-    radius: float | None = field(default=None, metadata=about("of the disc", unit="m", above=0))
+    radius: float | None = field(default=None, metadata=about("radius of the disc", unit="m", above=0))
     size: tuple[float, float] | None = field(
-        default=None, metadata=about("of the rectangle, across and up", unit="m")
+        default=None, metadata=about("sides of the rectangle, across and up", unit="m")
     )
 
     def __post_init__(self) -> None:

@@ -13,12 +13,14 @@ from impactopt.problem.terms.base import Term
 class Incidence(Term):
     """No glancing blow: the striking point's speed across the normal at contact is bounded.
 
-    :class:`impactopt.HitCone` takes its place.
+    :class:`impactopt.HitCone` replaces it.
     """
 
     name: ClassVar[str] = "incidence"
     unit: ClassVar[str] = "m/s"
     speed: float = field(
         default=0.05,
-        metadata=about("along each of two tangents; inf: any", unit="m/s", least=0, endless=True),
+        metadata=about(
+            "largest speed along each of two tangents; inf: any", unit="m/s", least=0, endless=True
+        ),
     )

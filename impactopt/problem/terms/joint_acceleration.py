@@ -1,4 +1,4 @@
-"""How hard joints are thrown."""
+"""Bounds on joint accelerations."""
 
 from __future__ import annotations
 
@@ -22,15 +22,17 @@ if TYPE_CHECKING:
 class JointAcceleration(Term):
     """|joint acceleration| is bounded in the swing.
 
-    At its nodes, between which those of the arms are linear, so that they are bounded everywhere. By joint,
-    those that are not named have no bound.
+    It holds at the nodes of the swing. Accelerations of joints outside the legs are linear between nodes, so
+    they are bounded everywhere. If the limit is given by joint, joints that are not named have no bound.
     """
 
     name: ClassVar[str] = "joint acceleration"
     unit: ClassVar[str] = "of limit"
     whole_motion: ClassVar[bool] = True
     limit: float | Mapping[str, float] = field(
-        metadata=about("of all joints, or by joint", unit="rad/s^2", above=0, by_joint=True)
+        metadata=about(
+            "largest acceleration: one for all joints, or by joint", unit="rad/s^2", above=0, by_joint=True
+        )
     )
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:

@@ -13,10 +13,12 @@ from impactopt.problem.terms.base import Term
 class KeepOut(Term):
     """The robot keeps off target, ground and obstacles; the link that strikes may touch the target.
 
-    It may from the side that it strikes. Held soles stand on the ground.
+    It may touch it at the face that it strikes. Held soles stand on the ground.
     """
 
     name: ClassVar[str] = "keep out"
     unit: ClassVar[str] = "m"
-    margin: float = field(default=0.01, metadata=about("from a link to any of them", unit="m", least=0))
+    margin: float = field(
+        default=0.01, metadata=about("least distance from a link to any of them", unit="m", least=0)
+    )
     enabled: bool = field(default=True, metadata=about("false: the robot may pass through them"))

@@ -14,14 +14,18 @@ class LegExtension(Term):
     """Held legs stay away from a straight knee.
 
     At the nodes of swing and follow-through the determinant of the leg's Jacobian (joints to sole) over its
-    value in the start posture is no less than a minimum. Near a straight knee the joint rates that hold the
-    sole grow without bound, and a few millimetres between two nodes are more than the leg has left: at 0.35
-    TALOS has 7 mm.
+    value in the start posture is no less than a minimum. Near a straight knee the joint rates that keep the
+    sole in place grow without bound, and the leg could become too short between two nodes: at 0.35 TALOS has
+    7 mm left.
     """
 
     name: ClassVar[str] = "leg extension"
     unit: ClassVar[str] = "of start"
     minimum: float = field(
         default=0.35,
-        metadata=about("of the start posture's leg determinant; 0 would be a straight knee", least=0, most=1),
+        metadata=about(
+            "least determinant of the leg's Jacobian over that of the start posture; 0: a straight knee",
+            least=0,
+            most=1,
+        ),
     )

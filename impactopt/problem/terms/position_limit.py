@@ -18,4 +18,4 @@ class PositionLimit(Term):
 
     name: ClassVar[str] = "position limit"
     unit: ClassVar[str] = "rad"
-    margin: float = field(default=0.02, metadata=about("from each limit", unit="rad", least=0))
+    margin: float = field(default=0.02, metadata=about("distance from each limit", unit="rad", least=0))

@@ -11,13 +11,13 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCollision(Term):
-    """Links of the robot keep apart, but for those that a joint connects or that touch at the start.
+    """Links of the robot keep apart, except those that a joint connects or that touch at the start.
 
-    From start to rest, after a miss too. Where two are nearer than the margin at the start, they may stay as
-    near.
+    It holds from start to rest, after a miss too. Two links that are nearer than the margin at the start may
+    stay that near.
     """
 
     name: ClassVar[str] = "self-collision"
     unit: ClassVar[str] = "m"
-    margin: float = field(default=0.01, metadata=about("between two links", unit="m", least=0))
+    margin: float = field(default=0.01, metadata=about("least distance between two links", unit="m", least=0))
     enabled: bool = field(default=True, metadata=about("false: links may pass through each other"))

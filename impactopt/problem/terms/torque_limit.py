@@ -11,11 +11,14 @@ from impactopt.problem.terms.base import Term
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueLimit(Term):
-    """|torque| is at most a fraction of each joint's limit: the rest is the servo's."""
+    """|torque| is at most a fraction of each joint's limit; the rest is left to the servo."""
 
     name: ClassVar[str] = "torque limit"
     unit: ClassVar[str] = "of limit"
     fraction: float = field(
-        default=0.85, metadata=about("of the limit, in swing and follow-through", above=0, most=1)
+        default=0.85,
+        metadata=about("share of the limit that may be used in swing and follow-through", above=0, most=1),
     )
-    collision: float = field(default=0.85, metadata=about("of the limit, while in contact", above=0, most=1))
+    collision: float = field(
+        default=0.85, metadata=about("share of the limit that may be used in contact", above=0, most=1)
+    )

@@ -18,7 +18,7 @@ from impactopt.problem.violation import Measure
 class TorqueRate(Term):
     """|d torque/dt| is bounded, from node to node of swing and follow-through.
 
-    By joint, those that are not named have no bound.
+    If the limit is given by joint, joints that are not named have no bound.
     """
 
     name: ClassVar[str] = "torque rate"
@@ -26,7 +26,7 @@ class TorqueRate(Term):
     whole_motion: ClassVar[bool] = True
     needs_torques: ClassVar[bool] = True
     limit: float | Mapping[str, float] = field(
-        metadata=about("of all joints, or by joint", unit="N m/s", above=0, by_joint=True)
+        metadata=about("largest rate: one for all joints, or by joint", unit="N m/s", above=0, by_joint=True)
     )
 
     def add_rows(self, program: Any) -> None:

@@ -10,10 +10,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impactopt.collision.effects import Effects, JointFriction
 from impactopt.collision.interface import CollisionModel
 from impactopt.collision.result import Collision
 from impactopt.collision.settings import Settings, no_bend, servo_settings
-from impactopt.collision.terms import JointFriction, Terms
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot
 from impactopt.simulation.pinocchio_robot import DenseBody
@@ -132,8 +132,8 @@ class ReferenceModel(CollisionModel):
 
     # ------------------------------------------------------------ numbers
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:
-        terms = Terms(friction=self.friction is not None)
-        servo = servo_settings(self.robot, terms, self._friction, kp, kd)
+        effects = Effects(friction=self.friction is not None)
+        servo = servo_settings(self.robot, effects, self._friction, kp, kd)
         servo |= no_bend(self.robot.n)  # with friction too
         return Settings(self.law, self.target, np.asarray(self.normal), servo)
 

@@ -23,18 +23,17 @@ def coasting_reference(
 ) -> dict[str, NDArray[np.float64]]:
     """The settings of a collision whose servo's reference keeps the soles in place.
 
-    A plan's reference goes on in contact at the rates ydot of its independent coordinates: the base's pose
-    and the joints outside the legs. So the legs' joint velocities change, as the soles stay where they are.
-    What they gain is fitted by t, t^2, ... t^10, exact in the acceleration at contact, and else best at all
-    times up to one between `until` and half of it: the longest for which the fit is within 1e-4 rad/s, as
-    legs that are all but straight soon ask for velocities without end. What they reach for less, bends less
-    long.
+    During contact a plan's reference keeps the rates ydot of its independent coordinates: the base's pose and
+    the joints outside the legs. The soles stay where they are, so the velocities of the leg joints change.
+    Their change is fitted by t, t^2, ... t^10. The fit is exact in the acceleration at contact, and best over
+    a time from half of `until` to `until`: the longest for which it is within 1e-4 rad/s. The time is shorter
+    for legs that are nearly straight, whose velocities grow without bound.
 
     Parameters
     ----------
     coordinates : where the soles are held, such as `ImpactProblem.coordinates`.
     q, v : (nq), (nv) at contact, Pinocchio's, with the soles in place and at rest.
-    until : [s] since contact; twice as long as that lasts is good.
+    until : [s] since contact; twice the contact's duration is a good value.
 
     Returns
     -------

@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.mujoco_robot import MujocoRobot
 from impactopt.simulation.mujoco_world import (
-    Solver,
+    MujocoOptions,
     mujoco_module,
     no_log_file,
     quaternion,
@@ -113,7 +113,7 @@ class HeldRobot(MujocoRobot):
 
     def __init__(self, robot: Robot, frames: tuple[str, ...], striker: str, step: float) -> None:
         mujoco, self.step = mujoco_module(), step
-        spec = spec_of(robot, Solver(step, iterations=50, tolerance=0.0))
+        spec = spec_of(robot, MujocoOptions(step, iterations=50, tolerance=0.0))
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         bodies = robot_bodies(mujoco, spec, robot)

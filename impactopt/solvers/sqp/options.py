@@ -1,4 +1,4 @@
-"""What can be set on the SQP."""
+"""Options of our solver."""
 
 from __future__ import annotations
 
@@ -16,29 +16,32 @@ class SQPOptions:
 
     Attributes
     ----------
-    qp_solver : "interior": every QP is taken one interior-point step towards its solution; or a name in
-        `QP_SOLVERS`, which solves every QP to its end. What is of no use to the one is said below.
-    hessian : "exact" (made convex) or "bfgs" (damped; dense, for some hundred variables at most).
+    qp_solver : "interior": a primal-dual interior-point method, which takes one Newton step on each quadratic
+        model; or a name in `QP_SOLVERS`, which solves every QP to its end (SQP in the strict sense). Options
+        of only one of the two say so.
+    hessian : with QP solvers, "exact" (made convex) or "bfgs" (damped; dense, for some hundred variables at
+        most).
     violation_tolerance : largest violation of a row or bound at a solution.
     kkt_tolerance : largest scaled stationarity and complementarity at a solution.
-    complementarity_tolerance : with "interior", the largest multiplier x distance to a bound there, in its
-        place. The objective is off by that times the number of bounds that hold, at most.
-    acceptable_tolerance : the same, for the status ACCEPTABLE where no further step helps.
+    complementarity_tolerance : of "interior", largest product of a multiplier and the distance to its bound
+        at a solution. The objective's error is at most this times the number of active bounds.
+    acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
     max_iterations, time_limit [s] : limits; the best iterate is returned.
-    radius, radius_max : of the trust region |d|_inf <= radius, at the start and at most.
-    price, price_max : of a unit of violation in the merit function f + price * sum of violations, at the
-        start and at most. It rises above the multipliers; too low a start costs iterations, too low a maximum
-        may end in an infeasible point.
-    levenberg : multiple of the identity always added to the Hessian. It rises by itself where the QP solver
-        struggles: OSQP takes fewer iterations, the SQP more.
-    augmentation : weight of the active rows (in multiples of the Hessian's norm) in making the Hessian
+    radius, radius_max : with QP solvers, first and largest radius of the trust region |d|_inf <= radius.
+    price, price_max : first and largest price of violations: with QP solvers in the merit function
+        f + price * sum of violations, with "interior" in its elastic phase. It rises by itself. If the first
+        is too low, more iterations are needed; if the largest is too low, the end may be infeasible.
+    levenberg : with QP solvers, multiple of the identity that is always added to the Hessian. It rises by
+        itself where the QP solver has difficulties.
+    augmentation : with QP solvers, weight of the active rows (in multiples of the Hessian's norm) in making
+        the Hessian convex.
+    curvature_floor : with QP solvers, least eigenvalue, in multiples of the Hessian's norm, after making it
         convex.
-    curvature_floor : least eigenvalue, in multiples of the Hessian's norm, after making it convex.
-    dense_limit : most variables for which matrices are treated as dense: the Hessian made convex by its
-        eigenvalues rather than by a shift, QPs solved by the dense active-set method.
+    dense_limit : with QP solvers, most variables for which matrices are treated as dense: the Hessian made
+        convex by its eigenvalues rather than by a shift, QPs solved by the dense active-set method.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
-    barrier, barrier_warm : with "interior", of the first QP's barrier, without and with multipliers given.
-    push : with "interior", how far the start is moved inside its bounds.
+    barrier, barrier_warm : of "interior", first barrier parameter, of starts without and with multipliers.
+    push : of "interior", how far the start is moved inside its bounds.
     """
 
     qp_solver: str = "interior"

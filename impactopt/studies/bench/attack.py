@@ -26,8 +26,8 @@ from impactopt.studies.bench.attack_calls import attack_call
 from impactopt.studies.bench.attack_cases import FINE, LATE, REFUSED, TRACEBACK, UNSOUND, Found, pick
 from impactopt.studies.bench.attack_collisions import FLOATING, ROBOTS, Struck, pairs_of, strike
 from impactopt.studies.bench.attack_commands import attack_command, make_result
+from impactopt.studies.bench.attack_compilers import BUILDS, Compared, builds, compare
 from impactopt.studies.bench.attack_compilers import ROBOTS as COMPILED
-from impactopt.studies.bench.attack_compilers import WAYS, Compared, compare, ways
 from impactopt.studies.bench.attack_files import attack_file, texts
 from impactopt.studies.bench.attack_replays import Replayed, replay_one
 from impactopt.studies.bench.attack_urdfs import URDFS, attack_urdf
@@ -129,9 +129,9 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
     def told(done: int, of: int) -> None:
         say(f"{done} of {of} parts of the attack")
 
-    alarm = workers > 1
+    watchdog = workers > 1
     parts = map_on_workers(
-        _job, (*shared, alarm), jobs, workers=workers, crashed=lambda code: None, progress=told
+        _job, (*shared, watchdog), jobs, workers=workers, crashed=lambda code: None, progress=told
     )
     found = [one for part in parts if part is not None for one in part]
     # of a part whose process has died or hung, each case in a process of its own
@@ -139,7 +139,7 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
     single = [(kind, seed, first + k, 1) for kind, seed, first, count in lost for k in range(count)]
     if single:
         again = map_on_workers(
-            _job, (*shared, alarm), single, workers=workers, crashed=lambda code: [_dead(code)]
+            _job, (*shared, watchdog), single, workers=workers, crashed=lambda code: [_dead(code)]
         )
         for job, part in zip(single, again, strict=True):
             found += [_placed(one, job) for one in part or []]
@@ -147,16 +147,16 @@ def _all(jobs: Sequence[tuple[str, int, int, int]], shared: Any, workers: int, s
 
 
 def _job(shared: Any, job: tuple[str, int, int, int]) -> list[Found] | None:
-    folder, result, program, alarm = shared
+    folder, result, program, watchdog = shared
     kind, seed, first, count = job
     found = []
     with tempfile.TemporaryDirectory(dir=folder) as own:
         for number in range(first, first + count):
-            if alarm:  # the kernel's: nothing else stops compiled code
+            if watchdog:  # the kernel's: nothing else stops compiled code
                 signal.setitimer(signal.ITIMER_REAL, HUNG)
             one = case(kind, seed, number, folder=Path(own), result=result, program=program)
             found.append(_placed(one, (kind, seed, number, 1)))
-    if alarm:
+    if watchdog:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
     return found
 
@@ -238,8 +238,8 @@ def report(
     numbers["slow"] = sum(counts[kind, LATE] for kind in NAMES)
     numbers["unsound"] = sum(counts[kind, UNSOUND] for kind in NAMES)
     numbers |= _sums(struck, "collisions")
-    absent = [way for way in WAYS if way not in ways()]
-    numbers["compilers"] = {"ways": list(ways()), "absent": absent, **_sums(compiled, "collisions")}
+    absent = [build for build in BUILDS if build not in builds()]
+    numbers["compilers"] = {"builds": list(builds()), "absent": absent, **_sums(compiled, "collisions")}
     numbers["replays"] = _sums(replayed, "replays")
     verdicts = (FINE, REFUSED, TRACEBACK, LATE, UNSOUND)
     rows = [
@@ -247,7 +247,7 @@ def report(
     ]
     tables = [make_table("attacks", ["of", "cases", *verdicts], rows)]
     heads = ["", "cases", "off", "refused", "too slow to judge", "largest error"]
-    by_compilers = f"collisions by {', '.join(ways())}; absent: {', '.join(absent) or 'none'}"
+    by_compilers = f"collisions by {', '.join(builds())}; absent: {', '.join(absent) or 'none'}"
     by_another_way: dict[str, Sequence[Any]] = {
         "collisions by an equation": struck,
         by_compilers: compiled,

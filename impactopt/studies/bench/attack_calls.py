@@ -168,9 +168,13 @@ CALLS: dict[str, Callable[[], Call]] = {
     "Tool": _of("Tool", name="t", frame="wrist", mass=1.0, **_TOOL),
     "Striker": _of("Striker", name="s", frame="wrist", point=np.zeros(3)),
     "Sole": _of("Sole", name="s", frame="wrist", polygon=_SQUARE),
-    "Conditions": _of("Conditions", mass=1.0, distance=0.01, payload=0.5, friction=0.9, kp=1.0, delay=1e-3),
-    "draw_conditions": _of("draw_conditions", n=5, seed=1),
-    "Spread": _of("Spread", mass=(0.5, 2.0), distance=(-0.02, 0.02), payload=(0.0, 1.0), period=1e-3),
+    "Perturbation": _of(
+        "Perturbation", mass=1.0, distance=0.01, payload=0.5, friction=0.9, kp=1.0, delay=1e-3
+    ),
+    "draw_perturbations": _of("draw_perturbations", n=5, seed=1),
+    "PerturbationRanges": _of(
+        "PerturbationRanges", mass=(0.5, 2.0), distance=(-0.02, 0.02), payload=(0.0, 1.0), period=1e-3
+    ),
     "Phase": _of("Phase", duration=(0.4, 0.8), intervals=12, grading=3.0),
     "Scenario": _of("Scenario", name="s", mass=2.0, stiffness=1.0, torque=1.0, capture_margin=0.01),
     "Obstacle": _of(

@@ -1,7 +1,7 @@
 """The same collisions with the compiler, with one that fails, and without: the same numbers, or refused.
 
 A failing compiler is one that makes a small file and nothing of ours, as on a full disk. Where clang is
-installed too it is another way; where it is not, that is said.
+installed too it is another build; where it is not, that is said.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from impactopt.errors import InputError
 from impactopt.studies.bench.attack_collisions import draw, model_of
 from impactopt.studies.bench.attack_equation import Blow
 
-__all__ = ["ROBOTS", "WAYS", "Compared", "compare", "ways"]
+__all__ = ["BUILDS", "ROBOTS", "Compared", "builds", "compare"]
 
 Array = NDArray[np.float64]
 
 ROBOTS = ("planar_arm", "arm7", "standin")
 SAME = 1e-6  # relative, of the impulse or of a plastic blow's
-WAYS = ("compiler", "failing compiler", "no compiler", "clang")
+BUILDS = ("compiler", "failing compiler", "no compiler", "clang")
 _FAILING = """#!/bin/sh
 case "$*" in *trial*|*version*) exec {cc} "$@";; esac
 echo "error: No space left on device" >&2
@@ -38,7 +38,7 @@ exit 1
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """Collisions of one model: how many had the same numbers in every way, had not, or were refused in one;
+    """Collisions of one model: how many had the same numbers in every build, had not, or were refused in one;
     what was not the same, in words; the largest difference, relative."""
 
     collisions: int = 0
@@ -48,23 +48,23 @@ class Compared:
     largest: float = 0.0
 
 
-def ways() -> tuple[str, ...]:
+def builds() -> tuple[str, ...]:
     """Those that this machine has."""
     has = {"clang": "clang", "compiler": "cc", "failing compiler": "cc"}
-    return tuple(way for way in WAYS if way not in has or shutil.which(has[way]))
+    return tuple(build for build in BUILDS if build not in has or shutil.which(has[build]))
 
 
 def compare(robot: str, law: str, target: str, count: int, seed: int) -> Compared:
-    """So many random collisions, each alone and as a row, in every way."""
+    """So many random collisions, each alone and as a row, in every build."""
     rng = np.random.default_rng([seed, *map(ord, robot + law + target)])
     blows = [draw(model_of(robot, law, target), law, target, rng) for _ in range(count)]
     found = {}
-    for way in ways():
-        with _compiling(way):
-            found[way] = _impulses(robot, law, target, blows)
+    for build in builds():
+        with _compiling(build):
+            found[build] = _impulses(robot, law, target, blows)
     off, refused, faults, largest = 0, 0, [], 0.0
     for k, blow in enumerate(blows):
-        numbers = {way: x for way, pair in found.items() for x in pair[:, k] if np.isfinite(x)}
+        numbers = {build: x for build, pair in found.items() for x in pair[:, k] if np.isfinite(x)}
         every = np.array([pair[:, k] for pair in found.values()])
         refused += bool(np.isnan(every).any())
         known = every[np.isfinite(every)]
@@ -80,18 +80,18 @@ def compare(robot: str, law: str, target: str, count: int, seed: int) -> Compare
 
 
 @contextlib.contextmanager
-def _compiling(way: str) -> Iterator[None]:
-    """The environment of a way; what a failing compiler leaves is gone afterwards."""
+def _compiling(build: str) -> Iterator[None]:
+    """The environment of a build; what a failing compiler leaves is gone afterwards."""
     kept = {name: os.environ.get(name) for name in ("CC", "IMPACTOPT_NO_COMPILER", "IMPACTOPT_CACHE")}
     with tempfile.TemporaryDirectory(prefix="impactopt-") as scratch:
-        if way == "failing compiler":
+        if build == "failing compiler":
             script = Path(scratch) / "cc"
             script.write_text(_FAILING.format(cc=shutil.which("cc")), encoding="utf-8")
             script.chmod(0o700)
             os.environ |= {"CC": str(script), "IMPACTOPT_CACHE": scratch}
-        elif way == "no compiler":
+        elif build == "no compiler":
             os.environ["IMPACTOPT_NO_COMPILER"] = "1"
-        elif way == "clang":
+        elif build == "clang":
             os.environ["CC"] = "clang"
         try:
             yield

@@ -1,7 +1,7 @@
 """A fair baseline: what people do today, on the same robot and in the same limits, beside our plans.
 
-Every reference is replayed in MuJoCo with free soles, as planned and under drawn conditions. All plans keep
-the same limits in the swing and in the follow-through; the rows of the collision are ours only.
+Every reference is replayed in MuJoCo with free soles, as planned and under drawn perturbations. All plans
+keep the same limits in the swing and in the follow-through; the rows of the collision are ours only.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Method:
 
 
 def run(say: Say, *, file: Path = DEMO, draws: int = 50, seed: int = 0, workers: int = 2) -> Report:
-    """One row a method; ``draws`` conditions are drawn for each."""
+    """One row a method; ``draws`` perturbations are drawn for each."""
     rows = []
     for name, make in methods(file, say):
         try:

@@ -21,10 +21,10 @@ from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.clock import medians, runner, shortest
 from impactopt.studies.bench.methods import Entry, entries
 from impactopt.studies.bench.peers import mujoco_rollouts, pinocchio_calls
-from impactopt.studies.bench.scene import (
+from impactopt.studies.bench.setup import (
     EVALUATION,
     MOTIONS,
-    Scene,
+    Setup,
     compiled_gradient,
     inputs,
     outcome,
@@ -47,9 +47,9 @@ COLUMNS = (("method", "method", 0), ("setting", "setting", 0), ("time us", "time
 KEYS = tuple(key for _, key, _ in ERRORS)
 
 
-def run(say: Say, *, scenes: Sequence[Scene] | None = None, quick: bool = False, repeats: int = 15) -> Report:
+def run(say: Say, *, setups: Sequence[Setup] | None = None, quick: bool = False, repeats: int = 15) -> Report:
     """One row a robot, method and setting; quick: the stand-in only, with few of them."""
-    scenes = list(scenes or (Scene.of(name) for name in (("standin",) if quick else MOTIONS)))
+    setups = list(setups or (Setup.of(name) for name in (("standin",) if quick else MOTIONS)))
     rows: list[dict[str, Any]] = []
     numbers: dict[str, Any] = {
         "rows": rows,
@@ -58,24 +58,24 @@ def run(say: Say, *, scenes: Sequence[Scene] | None = None, quick: bool = False,
         "cases": {},
         "load": os.getloadavg(),
     }
-    for scene in scenes:
-        say(f"{scene.name}: converged full dynamics")
-        case = scene.case
-        model = scene.model(FullDynamics, step=1e-4)
+    for setup in setups:
+        say(f"{setup.name}: converged full dynamics")
+        case = setup.case
+        model = setup.model(FullDynamics, step=1e-4)
         true, _ = model.converged(case.q, case.v, case.torque)
-        numbers["cases"][scene.name] = {
+        numbers["cases"][setup.name] = {
             "case": case.name,
             "impulse_Ns": true.impulse,
             "duration_s": true.duration,
         }
-        found, refused = entries(scene, true, say, quick)
-        say(f"{scene.name}: timing {len(found)} methods and settings")
-        own = timed_rows(scene, found, refused, true, repeats)
+        found, refused = entries(setup, true, say, quick)
+        say(f"{setup.name}: timing {len(found)} methods and settings")
+        own = timed_rows(setup, found, refused, true, repeats)
         rows += own
-        say(f"{scene.name}: gradient, batches, stages")
-        numbers["defaults"][scene.name] = default_of(scene, true, own, repeats)
-        numbers["profile"][scene.name] = profile(scene, repeats)
-    numbers["default"] = numbers["defaults"][scenes[0].name]
+        say(f"{setup.name}: gradient, batches, stages")
+        numbers["defaults"][setup.name] = default_of(setup, true, own, repeats)
+        numbers["profile"][setup.name] = profile(setup, repeats)
+    numbers["default"] = numbers["defaults"][setups[0].name]
     return Report(
         name="collision",
         numbers=numbers,
@@ -85,7 +85,7 @@ def run(say: Say, *, scenes: Sequence[Scene] | None = None, quick: bool = False,
 
 
 def timed_rows(
-    scene: Scene, found: Sequence[Entry], refused: Sequence[dict[str, Any]], true: Collision, repeats: int
+    setup: Setup, found: Sequence[Entry], refused: Sequence[dict[str, Any]], true: Collision, repeats: int
 ) -> list[dict[str, Any]]:
     """Rows with times and errors; errors are None where nothing is known of the outcome."""
     names = {f"{e.method}|{e.setting}": e for e in found}
@@ -94,22 +94,22 @@ def timed_rows(
     )
     rows = []
     for name, e in names.items():
-        row: dict[str, Any] = {"robot": scene.name, "method": e.method, "setting": e.setting}
+        row: dict[str, Any] = {"robot": setup.name, "method": e.method, "setting": e.setting}
         row |= {"time_us": 1e6 * times[name], **dict.fromkeys(KEYS)}
         if e.impulse is not None:
             row["impulse_error_pct"] = 100 * (e.impulse / true.impulse - 1)
         if e.result is not None:
-            errors = errors_against(e.result, true, torque_limit=scene.case.robot.torque_limit)
+            errors = errors_against(e.result, true, torque_limit=setup.case.robot.torque_limit)
             row |= {KEYS[0]: errors[KEYS[0]], KEYS[1]: errors["f_max_error_pct"]}
             row |= {key: errors[key] for key in KEYS[2:]}
         rows.append({**row, "note": e.note})
     empty = {"time_us": None, **dict.fromkeys(KEYS)}
-    return rows + [{"robot": scene.name, **empty, **row} for row in refused]
+    return rows + [{"robot": setup.name, **empty, **row} for row in refused]
 
 
-def default_of(scene: Scene, true: Collision, rows: Sequence[dict[str, Any]], repeats: int) -> dict[str, Any]:
+def default_of(setup: Setup, true: Collision, rows: Sequence[dict[str, Any]], repeats: int) -> dict[str, Any]:
     """What the default model takes, and ratios to the others of the same run."""
-    case, model = scene.case, scene.model(SDC)
+    case, model = setup.case, setup.model(SDC)
     at = {(r["method"], r["setting"]): r["time_us"] for r in rows}
     own = at[DEFAULT]
 
@@ -117,12 +117,12 @@ def default_of(scene: Scene, true: Collision, rows: Sequence[dict[str, Any]], re
         other = at.get((method, setting))
         return None if other is None else other / own
 
-    exact = ExactCollision(scene.model(SDC)).collide(case.q, case.v, case.torque)
+    exact = ExactCollision(setup.model(SDC)).collide(case.q, case.v, case.torque)
     gradient = runner(compiled_gradient(model, "impulse"), inputs(model, case))
     usual = runner(model.function(("impulse",)), [case.q, case.v, case.torque])
     runs = {"value": run_of(model, case, ("impulse",)), "gradient": gradient, "function": usual}
     value = medians(runs, repeats=repeats, clock=time.thread_time)
-    throughput = batches(scene, true, 3 * repeats)
+    throughput = batches(setup, true, 3 * repeats)
     return {
         "time_us": own,
         "impulse_alone_us": 1e6 * value["value"],
@@ -138,15 +138,15 @@ def default_of(scene: Scene, true: Collision, rows: Sequence[dict[str, Any]], re
     }
 
 
-def batches(scene: Scene, true: Collision, repeats: int) -> dict[str, Any]:
+def batches(setup: Setup, true: Collision, repeats: int) -> dict[str, Any]:
     """Collisions a second on one core and two: ours (impulse alone), and MuJoCo's own rollouts of steps."""
-    case, model = scene.case, scene.model(SDC)
+    case, model = setup.case, setup.model(SDC)
     q, v = np.tile(case.q, (BATCH, 1)), np.tile(case.v, (BATCH, 1))
     v *= np.linspace(0.8, 1.2, BATCH)[:, None]
     runs: dict[str, Callable[[], Any]] = {}
     for k in (1, 2):
         runs[f"ours {k}"] = partial(model.batch, q, v, case.torque, outputs=("impulse",), threads=k)
-        runs[f"mujoco {k}"] = mujoco_rollouts(scene, 1e-4, true.duration, ROLLOUTS, k)
+        runs[f"mujoco {k}"] = mujoco_rollouts(setup, 1e-4, true.duration, ROLLOUTS, k)
     times = shortest(runs, repeats=repeats)
     return {
         "impacts_per_second_1_core": BATCH / times["ours 1"],
@@ -158,18 +158,18 @@ def batches(scene: Scene, true: Collision, repeats: int) -> dict[str, Any]:
     }
 
 
-def profile(scene: Scene, repeats: int) -> dict[str, float]:
+def profile(setup: Setup, repeats: int) -> dict[str, float]:
     """[us] of our stages, by differences of functions that contain more and more; and Pinocchio's functions
     less their call from Python."""
-    case, model = scene.case, scene.model(SDC)
-    short = scene.model(SDC, horizon=1e-9)  # one step
+    case, model = setup.case, setup.model(SDC)
+    short = setup.model(SDC, horizon=1e-9)  # one step
     wanted = tuple(name for name in EVALUATION if name in model.available)
     ours = {
         "freeze": run_of(short, case, ("impulse",)),
         "impulse": run_of(model, case, ("impulse",)),
         "all": run_of(model, case, wanted),
     }
-    theirs = {f"pinocchio {name}": call for name, call in pinocchio_calls(scene).items()}
+    theirs = {f"pinocchio {name}": call for name, call in pinocchio_calls(setup).items()}
     found = medians({**ours, **theirs}, repeats=repeats, clock=time.thread_time)
     times = {name: 1e6 * t for name, t in found.items()}
     out = {

@@ -1,6 +1,6 @@
 """How far is each collision model from full dynamics?
 
-On each robot 27 collisions (`ladder.py`), with torque limits on. The reference is full dynamics with its
+On each robot 27 collisions (`hierarchy.py`), with torque limits on. The reference is full dynamics with its
 steps halved until the impulse stands still, and MuJoCo has the second word on it. What is measured is the
 virtual mass, the paper's SDC, and ours with more and more freezes on the way.
 """
@@ -20,7 +20,16 @@ from impactopt.errors import InputError
 from impactopt.pictures.fidelity import fidelity_picture
 from impactopt.simulation.cases import PAPER_SPEEDS, Case, errors_against
 from impactopt.simulation.workers import map_on_workers
-from impactopt.studies.bench.ladder import GAINS, HORIZON, LADDER, LAW, MASS_RATIOS, TARGETS, Rung, situations
+from impactopt.studies.bench.hierarchy import (
+    GAINS,
+    HIERARCHY,
+    HORIZON,
+    LAW,
+    MASS_RATIOS,
+    TARGETS,
+    Fidelity,
+    situations,
+)
 from impactopt.studies.report import Report, Say, cell, columns_table, make_table
 
 TOLERANCE = 1e-5  # relative, of the reference's impulse
@@ -50,7 +59,7 @@ class Task:
 
     robot: str
     index: int
-    ladder: tuple[Rung, ...]
+    hierarchy: tuple[Fidelity, ...]
     mujoco: bool
 
 
@@ -58,25 +67,25 @@ def run(
     say: Say,
     *,
     robots: Sequence[str] | None = None,
-    ladder: Sequence[Rung] | None = None,
+    hierarchy: Sequence[Fidelity] | None = None,
     workers: int = 2,
     quick: bool = False,
 ) -> Report:
     """One row a robot and model; quick: three collisions of the stand-in, up to four freezes."""
-    short = tuple(rung for rung in LADDER if (rung.freezes or 0) in (0, 2, 4))
+    short = tuple(fidelity for fidelity in HIERARCHY if (fidelity.freezes or 0) in (0, 2, 4))
     names = tuple(robots or (("standin",) if quick else TARGETS))
-    rungs = tuple(ladder or (short if quick else LADDER))
+    fidelities = tuple(hierarchy or (short if quick else HIERARCHY))
     # what takes longest to compile first, so that no process is left with it at the end
-    compiled = [(name, rung) for rung in rungs[::-1] for name in names]
+    compiled = [(name, fidelity) for fidelity in fidelities[::-1] for name in names]
     map_on_workers(
-        compile_rung,
+        compile_model,
         None,
         compiled,
         workers=workers,
         crashed=lambda _code: None,  # what needs the function says it better
         progress=lambda done, of: say(f"models compiled: {done} of {of}"),
     )
-    tasks = [task for name in names for task in tasks_of(name, rungs, quick)]
+    tasks = [task for name in names for task in tasks_of(name, fidelities, quick)]
     found = map_on_workers(
         measured,
         None,
@@ -86,8 +95,13 @@ def run(
         progress=lambda done, of: say(f"collisions: {done} of {of}"),
     )
     collisions = [{"robot": task.robot, **given} for task, given in zip(tasks, found, strict=True)]
-    rows = [row_of(name, rung, collisions) for name in names for rung in rungs]
-    numbers = {"rows": rows, **orders(collisions, rungs), **second_opinion(collisions), **_setting(names)}
+    rows = [row_of(name, fidelity, collisions) for name in names for fidelity in fidelities]
+    numbers = {
+        "rows": rows,
+        **orders(collisions, fidelities),
+        **second_opinion(collisions),
+        **_setting(names),
+    }
     return Report(
         name="fidelity",
         numbers={**numbers, "collisions": collisions},
@@ -97,7 +111,7 @@ def run(
 
 
 # ---------------------------------------------------------------- collisions
-def tasks_of(robot: str, ladder: tuple[Rung, ...], quick: bool) -> list[Task]:
+def tasks_of(robot: str, hierarchy: tuple[Fidelity, ...], quick: bool) -> list[Task]:
     """MuJoCo gets those of a Latin square, nine of 27: each pair of posture, speed and gains once."""
     tasks = []
     places = product(range(len(MASS_RATIOS)), range(len(PAPER_SPEEDS)), range(len(GAINS)))
@@ -105,20 +119,20 @@ def tasks_of(robot: str, ladder: tuple[Rung, ...], quick: bool) -> list[Task]:
         if quick and not i == j == k:
             continue
         mujoco = i == j == k == 1 if quick else (i + j + k) % 3 == 0
-        tasks.append(Task(robot=robot, index=index, ladder=ladder, mujoco=mujoco))
+        tasks.append(Task(robot=robot, index=index, hierarchy=hierarchy, mujoco=mujoco))
     return tasks
 
 
 @cache
-def _model(robot: str, rung: Rung) -> Any:
-    return rung.make(robot)
+def _model(robot: str, fidelity: Fidelity) -> Any:
+    return fidelity.make(robot)
 
 
-def compile_rung(_shared: None, given: tuple[str, Rung]) -> None:
+def compile_model(_shared: None, given: tuple[str, Fidelity]) -> None:
     """The model's function into the cache on disk, by using it once."""
-    robot, rung = given
+    robot, fidelity = given
     try:
-        situations(robot)[0].collide(_model(robot, rung))
+        situations(robot)[0].collide(_model(robot, fidelity))
     except InputError:
         return  # said again, and kept, where the model is measured
 
@@ -128,7 +142,7 @@ def measured(_shared: None, task: Task) -> dict[str, Any]:
     case = situations(task.robot)[task.index]
     out: dict[str, Any] = {"case": case.name, "models": [], "mujoco_vs_pinocchio_pct": None, "reason": None}
     try:
-        reference, change = _converged(case, Rung(model="reference"), task.robot, TOLERANCE)
+        reference, change = _converged(case, Fidelity(model="reference"), task.robot, TOLERANCE)
     except InputError as error:
         return out | {"reason": f"reference: {error}"}
     out |= {
@@ -140,11 +154,11 @@ def measured(_shared: None, task: Task) -> dict[str, Any]:
     }
     if task.mujoco:
         try:
-            other, _ = _converged(case, Rung(model="mujoco"), task.robot, 1e-4)
+            other, _ = _converged(case, Fidelity(model="mujoco"), task.robot, 1e-4)
             out["mujoco_vs_pinocchio_pct"] = 100 * (other.impulse / reference.impulse - 1)
         except InputError as error:
             out["reason"] = f"mujoco: {error}"
-    out["models"] = [_compared(case, rung, task.robot, reference) for rung in task.ladder]
+    out["models"] = [_compared(case, fidelity, task.robot, reference) for fidelity in task.hierarchy]
     return out
 
 
@@ -154,18 +168,18 @@ def _saturated(collision: Collision, case: Case) -> int:
     return int(over.any(axis=0).sum())
 
 
-def _converged(case: Case, rung: Rung, robot: str, tolerance: float) -> tuple[Collision, float]:
-    model = _model(robot, rung)
+def _converged(case: Case, fidelity: Fidelity, robot: str, tolerance: float) -> tuple[Collision, float]:
+    model = _model(robot, fidelity)
     options: dict[str, Any] = {"tolerance": tolerance, "require_separation": False, **case.overrides}
     found: tuple[Collision, float] = model.converged(case.q, case.v, case.torque, **options)
     return found
 
 
-def _compared(case: Case, rung: Rung, robot: str, reference: Collision) -> dict[str, Any]:
-    out: dict[str, Any] = {"model": rung.model, "freezes": rung.freezes, **dict.fromkeys(ERRORS)}
+def _compared(case: Case, fidelity: Fidelity, robot: str, reference: Collision) -> dict[str, Any]:
+    out: dict[str, Any] = {"model": fidelity.model, "freezes": fidelity.freezes, **dict.fromkeys(ERRORS)}
     out |= {"torque_joint": None, "separated": None, "reason": None}
     try:
-        result = case.collide(_model(robot, rung))
+        result = case.collide(_model(robot, fidelity))
     except InputError as error:
         return out | {"reason": str(error)}
     limit = case.robot.torque_limit
@@ -189,12 +203,12 @@ def _crashed(code: int) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------- what comes out
-def row_of(robot: str, rung: Rung, collisions: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def row_of(robot: str, fidelity: Fidelity, collisions: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Worst and median over the robot's collisions, and where the worst are; `failed` have no error."""
     own = [c for c in collisions if c["robot"] == robot]
-    pairs = [(c["case"], found) for c in own for found in _of(rung, c)]
+    pairs = [(c["case"], found) for c in own for found in _of(fidelity, c)]
     good = [(case, found) for case, found in pairs if found["impulse_error_pct"] is not None]
-    row: dict[str, Any] = {"robot": robot, "model": rung.model, "freezes": rung.freezes}
+    row: dict[str, Any] = {"robot": robot, "model": fidelity.model, "freezes": fidelity.freezes}
     for what in ("impulse_error_pct", "zmp_error_mm", "torque_error_pct"):
         sized = [(abs(found[what]), case, found) for case, found in good if found[what] is not None]
         worst: tuple[Any, Any, Any] = max(sized, key=lambda entry: entry[0], default=(None, None, {}))
@@ -207,17 +221,21 @@ def row_of(robot: str, rung: Rung, collisions: Sequence[dict[str, Any]]) -> dict
     return row | {"collisions": len(own), "failed": len(own) - len(good), "pushes": pushes}
 
 
-def _of(rung: Rung, collision: dict[str, Any]) -> list[dict[str, Any]]:
-    return [m for m in collision["models"] if (m["model"], m["freezes"]) == (rung.model, rung.freezes)]
+def _of(fidelity: Fidelity, collision: dict[str, Any]) -> list[dict[str, Any]]:
+    return [
+        m for m in collision["models"] if (m["model"], m["freezes"]) == (fidelity.model, fidelity.freezes)
+    ]
 
 
-def orders(collisions: Sequence[dict[str, Any]], ladder: Sequence[Rung]) -> dict[str, Any]:
+def orders(collisions: Sequence[dict[str, Any]], hierarchy: Sequence[Fidelity]) -> dict[str, Any]:
     """Order in the number of freezes, from two on: of the worst impulse error, and of the median one.
 
     Minus the slope of a straight line through the logarithms; robots' own beside that of all together. None
     from fewer than two numbers of freezes.
     """
-    rungs = [rung for rung in ladder if rung.freezes is not None and rung.freezes >= ORDER_FROM]
+    fidelities = [
+        fidelity for fidelity in hierarchy if fidelity.freezes is not None and fidelity.freezes >= ORDER_FROM
+    ]
     out: dict[str, Any] = {"order_in_freezes": None, "order_in_freezes_median": None}
     by_robot = {}
     for name in (None, *dict.fromkeys(c["robot"] for c in collisions)):
@@ -226,14 +244,14 @@ def orders(collisions: Sequence[dict[str, Any]], ladder: Sequence[Rung]) -> dict
                 abs(found["impulse_error_pct"])
                 for c in collisions
                 if name in (None, c["robot"])
-                for found in _of(rung, c)
+                for found in _of(fidelity, c)
                 if found["impulse_error_pct"] is not None
             ]
-            for rung in rungs
+            for fidelity in fidelities
         ]
-        if len(rungs) < 2 or not all(errors):
+        if len(fidelities) < 2 or not all(errors):
             continue
-        counts = np.log([float(rung.freezes or 0) for rung in rungs])
+        counts = np.log([float(fidelity.freezes or 0) for fidelity in fidelities])
         slopes = {
             key: -float(np.polyfit(counts, np.log([of(e) for e in errors]), 1)[0])
             for key, of in (("order_in_freezes", np.max), ("order_in_freezes_median", np.median))
@@ -272,7 +290,7 @@ def tables_of(rows: Sequence[dict[str, Any]], numbers: dict[str, Any]) -> tuple[
         own = [
             {
                 **r,
-                "label": Rung(model=r["model"], freezes=r["freezes"]).label,
+                "label": Fidelity(model=r["model"], freezes=r["freezes"]).label,
                 "pushes": len(r["pushes"]),
             }
             for r in rows

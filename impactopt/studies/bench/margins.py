@@ -2,7 +2,7 @@
 
 From one base, the problem without scenarios and with default terms, one option at a time goes from daring to
 cautious. Each plan is replayed on free soles: as planned, with the target missing, and under the same drawn
-conditions.
+perturbations.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, Term, TorqueLimit
-from impactopt.simulation import Conditions, simulate
+from impactopt.simulation import Perturbation, simulate
 from impactopt.simulation.robustness import STEP, robustness
 from impactopt.studies.bench.planning import DEMO
 from impactopt.studies.report import Report, Say, columns_table
@@ -216,11 +216,13 @@ def row(problem: ImpactProblem, name: str, say: Say, draws: int, seed: int, work
 
 
 def replays(solution: Solution, name: str, say: Say, draws: int, seed: int, workers: int) -> dict[str, Any]:
-    """As planned, with the target missing, and under drawn conditions; slip is of the draws that stand."""
+    """As planned, with the target missing, and under drawn perturbations; slip is of the draws that stand."""
     problem, reference = solution.problem, solution.trajectory
     say(f"replaying {name}: {solution.impulse:.2f} N s, {solution.solve_seconds:.1f} s")
     nominal = simulate(problem, reference, engine="mujoco", step=STEP)
-    missing = simulate(problem, reference, engine="mujoco", step=STEP, conditions=Conditions(missing=True))
+    missing = simulate(
+        problem, reference, engine="mujoco", step=STEP, perturbation=Perturbation(missing=True)
+    )
     many = robustness(
         problem, reference, solution.impulse, draws=draws, seed=seed, workers=workers, step=STEP
     )

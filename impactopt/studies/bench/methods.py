@@ -12,7 +12,7 @@ from impactopt.errors import InputError
 from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.clock import runner
 from impactopt.studies.bench.peers import cvodes, mujoco_loop, mujoco_steps, pinocchio_calls
-from impactopt.studies.bench.scene import EVALUATION, Scene, graph, inputs, outcome, run_of
+from impactopt.studies.bench.setup import EVALUATION, Setup, graph, inputs, outcome, run_of
 from impactopt.studies.exact import ExactCollision
 from impactopt.studies.report import Say
 
@@ -43,22 +43,22 @@ class Entry:
         return self.method, self.setting
 
 
-def entries(scene: Scene, true: Collision, say: Say, quick: bool) -> tuple[list[Entry], list[dict[str, Any]]]:
+def entries(setup: Setup, true: Collision, say: Say, quick: bool) -> tuple[list[Entry], list[dict[str, Any]]]:
     """What can be run, and rows of what cannot."""
     found: list[Entry] = []
     refused: list[dict[str, Any]] = []
-    case, ours = scene.case, _ours(scene, say, found, refused)
-    usual = f"tolerance {scene.model(SDC).tolerance:g}"
-    ours("virtual mass", usual, lambda: scene.model(VirtualMass))
-    paper = partial(scene.model, SDC.paper)
+    case, ours = setup.case, _ours(setup, say, found, refused)
+    usual = f"tolerance {setup.model(SDC).tolerance:g}"
+    ours("virtual mass", usual, lambda: setup.model(VirtualMass))
+    paper = partial(setup.model, SDC.paper)
     for step in (1e-4,) if quick else PAPER_STEPS:
         ours("paper, by hand", f"{step:g} s", partial(_stepped, paper, step))
     for tolerance in (1e-7,) if quick else OUR_TOLERANCES:
-        ours("sdc", f"tolerance {tolerance:g}", partial(scene.model, SDC, tolerance=tolerance))
+        ours("sdc", f"tolerance {tolerance:g}", partial(setup.model, SDC, tolerance=tolerance))
     for freezes in (2,) if quick else FREEZES:
-        ours(f"sdc, {freezes} freezes", usual, partial(scene.model, SDC, freezes=freezes))
-    found += _by_graph(scene, paper, say)
-    exact = ExactCollision(scene.model(SDC))
+        ours(f"sdc, {freezes} freezes", usual, partial(setup.model, SDC, freezes=freezes))
+    found += _by_graph(setup, paper, say)
+    exact = ExactCollision(setup.model(SDC))
     frozen = exact.collide(case.q, case.v, case.torque)
     found.append(
         Entry(
@@ -68,18 +68,18 @@ def entries(scene: Scene, true: Collision, say: Say, quick: bool) -> tuple[list[
             result=frozen,
         )
     )
-    found += _peers(scene, true, frozen, say, quick)
+    found += _peers(setup, true, frozen, say, quick)
     return found, refused
 
 
 def _ours(
-    scene: Scene, say: Say, found: list[Entry], refused: list[dict[str, Any]]
+    setup: Setup, say: Say, found: list[Entry], refused: list[dict[str, Any]]
 ) -> Callable[[str, str, Callable[[], Any]], None]:
     """Adds a model of ours, which it makes, to what is found, or the reason against it to what is refused."""
-    case = scene.case
+    case = setup.case
 
     def add(method: str, setting: str, make: Callable[[], Any]) -> None:
-        say(f"{scene.name}: {method}, {setting}")
+        say(f"{setup.name}: {method}, {setting}")
         try:
             model = make()
             longest = model.stable_step(case.q)
@@ -101,29 +101,29 @@ def _stepped(make: Callable[..., Any], step: float) -> Any:
     return replace(make(), step=step)
 
 
-def _by_graph(scene: Scene, paper: Callable[..., Any], say: Say) -> list[Entry]:
+def _by_graph(setup: Setup, paper: Callable[..., Any], say: Say) -> list[Entry]:
     """The paper's scheme and ours by CasADi's route: from the graph to C, at -O1."""
     made = []
-    ours = scene.model(SDC, method="rk4")
+    ours = setup.model(SDC, method="rk4")
     for method, model in (("paper, CasADi's C", paper()), ("sdc, CasADi's C", ours)):
-        say(f"{scene.name}: {method}")
+        say(f"{setup.name}: {method}")
         wanted = tuple(name for name in EVALUATION if name in model.available)
-        run = runner(graph(model, wanted), inputs(model, scene.case))
+        run = runner(graph(model, wanted), inputs(model, setup.case))
         made.append(
             Entry(
                 method=method,
                 setting=f"{model.step_length:g} s",
                 run=run,
-                result=outcome(model, scene.case),
+                result=outcome(model, setup.case),
             )
         )
     return made
 
 
-def _peers(scene: Scene, true: Collision, frozen: Collision, say: Say, quick: bool) -> list[Entry]:
-    case, made = scene.case, []
+def _peers(setup: Setup, true: Collision, frozen: Collision, say: Say, quick: bool) -> list[Entry]:
+    case, made = setup.case, []
     for tolerance in (1e-7,) if quick else TOLERANCES:
-        run, impulse = cvodes(scene, frozen.duration, tolerance)
+        run, impulse = cvodes(setup, frozen.duration, tolerance)
         note = "frozen; its end is given to it; the freeze is not in the time"
         made.append(
             Entry(
@@ -134,10 +134,10 @@ def _peers(scene: Scene, true: Collision, frozen: Collision, say: Say, quick: bo
                 note=note,
             )
         )
-    calls = pinocchio_calls(scene)["constrained dynamics"]
+    calls = pinocchio_calls(setup)["constrained dynamics"]
     for step in (1e-4,) if quick else FULL_STEPS:
-        say(f"{scene.name}: full dynamics, {step:g} s")
-        model = scene.model(FullDynamics, step=step, form="pinocchio")
+        say(f"{setup.name}: full dynamics, {step:g} s")
+        model = setup.model(FullDynamics, step=step, form="pinocchio")
         try:
             result = model.collide(case.q, case.v, case.torque)
         except InputError:
@@ -150,12 +150,12 @@ def _peers(scene: Scene, true: Collision, frozen: Collision, say: Say, quick: bo
         note = "constraintDynamics alone, four times a step: a bound from below"
         made.append(Entry(method="Pinocchio, calls alone", setting=setting, run=alone, note=note))
     for step in (1e-4,) if quick else MUJOCO_STEPS:
-        say(f"{scene.name}: MuJoCo, {step:g} s")
+        say(f"{setup.name}: MuJoCo, {step:g} s")
         setting = f"{step:g} s"
-        alone = mujoco_steps(scene, step, true.duration)
+        alone = mujoco_steps(setup, step, true.duration)
         note = "mj_step alone, without servo, law and records: a bound from below"
         made.append(Entry(method="MuJoCo, steps alone", setting=setting, run=alone, note=note))
-        loop = mujoco_loop(scene, step)
+        loop = mujoco_loop(setup, step)
         try:
             result = loop()
         except InputError:

@@ -17,7 +17,7 @@ from impactopt.simulation.mujoco_world import mujoco_module, no_log_file
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.reference import FullDynamics, MujocoDynamics
 from impactopt.simulation.reference.mujoco_dynamics import HeldRobot, march
-from impactopt.studies.bench.scene import Scene
+from impactopt.studies.bench.setup import Setup
 
 __all__ = ["cvodes", "mujoco_loop", "mujoco_rollouts", "mujoco_steps", "pinocchio_calls"]
 
@@ -25,17 +25,17 @@ Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- MuJoCo
-def _world(scene: Scene, step: float) -> tuple[MujocoDynamics, HeldRobot]:
-    model = scene.model(MujocoDynamics, step=step)
+def _world(setup: Setup, step: float) -> tuple[MujocoDynamics, HeldRobot]:
+    model = setup.model(MujocoDynamics, step=step)
     robot, frames, _, striker = model._held
     with no_log_file():
         return model, HeldRobot(robot, frames, striker, step)
 
 
-def mujoco_loop(scene: Scene, step: float) -> Callable[[], Collision]:
+def mujoco_loop(setup: Setup, step: float) -> Callable[[], Collision]:
     """A collision in MuJoCo, with servo, contact law and records from Python, in a world made once."""
-    model, world = _world(scene, step)
-    case = scene.case
+    model, world = _world(setup, step)
+    case = setup.case
     soles = len(model.held_by.sole_names(case.robot))
 
     def run() -> Collision:
@@ -48,32 +48,32 @@ def mujoco_loop(scene: Scene, step: float) -> Callable[[], Collision]:
     return run
 
 
-def mujoco_steps(scene: Scene, step: float, duration: float) -> Callable[[], None]:
+def mujoco_steps(setup: Setup, step: float, duration: float) -> Callable[[], None]:
     """MuJoCo's own steps for as long as the contact [s], and nothing else: no law, no servo, no records.
 
     Its solver has MuJoCo's default tolerance and iterations. A bound from below on what a collision costs it.
     """
-    world, count = _steps_alone(scene, step), max(1, round(duration / step))
+    world, count = _steps_alone(setup, step), max(1, round(duration / step))
     mujoco = world.mujoco
 
     def run() -> None:
         mujoco.mj_resetData(world.world, world.data)
-        world.start(scene.case.q, scene.case.v)
-        world.data.qfrc_applied[world.dof] = scene.case.torque
+        world.start(setup.case.q, setup.case.v)
+        world.data.qfrc_applied[world.dof] = setup.case.torque
         mujoco.mj_step(world.world, world.data, count)
 
     return run
 
 
 def mujoco_rollouts(
-    scene: Scene, step: float, duration: float, batch: int, threads: int
+    setup: Setup, step: float, duration: float, batch: int, threads: int
 ) -> Callable[[], Any]:
     """`batch` times those steps, by MuJoCo's own batched rollout."""
     from mujoco import rollout
 
-    world, count = _steps_alone(scene, step), max(1, round(duration / step))
+    world, count = _steps_alone(setup, step), max(1, round(duration / step))
     mujoco = world.mujoco
-    world.start(scene.case.q, scene.case.v)
+    world.start(setup.case.q, setup.case.v)
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
     state = np.zeros(mujoco.mj_stateSize(world.world, kind))
     mujoco.mj_getState(world.world, world.data, state, kind)
@@ -84,21 +84,21 @@ def mujoco_rollouts(
     return lambda: pool.rollout(world.world, data, many, nstep=count)
 
 
-def _steps_alone(scene: Scene, step: float) -> HeldRobot:
+def _steps_alone(setup: Setup, step: float) -> HeldRobot:
     mujoco = mujoco_module()
-    _, world = _world(scene, step)
+    _, world = _world(setup, step)
     usual = mujoco.MjSpec().compile().opt
     world.world.opt.iterations, world.world.opt.tolerance = usual.iterations, usual.tolerance
     return world
 
 
 # ---------------------------------------------------------------- Pinocchio
-def pinocchio_calls(scene: Scene) -> dict[str, Callable[[], Any]]:
+def pinocchio_calls(setup: Setup) -> dict[str, Callable[[], Any]]:
     """Pinocchio's functions for each stage, called from Python; `call` is the call of one on a pendulum."""
-    case = scene.case
+    case = setup.case
     robot, q, v = case.robot, case.q, case.v
     model, data = robot.model, robot.model.createData()
-    body = PinocchioBody(*scene.model(FullDynamics)._held, case.normal)
+    body = PinocchioBody(*setup.model(FullDynamics)._held, case.normal)
     torque = np.concatenate([np.zeros(robot.nv - robot.n), case.torque])
     held = (body._constraints, body._found, body._proximal)
     pendulum = pin.Model()
@@ -128,13 +128,13 @@ def pinocchio_calls(scene: Scene) -> dict[str, Callable[[], Any]]:
 
 
 # ---------------------------------------------------------------- CVODES
-def cvodes(scene: Scene, duration: float, tolerance: float) -> tuple[Callable[[], Any], Callable[[], float]]:
+def cvodes(setup: Setup, duration: float, tolerance: float) -> tuple[Callable[[], Any], Callable[[], float]]:
     """The frozen collision from contact to a duration [s] that is given to it, by CasADi's `integrator`.
 
     Returns what makes one, and what gives the impulse [N s]. Its right-hand side runs in CasADi's virtual
     machine, as CVODES is not for code generation; the freeze is not in it.
     """
-    sdc, case = scene.model(), scene.case
+    sdc, case = setup.model(), setup.case
     model = joint_space_model(sdc)
     y, data = ca.SX.sym("y", model.n_states), model.symbols()
     rate = rate_of_change(model, y, model.velocity_change(y, data), data)

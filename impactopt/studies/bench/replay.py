@@ -13,13 +13,13 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.pictures.convergence import convergence_picture
 from impactopt.planning.solution import Solution
-from impactopt.simulation import Conditions, Simulation
+from impactopt.simulation import Perturbation, Simulation
 from impactopt.studies.bench.planning import DEMO, plan_of
 from impactopt.studies.report import Report, Say, columns_table
 
 STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2.5e-5)  # [s]
 STEP = 2e-4  # of the rows that change something else
-FLOOR = Conditions().floor_time
+FLOOR = Perturbation().floor_time
 COLUMNS = (
     ("impulse N s", "impulse_Ns", 3),
     ("change %", "impulse_change_pct", 3),
@@ -34,10 +34,10 @@ OTHERS: dict[str, dict[str, Any]] = {
     "iterations 10": {"iterations": 10},
     "tolerance 1e-8": {"tolerance": 1e-8},
     "tolerance 1e-6": {"tolerance": 1e-6},
-    f"floor time {500 * FLOOR:g} ms": {"conditions": Conditions(floor_time=FLOOR / 2)},
-    f"floor time {2000 * FLOOR:g} ms": {"conditions": Conditions(floor_time=2 * FLOOR)},
-    "servo every 1 ms": {"conditions": Conditions(period=1e-3)},
-    "friction 0.6": {"conditions": Conditions(friction=0.6)},
+    f"floor time {500 * FLOOR:g} ms": {"perturbation": Perturbation(floor_time=FLOOR / 2)},
+    f"floor time {2000 * FLOOR:g} ms": {"perturbation": Perturbation(floor_time=2 * FLOOR)},
+    "servo every 1 ms": {"perturbation": Perturbation(period=1e-3)},
+    "friction 0.6": {"perturbation": Perturbation(friction=0.6)},
 }
 
 
@@ -125,8 +125,8 @@ def _replay(solution: Solution, say: Say, **options: Any) -> Simulation | str:
 
 
 def _short(value: Any) -> str:
-    if not isinstance(value, Conditions):
+    if not isinstance(value, Perturbation):
         return f"{value:g}"
-    plan = Conditions()
+    plan = Perturbation()
     changed = {k: v for k, v in vars(value).items() if v != getattr(plan, k)}
     return " ".join(f"{k}={v:g}" for k, v in changed.items())

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from impactopt.pictures.robustness import robustness_picture
-from impactopt.simulation import Conditions, Simulation
-from impactopt.simulation.robustness import STEP, Robustness, Spread, robustness
+from impactopt.simulation import Perturbation, Simulation
+from impactopt.simulation.robustness import STEP, PerturbationRanges, Robustness, robustness
 from impactopt.studies.bench.planning import DEMO, plan_of
 from impactopt.studies.report import Report, Say, make_table
 
@@ -19,14 +19,14 @@ SAID_EVERY = 20  # draws
 
 
 def run(say: Say, *, file: Path | None = None, draws: int = 200, seed: int = 0, workers: int = 2) -> Report:
-    """Plan a problem file, and replay the plan under drawn conditions.
+    """Plan a problem file, and replay the plan under drawn perturbations.
 
     file : default: problems/punch_robust.toml, and where it is not there the demo's.
     """
     chosen = file if file is not None else ROBUST if ROBUST.exists() else DEMO
     solution = plan_of(chosen, say)
-    as_planned = Conditions(period=Spread().period)
-    nominal = solution.validate(engine="mujoco", step=STEP, conditions=as_planned)
+    as_planned = Perturbation(period=PerturbationRanges().period)
+    nominal = solution.validate(engine="mujoco", step=STEP, perturbation=as_planned)
 
     def progress(done: int, of: int) -> None:
         if done % SAID_EVERY == 0 or done == of:
@@ -70,7 +70,7 @@ def numbers_of(result: Robustness) -> dict[str, Any]:
         "reasons": result.reasons(),
         "separation": result.separation(),
         "standing_by_third": result.by_third(),
-        "spread": asdict(result.spread),
+        "ranges": asdict(result.drawn_from),
         "rows": {
             **{name: list(value) for name, value in result.table().items()},
             "standing": [bool(x) for x in result.standing],

@@ -23,9 +23,9 @@ from impactopt.pictures.scaling import scaling_picture
 from impactopt.simulation.cases import Case
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.clock import medians, shortest
-from impactopt.studies.bench.costs import Tree, cost_sdc, even_tree, iterations
-from impactopt.studies.bench.scaling_robots import depth, humanoid_scenes, tip_scene
-from impactopt.studies.bench.scene import Scene, compiled, inputs, run_of
+from impactopt.studies.bench.costs import TreeSize, cost_sdc, even_tree, iterations
+from impactopt.studies.bench.scaling_robots import depth, humanoid_setups, tip_setup
+from impactopt.studies.bench.setup import Setup, compiled, inputs, run_of
 from impactopt.studies.exact import ExactCollision
 from impactopt.studies.report import Report, Say, columns_table
 
@@ -79,7 +79,7 @@ def run(
     chains: Sequence[int] | None = None,
     trees: Sequence[int] | None = None,
     humanoids: Sequence[str] = HUMANOIDS,
-    scene: Scene | None = None,
+    setup: Setup | None = None,
     steps: Sequence[float] = STEPS,
     tolerances: Sequence[float] = TOLERANCES,
     batches: Sequence[int] = BATCHES,
@@ -89,7 +89,7 @@ def run(
 ) -> Report:
     """Rows over "dof", "step" and "batch", and the exponents of cost in the number of joints.
 
-    humanoids : presets; those that are not installed are left out.  scene : of steps and batches.
+    humanoids : presets; those that are not installed are left out.  setup : of steps and batches.
     workers : processes that compile.
     quick : no more than 32 joints, the stand-in only, and a few steps.
     """
@@ -97,17 +97,17 @@ def run(
     trees = trees or (QUICK_TREES if quick else TREES)
     if quick:
         humanoids, steps, tolerances = humanoids[:1], steps[1:3], tolerances[:2]
-    scene = scene or Scene.of("standin")
-    scenes = [tip_scene("chain", n) for n in chains] + [tip_scene("tree", n) for n in trees]
-    scenes += humanoid_scenes(humanoids, say)
-    stages = [stage_model(one) for one in scenes]
-    of_steps = step_models(scene, steps, tolerances)
-    whole = [one.model(SDC) for one in scenes]
+    setup = setup or Setup.of("standin")
+    setups = [tip_setup("chain", n) for n in chains] + [tip_setup("tree", n) for n in trees]
+    setups += humanoid_setups(humanoids, say)
+    stages = [stage_model(one) for one in setups]
+    of_steps = step_models(setup, steps, tolerances)
+    whole = [one.model(SDC) for one in setups]
     compile_all([*whole, *(m for m in stages if m is not None), *of_steps], say, workers)
     say("measuring")
-    rows = over_dof(scenes, stages, repeats)
+    rows = over_dof(setups, stages, repeats)
     powers = exponents(rows)
-    rows += over_step(scene, of_steps, repeats) + over_batch(scene, batches, repeats)
+    rows += over_step(setup, of_steps, repeats) + over_batch(setup, batches, repeats)
     return Report(
         name="scaling",
         numbers={"rows": rows, "exponents": powers},
@@ -146,44 +146,44 @@ def parted(case: Case) -> Case:
     return replace(case, v=-case.v)
 
 
-def stage_model(scene: Scene) -> SymbolicModel | None:
+def stage_model(setup: Setup) -> SymbolicModel | None:
     """The paper's scheme on the same frozen dynamics; None of chains: it does not know a tree's shape, and
     those take long to compile."""
-    if scene.name == "chain":
+    if setup.name == "chain":
         return None
-    model = scene.model(SDC, method="rk4")
+    model = setup.model(SDC, method="rk4")
     # a step that is stable on all of them, whatever has been drawn
-    step = min(PAPER_STEP, 0.5 * model.stable_step(scene.case.q))
+    step = min(PAPER_STEP, 0.5 * model.stable_step(setup.case.q))
     staged: SymbolicModel = replace(model, step=step)
     return staged
 
 
 def over_dof(
-    scenes: Sequence[Scene], stages: Sequence[SymbolicModel | None], repeats: int
+    setups: Sequence[Setup], stages: Sequence[SymbolicModel | None], repeats: int
 ) -> list[dict[str, Any]]:
     """Time of a collision, of its freeze and its time loop, and of a stage of the paper's scheme."""
     runs: dict[str, Callable[[], Any]] = {}
-    for k, (scene, staged) in enumerate(zip(scenes, stages, strict=True)):
-        for name, model in (("whole", scene.model(SDC)), ("staged", staged)):
+    for k, (setup, staged) in enumerate(zip(setups, stages, strict=True)):
+        for name, model in (("whole", setup.model(SDC)), ("staged", staged)):
             if model is not None:
-                runs[f"{k} {name}"] = run_of(model, scene.case, WANTED)
-                runs[f"{k} {name} frozen"] = run_of(model, parted(scene.case), WANTED)
+                runs[f"{k} {name}"] = run_of(model, setup.case, WANTED)
+                runs[f"{k} {name} frozen"] = run_of(model, parted(setup.case), WANTED)
     # the best: code of megabytes is thrown out of the caches by whatever else runs
     found = shortest(runs, repeats=repeats, warm=True)
     times = {name: 1e6 * seconds for name, seconds in found.items()}
     rows = []
-    for k, (scene, staged) in enumerate(zip(scenes, stages, strict=True)):
-        case, stage = scene.case, None
+    for k, (setup, staged) in enumerate(zip(setups, stages, strict=True)):
+        case, stage = setup.case, None
         n = case.robot.n
         if staged is not None:
             steps = np.ceil(numbers_of(staged, case)["duration"] / staged.step_length)
             stage = (times[f"{k} staged"] - times[f"{k} staged frozen"]) / (STAGES * max(1.0, steps))
-        tree = Tree(n=n, arms=(n,), colliding=n) if scene.name == "chain" else even_tree(n)
+        tree = TreeSize(n=n, arms=(n,), colliding=n) if setup.name == "chain" else even_tree(n)
         once = cost_sdc(tree, 0)
         rows.append(
             {
                 "over": "dof",
-                "robot": scene.name,
+                "robot": setup.name,
                 "n": n,
                 "velocities": case.robot.nv,
                 "time_us": times[f"{k} whole"],
@@ -222,23 +222,23 @@ def exponents(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 # ---------------------------------------------------------------- step, batch
-def step_models(scene: Scene, steps: Sequence[float], tolerances: Sequence[float]) -> list[SymbolicModel]:
+def step_models(setup: Setup, steps: Sequence[float], tolerances: Sequence[float]) -> list[SymbolicModel]:
     """Of all methods, as far as their steps are stable and not too many."""
-    models: list[SymbolicModel] = [scene.model(SDC, tolerance=tolerance) for tolerance in tolerances]
+    models: list[SymbolicModel] = [setup.model(SDC, tolerance=tolerance) for tolerance in tolerances]
     for step in steps:
         try:
-            model = scene.model(SDC, method="rk4", step=step)
+            model = setup.model(SDC, method="rk4", step=step)
         except InputError:
             continue  # more steps than there may be
-        if step < model.stable_step(scene.case.q):
+        if step < model.stable_step(setup.case.q):
             models.append(model)
     return models
 
 
-def over_step(scene: Scene, models: Sequence[SymbolicModel], repeats: int) -> list[dict[str, Any]]:
+def over_step(setup: Setup, models: Sequence[SymbolicModel], repeats: int) -> list[dict[str, Any]]:
     """Time and error of the frozen collision, against its exact solution."""
-    case, default = scene.case, scene.model(SDC)
-    exact = ExactCollision(scene.model(SDC)).collide(case.q, case.v, case.torque)
+    case, default = setup.case, setup.model(SDC)
+    exact = ExactCollision(setup.model(SDC)).collide(case.q, case.v, case.torque)
     runs = {str(k): run_of(model, case, WANTED) for k, model in enumerate(models)}
     times = medians(runs, repeats=repeats, clock=time.thread_time)
     rows = []
@@ -249,7 +249,7 @@ def over_step(scene: Scene, models: Sequence[SymbolicModel], repeats: int) -> li
         rows.append(
             {
                 "over": "step",
-                "robot": scene.name,
+                "robot": setup.name,
                 "method": model.stepping,
                 "step_s": step,
                 "tolerance": model.tolerance if own else None,
@@ -262,9 +262,9 @@ def over_step(scene: Scene, models: Sequence[SymbolicModel], repeats: int) -> li
     return rows
 
 
-def over_batch(scene: Scene, sizes: Sequence[int], repeats: int) -> list[dict[str, Any]]:
+def over_batch(setup: Setup, sizes: Sequence[int], repeats: int) -> list[dict[str, Any]]:
     """Collisions a second by size of the batch, on one core and on two."""
-    case, model = scene.case, scene.model(SDC)
+    case, model = setup.case, setup.model(SDC)
     runs: dict[str, Callable[[], Any]] = {}
     for size in sizes:
         q, v = np.tile(case.q, (size, 1)), np.tile(case.v, (size, 1))

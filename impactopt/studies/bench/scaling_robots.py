@@ -18,11 +18,11 @@ from impactopt.kinematics.held import holding_torque, striking_velocity
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import Case
-from impactopt.studies.bench.scene import Scene
+from impactopt.studies.bench.setup import Setup
 from impactopt.studies.bench.trees import LIMBS, random_robot, tip_speed
 from impactopt.studies.report import Say
 
-__all__ = ["depth", "humanoid_scenes", "tip_scene"]
+__all__ = ["depth", "humanoid_setups", "tip_setup"]
 
 Array = NDArray[np.float64]
 
@@ -33,18 +33,18 @@ NO_LIMIT = 1e6  # [N m]
 KINDS = {"chain": 1, "tree": LIMBS}
 
 
-def tip_scene(kind: str, n: int) -> Scene:
+def tip_setup(kind: str, n: int) -> Setup:
     """A random "chain" or "tree" of n joints whose tip strikes, with the least joint velocities that do."""
     robot = replace(random_robot(n, limbs=KINDS[kind]), torque_limit=np.full(n, NO_LIMIT))
     q = np.random.default_rng(1).uniform(-1, 1, size=n)
     row = np.array([tip_speed(robot, q, e) for e in np.eye(n)])
-    return _scene(kind, robot, "tip", q, SPEED * row / (row @ row), np.zeros(n))
+    return _setup(kind, robot, "tip", q, SPEED * row / (row @ row), np.zeros(n))
 
 
-def humanoid_scenes(names: Sequence[str], say: Say) -> list[Scene]:
+def humanoid_setups(names: Sequence[str], say: Say) -> list[Setup]:
     """Robots that half-sit and strike with the right hand; one whose files are not installed is left out,
     and named."""
-    scenes = []
+    setups = []
     for name in names:
         try:
             robot = load_robot(name)
@@ -53,8 +53,8 @@ def humanoid_scenes(names: Sequence[str], say: Say) -> list[Scene]:
             continue
         q = robot.posture("half_sitting")
         v = striking_velocity(robot, q, "right_hand", X, SPEED)
-        scenes.append(_scene(name, robot, "right_hand", q, v, holding_torque(robot, q, v)))
-    return scenes
+        setups.append(_setup(name, robot, "right_hand", q, v, holding_torque(robot, q, v)))
+    return setups
 
 
 def depth(robot: Robot) -> int:
@@ -62,7 +62,7 @@ def depth(robot: Robot) -> int:
     return max(len(path) - 1 for path in robot.model.supports)
 
 
-def _scene(kind: str, robot: Robot, striker: str, q: Array, v: Array, torque: Array) -> Scene:
+def _setup(kind: str, robot: Robot, striker: str, q: Array, v: Array, torque: Array) -> Setup:
     case = Case(
         robot=robot,
         name=f"{robot.n} joints",
@@ -74,4 +74,4 @@ def _scene(kind: str, robot: Robot, striker: str, q: Array, v: Array, torque: Ar
         effective_mass=np.nan,
         speed=SPEED,
     )
-    return Scene(name=kind, case=case, law=LAW, target=TARGET)
+    return Setup(name=kind, case=case, law=LAW, target=TARGET)

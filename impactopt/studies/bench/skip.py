@@ -1,4 +1,4 @@
-"""What a scene does not need is left out when the function is built: what each saves.
+"""What a setup does not need is left out when the function is built: what each saves.
 
 The stand-in's motion B-3. Each row leaves one thing out of a function that has everything; the last rows have
 a beginning of their own, which they name.
@@ -13,7 +13,7 @@ from typing import Any
 
 import casadi as ca
 
-from impactopt.collision import SDC, JointFriction, Terms
+from impactopt.collision import SDC, Effects, JointFriction
 from impactopt.collision.describe import independent_joints, instructions
 from impactopt.collision.graph import joint_space_model
 from impactopt.collision.outputs import HISTORIES, OF_SOLES
@@ -25,7 +25,7 @@ from impactopt.robots.presets import standin
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench.clock import medians
-from impactopt.studies.bench.scene import Scene, run_of
+from impactopt.studies.bench.setup import Setup, run_of
 from impactopt.studies.report import Report, Say, columns_table
 
 FRICTION = JointFriction(viscous=1.0, coulomb=1.0, transition=0.05)
@@ -60,10 +60,10 @@ class Variant:
     beside: str = WHOLE
 
 
-def run(say: Say, *, scene: Scene | None = None, repeats: int = 25) -> Report:
+def run(say: Say, *, setup: Setup | None = None, repeats: int = 25) -> Report:
     """One row a thing left out."""
-    scene = scene or Scene.of("standin")
-    found = variants(scene)
+    setup = setup or Setup.of("standin")
+    found = variants(setup)
     runs: dict[str, Callable[[], Any]] = {}
     for variant in found:
         say(f"compiling without {variant.skipped}")
@@ -80,22 +80,22 @@ def run(say: Say, *, scene: Scene | None = None, repeats: int = 25) -> Report:
         }
         row |= {"speedup": times[variant.beside] / own, "beside": variant.beside}
         rows.append({**row, "freeze_instructions": parts["freeze"], "step_instructions": parts["step"]})
-    rows += not_timed(scene, found)
-    title = f"{scene.name}, {scene.case.name}: what is left out, and what it saves"
+    rows += not_timed(setup, found)
+    title = f"{setup.name}, {setup.case.name}: what is left out, and what it saves"
     table = columns_table(title, COLUMNS, rows)
     numbers = {"rows": rows, "not_done": NOT_DONE, "describe": found[0].model.describe().as_dict()}
     return Report(name="skip", numbers=numbers, tables=(table,), figures={"skip": lambda: skip_picture(rows)})
 
 
 # ---------------------------------------------------------------- variants
-def variants(scene: Scene) -> list[Variant]:
+def variants(setup: Setup) -> list[Variant]:
     """Everything, and everything but one; then what a planner asks for."""
-    case = scene.case
+    case = setup.case
 
-    def model(*, terms: dict[str, bool] | None = None, **options: Any) -> SymbolicModel:
-        chosen = Terms(**{"friction": True, **(terms or {})})
+    def model(*, effects: dict[str, bool] | None = None, **options: Any) -> SymbolicModel:
+        chosen = Effects(**{"friction": True, **(effects or {})})
         friction = FRICTION if chosen.friction else None
-        made: SymbolicModel = scene.model(SDC, terms=chosen, friction=friction, **options)
+        made: SymbolicModel = setup.model(SDC, effects=chosen, friction=friction, **options)
         return made
 
     whole = model()
@@ -104,13 +104,13 @@ def variants(scene: Scene) -> list[Variant]:
     scalars = tuple(name for name in everything if name not in HISTORIES)
     out = [
         Variant(skipped=WHOLE, model=whole, case=case, outputs=everything),
-        Variant(skipped="friction", model=model(terms={"friction": False}), case=case, outputs=everything),
+        Variant(skipped="friction", model=model(effects={"friction": False}), case=case, outputs=everything),
         Variant(
-            skipped="saturation", model=model(terms={"saturation": False}), case=case, outputs=everything
+            skipped="saturation", model=model(effects={"saturation": False}), case=case, outputs=everything
         ),
         Variant(
             skipped="bias and Jdot",
-            model=model(terms={"bias": False, "jdot": False}),
+            model=model(effects={"bias": False, "jdot": False}),
             case=case,
             outputs=everything,
         ),
@@ -124,27 +124,27 @@ def variants(scene: Scene) -> list[Variant]:
         ]
     names = tuple(name for name in case.robot.joint_names if name.startswith(LOCKED))
     if names:
-        out.append(without_joints(scene, names, everything))
-    bare = scene.model(SDC, terms=Terms(saturation=False))
+        out.append(without_joints(setup, names, everything))
+    bare = setup.model(SDC, effects=Effects(saturation=False))
     out.append(Variant(skipped="all but the impulse", model=bare, case=case, outputs=("impulse",)))
-    return out + (on_fixed_base(scene) if names else [])
+    return out + (on_fixed_base(setup) if names else [])
 
 
-def without_joints(scene: Scene, names: Sequence[str], outputs: tuple[str, ...]) -> Variant:
+def without_joints(setup: Setup, names: Sequence[str], outputs: tuple[str, ...]) -> Variant:
     """The stand-in with joints locked where they are."""
-    case, small = locked(scene.case, names, floating=True)
-    options = {**scene.options, "robot": small}
-    model = SDC(**options, terms=Terms(friction=True), friction=FRICTION)
+    case, small = locked(setup.case, names, floating=True)
+    options = {**setup.options, "robot": small}
+    model = SDC(**options, effects=Effects(friction=True), friction=FRICTION)
     return Variant(skipped=f"{len(names)} joints, locked", model=model, case=case, outputs=outputs)
 
 
-def on_fixed_base(scene: Scene) -> list[Variant]:
+def on_fixed_base(setup: Setup) -> list[Variant]:
     """The stand-in on a fixed base, whole, and with only the joints that the blow moves: the same."""
-    case, robot = locked(scene.case, (), floating=False)
-    options = {**scene.options, "stance": FixedBase()}
+    case, robot = locked(setup.case, (), floating=False)
+    options = {**setup.options, "stance": FixedBase()}
     whole = SDC(**{**options, "robot": robot})
     apart = independent_joints(whole)
-    less, small = locked(scene.case, apart, floating=False)
+    less, small = locked(setup.case, apart, floating=False)
     path = SDC(**{**options, "robot": small})
     outputs = ("impulse", "force", "torque")
     return [
@@ -168,18 +168,18 @@ def locked(case: Case, names: Sequence[str], *, floating: bool) -> tuple[Case, R
     return less, small
 
 
-def not_timed(scene: Scene, found: Sequence[Variant]) -> list[dict[str, Any]]:
+def not_timed(setup: Setup, found: Sequence[Variant]) -> list[dict[str, Any]]:
     """What is not done, with the instructions that it would leave."""
     whole = found[0]
     freeze, step = instructions(whole.model, whole.outputs).values()
     out: list[dict[str, Any]] = [
         {"skipped": "constant parameters", "freeze": freeze, "step": constant_step(whole)}
     ]
-    leg = [name for name in scene.case.robot.joint_names if name.startswith("right_") and _of_leg(name)]
+    leg = [name for name in setup.case.robot.joint_names if name.startswith("right_") and _of_leg(name)]
     if leg:
-        _, small = locked(scene.case, leg, floating=True)
-        one = SDC(**{**scene.options, "robot": small, "stance": OneSole("left")})
-        both = scene.model(SDC)
+        _, small = locked(setup.case, leg, floating=True)
+        one = SDC(**{**setup.options, "robot": small, "stance": OneSole("left")})
+        both = setup.model(SDC)
         saved = instructions(both, ("impulse",))["freeze"] - instructions(one, ("impulse",))["freeze"]
         out.append({"skipped": "symmetric limbs", "freeze": freeze - saved, "step": step})
     empty = {"time_us": None, "speedup": None, "beside": WHOLE}

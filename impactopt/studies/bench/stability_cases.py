@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.collision import SDC, JointFriction, Terms, VirtualMass
+from impactopt.collision import SDC, Effects, JointFriction, VirtualMass
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import (
     Board,
@@ -84,7 +84,7 @@ class Rig:
             return VirtualMass(**options, method=self.method, step=self.step)
         friction = JointFriction(viscous=0.5, coulomb=1.0, transition=0.05) if self.friction else None
         options |= {"method": self.method, "step": self.step}
-        return SDC(**options, terms=Terms(friction=self.friction), friction=friction, accuracy=None)
+        return SDC(**options, effects=Effects(friction=self.friction), friction=friction, accuracy=None)
 
 
 # steps of a fixed length for slow contacts, for fast and for the fastest

@@ -42,7 +42,7 @@ def reference(model: SymbolicModel, case: Case) -> tuple[Expected, float, str]:
     """
     values = model.settings.override({k: np.asarray(x, dtype=float) for k, x in case.overrides.items()})
     q, v, torque = (np.asarray(x, dtype=float) for x in (case.q, case.v, case.torque))
-    given = torque if model.terms.feedforward else None
+    given = torque if model.effects.feedforward else None
     frozen = frozen_numbers(model, q, v, values)
     m, speed = float(frozen["m"].item()), float(frozen["hand_speed"].item())
     free = isinstance(model.target, (FreeMass, Board))
@@ -105,7 +105,7 @@ def by_lsoda(
     model: SymbolicModel, frozen: dict[str, Array], v: Array, torque: Array | None, values: dict[str, Array]
 ) -> Expected:
     """The same frozen dynamics by SciPy's LSODA, from the numbers alone."""
-    n, terms, target = model.n_servos, model.terms, model.target
+    n, effects, target = model.n_servos, model.effects, model.target
     law = type(model.law)(**{k: float(values[f"contact_{k}"]) for k in model.law.parameters})
     hit = type(target)(**{k: float(values[f"target_{k}"]) for k in target.parameters})
     A = np.zeros((n, n))
@@ -135,13 +135,13 @@ def by_lsoda(
         tau = np.zeros(n)
         if n:
             tau = -values["kd"] * u
-            if terms.stiffness:
+            if effects.stiffness:
                 tau = tau + values["kp"] * y[2 + k + n :]
             if torque is not None:
                 tau = tau + torque
-            if terms.saturation:
+            if effects.saturation:
                 tau = np.clip(tau, -values["torque_limit"], values["torque_limit"])
-            if terms.friction:
+            if effects.friction:
                 rates = v[v.size - n :] + u
                 slipping = np.clip(rates / model.joint_friction.transition, -1.0, 1.0)
                 tau = tau - values["viscous"] * rates - values["coulomb"] * slipping

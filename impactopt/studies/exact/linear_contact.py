@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impactopt.contact import Board, ContactLaw, Nail, Target
 from impactopt.errors import InputError
 
-__all__ = ["TargetPiece", "force_coefficients", "target_pieces"]
+__all__ = ["TargetMode", "force_coefficients", "target_modes"]
 
 Array = NDArray[np.float64]
 _INSTEAD = "the exact solution: {} is not linear between events; measure by SciPy"
@@ -41,16 +41,16 @@ def force_coefficients(law: ContactLaw, numbers: Mapping[str, float]) -> tuple[A
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TargetPiece:
+class TargetMode:
     """A target's motion between two switches, linear in its state (k), the force and one.
 
     Attributes
     ----------
     derivative : (k, k + 2) of state, force, one.
     velocity : (k + 2) the same, without force.
-    watched : (k + 2) what stays within `bounds` while the piece lasts; None where it lasts for good.
+    watched : (k + 2) what stays within `bounds` while the mode lasts; None where it lasts for good.
     bounds : of the form watched.
-    following : number of the piece that comes next.
+    following : number of the mode that comes next.
     stopped : the target stands still: its first state, the speed, is zero.
     """
 
@@ -62,8 +62,8 @@ class TargetPiece:
     stopped: bool = False
 
 
-def target_pieces(target: Target, p: Mapping[str, float]) -> tuple[TargetPiece, ...]:
-    """A target's pieces, the first being that at contact.
+def target_modes(target: Target, p: Mapping[str, float]) -> tuple[TargetMode, ...]:
+    """A target's modes, the first being that at contact.
 
     Raises
     ------
@@ -76,10 +76,10 @@ def target_pieces(target: Target, p: Mapping[str, float]) -> tuple[TargetPiece, 
         none = np.zeros((2, 4))
         below, above = (-np.inf, 0.0), (0.0, np.inf)
         return (
-            TargetPiece(
+            TargetMode(
                 derivative=none, velocity=none[0], watched=beyond, bounds=below, following=1, stopped=True
             ),
-            TargetPiece(derivative=driven, velocity=v, watched=v, bounds=above, following=0),
+            TargetMode(derivative=driven, velocity=v, watched=v, bounds=above, following=0),
         )
     if isinstance(target, Board):
         k, d, m = p["stiffness"], p["damping"], p["mass"]
@@ -88,13 +88,13 @@ def target_pieces(target: Target, p: Mapping[str, float]) -> tuple[TargetPiece, 
         free = np.array([[0.0, 0.0, 1 / m, 0.0], v])
         limit = (-np.inf, p["breaking_force"] / k)
         return (
-            TargetPiece(derivative=bent, velocity=v, watched=w, bounds=limit, following=1),
-            TargetPiece(derivative=free, velocity=v),
+            TargetMode(derivative=bent, velocity=v, watched=w, bounds=limit, following=1),
+            TargetMode(derivative=free, velocity=v),
         )
     return (_smooth_target(target, p),)
 
 
-def _smooth_target(target: Target, numbers: Mapping[str, float]) -> TargetPiece:
+def _smooth_target(target: Target, numbers: Mapping[str, float]) -> TargetMode:
     k = target.n_states
 
     def value(x: Array) -> Array:
@@ -114,4 +114,4 @@ def _smooth_target(target: Target, numbers: Mapping[str, float]) -> TargetPiece:
             raise InputError(_INSTEAD.format(type(target).__name__))
     if target.switches([0.0] * k, 0.0, numbers):
         raise InputError(_INSTEAD.format(f"{type(target).__name__} with switches of its own"))
-    return TargetPiece(derivative=matrix[:k], velocity=matrix[k])
+    return TargetMode(derivative=matrix[:k], velocity=matrix[k])

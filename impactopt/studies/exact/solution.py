@@ -1,4 +1,4 @@
-"""The frozen collision solved exactly, piece by piece, where law and target are linear between events.
+"""The frozen collision solved exactly, mode by mode, where law and target are linear between events.
 
 Between events (end of compression, separation, a joint entering or leaving saturation or its friction's
 transition band, a switch of the target) the frozen equations are linear with constant coefficients, so that
@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
 from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
-from impactopt.collision.course import Stretch, relative_to
+from impactopt.collision.course import Segment, relative_to
 from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
 from impactopt.collision.outputs import Outputs, frozen_for
 from impactopt.collision.result import Collision
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError, check_array
-from impactopt.studies.exact.linear_contact import force_coefficients, target_pieces
-from impactopt.studies.exact.pieces import Phase, Pieces
+from impactopt.studies.exact.linear_contact import force_coefficients, target_modes
+from impactopt.studies.exact.modes import Modes, Phase
 
 __all__ = ["ExactCollision", "Path", "exact_path"]
 
@@ -61,7 +61,7 @@ class ExactCollision:
         self.collision, self.spacing = collision, own if spacing is None else spacing
         self.model = joint_space_model(collision, ("configuration",))
         force_coefficients(collision.law, collision.law.parameters)
-        target_pieces(collision.target, collision.target.parameters)
+        target_modes(collision.target, collision.target.parameters)
 
     @cached_property
     def _frozen(self) -> Any:
@@ -96,11 +96,11 @@ class ExactCollision:
         found = self._freeze.call([ca.DM(x) for x in (q, v, values["normal"], gives_way)])
         data: dict[str, Any] = dict(zip(self._freeze.name_out(), found, strict=True))
         data |= {"q": q, "v": v, "joint_velocity": v[-collision.robot.n :], **values}
-        if collision.terms.feedforward:
+        if collision.effects.feedforward:
             data["feedforward"] = torque
         data = relative_to({name: ca.DM(x) for name, x in values.items()}, 0.0, data)
         numbers = {name: _array(data[name]) for name in model.data}
-        path = exact_path(Pieces(model, numbers), collision.horizon, self.spacing)
+        path = exact_path(Modes(model, numbers), collision.horizon, self.spacing)
         return self._result({name: ca.DM(x) for name, x in data.items()}, path)
 
     def _result(self, data: dict[str, Any], path: Path) -> Collision:
@@ -121,7 +121,7 @@ class ExactCollision:
             return frozen.velocity_change(*at, joints, impulse, wrench, weight)
 
         way = data["v"] * path.time[-1] + change(second=True)
-        stretch = Stretch(
+        segment = Segment(
             data=data,
             since=0.0,
             final=final,
@@ -129,7 +129,7 @@ class ExactCollision:
             v_after=lambda: data["v"] + change(second=False),
             q_after=lambda: frozen.integrate(data["q"], way),
         )
-        made = Outputs(self.model, [stretch], len(frozen.soles), len(frozen.held), data["v"])
+        made = Outputs(self.model, [segment], len(frozen.soles), len(frozen.held), data["v"])
         known = {"peak_force": path.peak_force, "separated": float(path.separated)}
         out = {name: np.array([[x]]) for name, x in known.items()}
         for name in collision.available:
@@ -160,7 +160,7 @@ class Path:
     phases: list[Phase]
 
 
-def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
+def exact_path(modes: Modes, horizon: float, spacing: float) -> Path:
     """From contact to separation, or to the horizon [s]; states are kept every `spacing` [s].
 
     Raises
@@ -168,17 +168,17 @@ def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
     RuntimeError : phases that end as soon as they begin, one after the other; numbers too far apart for
         floating point.
     """
-    z, phase = pieces.start()
+    z, phase = modes.start()
     phases, kept, peak = [], [z], 0.0
-    time, step = pieces.model.layout["time"].start, min(1.0 / pieces.fastest(), horizon)
-    touching = phase.compressing or pieces.force(phase) @ z > 0
+    time, step = modes.model.layout["time"].start, min(1.0 / modes.fastest(), horizon)
+    touching = phase.compressing or modes.force(phase) @ z > 0
     following: Phase | None = phase if touching else None
     while following is not None and z[time] < horizon:
         phase, found = following, None
         phases.append(phase)
         if len(phases) > _MOST_PHASES:
             raise RuntimeError(f"more than {_MOST_PHASES} phases by {z[time]:.3g} s")
-        flow = _Flow(pieces, phase, step)
+        flow = _Flow(modes, phase, step)
         while found is None and z[time] < horizon:
             flow, terms = flow.fitting(z)
             begin, left = z[time], min(1.0, (horizon - z[time]) / flow.step)
@@ -193,8 +193,8 @@ def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
                 z[time] = horizon
         kept.append(z)
         if found is not None:
-            following = pieces.after(phase, flow.watch.of[found[1]], above=found[2])
-            z = z if following is None else pieces.entering(following, z)
+            following = modes.after(phase, flow.watch.of[found[1]], above=found[2])
+            z = z if following is None else modes.entering(following, z)
     states = np.array(kept)
     return Path(
         time=states[:, time],
@@ -208,11 +208,11 @@ def exact_path(pieces: Pieces, horizon: float, spacing: float) -> Path:
 class _Flow:
     """Steps of one length [s] within one phase."""
 
-    def __init__(self, pieces: Pieces, phase: Phase, step: float) -> None:
-        self.pieces, self.phase, self.step = pieces, phase, step
-        self.scaled = pieces.matrix(phase) * step
+    def __init__(self, modes: Modes, phase: Phase, step: float) -> None:
+        self.modes, self.phase, self.step = modes, phase, step
+        self.scaled = modes.matrix(phase) * step
         self.exponential = expm(self.scaled)
-        self.watch, self.force = pieces.watch(phase), pieces.force(phase)
+        self.watch, self.force = modes.watch(phase), modes.force(phase)
 
     def fitting(self, z: Array) -> tuple[_Flow, Array]:
         """This flow, or one of shorter steps, and its terms: they have to sum up to what the exponential
@@ -223,7 +223,7 @@ class _Flow:
             off = np.abs(flow.watch.rows @ (_value(terms, 1.0) - ends))
             if (off <= 1e-12 * flow.sizes(terms)).all():
                 return flow, terms
-            flow = _Flow(flow.pieces, flow.phase, flow.step / 2)
+            flow = _Flow(flow.modes, flow.phase, flow.step / 2)
         raise RuntimeError(f"Taylor's polynomials differ from the exponential in steps of {flow.step:.2g} s")
 
     def terms(self, z: Array) -> Array:

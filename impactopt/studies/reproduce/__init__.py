@@ -2,6 +2,6 @@
 
 * paper.py       what the paper prints
 * costs.py       its formulas of computation cost; timing.py, trees.py: our own implementations, measured
-* motions.py     the nine motions through every rung of the ladder of collision models
+* motions.py     the nine motions through every model of the hierarchy
 * table1.py, table2.py, table3.py, fig3.py, fig4.py, fig7.py    one a file, each with a function `run`
 """

@@ -1,5 +1,6 @@
-"""Fig. 7: contact force over time, motions of type C (8 kg) at three speeds, on the stand-in: every rung of
-the ladder of collision models.
+"""Fig. 7: contact force over time, motions of type C (8 kg) at three speeds, on the stand-in.
+
+Every model of the hierarchy is drawn.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 
 from impactopt.collision import Collision
 from impactopt.studies.report import Report, Say, columns_table
-from impactopt.studies.reproduce.motions import LADDER, WHOSE, Rung, motions, reference
+from impactopt.studies.reproduce.motions import HIERARCHY, WHOSE, Fidelity, motions, reference
 from impactopt.studies.reproduce.paper import OPENHRP3, TABLE_2, TABLE_3
 
 if TYPE_CHECKING:
@@ -40,13 +41,13 @@ COLUMNS = (
 )
 
 
-def run(say: Say, *, robot: str = ROBOT, rungs: Sequence[Rung] = LADDER) -> Report:
+def run(say: Say, *, robot: str = ROBOT, fidelities: Sequence[Fidelity] = HIERARCHY) -> Report:
     """Force histories of the virtual mass, both kinds of SDC, ours frozen again on the way, full dynamics."""
     rows: list[dict[str, Any]] = []
     found: dict[str, dict[str, Collision]] = {}
     speeds = {}
     for _, cases in motions((robot,), say):
-        models = {label(rung): rung.build(cases[0].robot) for rung in rungs}
+        models = {label(fidelity): fidelity.build(cases[0].robot) for fidelity in fidelities}
         for case in (case for case in cases if case.name.startswith(TYPE)):
             say(f"{case.name}: full dynamics, and {len(models)} models (compile the first time)")
             results = {name: case.collide(model) for name, model in models.items()}
@@ -66,12 +67,12 @@ def run(say: Say, *, robot: str = ROBOT, rungs: Sequence[Rung] = LADDER) -> Repo
     )
 
 
-def label(rung: Rung) -> str:
-    """What the table and the legend call a rung."""
-    name = LABELS[rung.model]
-    if rung.model != "sdc":
+def label(fidelity: Fidelity) -> str:
+    """What the table and the legend call a fidelity."""
+    name = LABELS[fidelity.model]
+    if fidelity.model != "sdc":
         return name
-    return f"{name}, frozen {rung.freezes} x more" if rung.freezes else f"{name}, frozen at contact"
+    return f"{name}, frozen {fidelity.freezes} x more" if fidelity.freezes else f"{name}, frozen at contact"
 
 
 def _row(motion: str, speed: float, model: str, result: Collision) -> dict[str, Any]:
@@ -94,7 +95,7 @@ def _row(motion: str, speed: float, model: str, result: Collision) -> dict[str, 
 
 def draw(found: dict[str, dict[str, Collision]], speeds: dict[str, float]) -> Picture:
     """A row a speed, as in the paper; beside each history what the models are off."""
-    from impactopt.pictures.ladder import ladder
+    from impactopt.pictures.hierarchy import hierarchy
 
     rows = {f"{motion}, {speeds[motion]:g} m/s": models for motion, models in found.items()}
-    return ladder(rows, reference=FULL)
+    return hierarchy(rows, reference=FULL)

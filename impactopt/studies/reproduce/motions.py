@@ -1,4 +1,4 @@
-"""The paper's nine motions through every rung of the ladder of collision models, and full dynamics.
+"""The paper's nine motions through every model of the hierarchy, and full dynamics.
 
 The paper's robot is HRP-2, whose description is not public, in OpenHRP3. Ours are a stand-in of HRP-2's class
 (see `impactopt.robots.presets.standin`) and TALOS, in postures found by optimization, and the reference is
@@ -20,7 +20,7 @@ from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.report import Say
 from impactopt.studies.reproduce.paper import LAW, STEP, TARGET
 
-__all__ = ["HORIZON", "LADDER", "ROBOTS", "WHOSE", "Rung", "motions", "reference", "setting"]
+__all__ = ["HIERARCHY", "HORIZON", "ROBOTS", "WHOSE", "Fidelity", "motions", "reference", "setting"]
 
 ROBOTS = ("standin", "talos")
 WHOSE = {"standin": "a stand-in for the paper's HRP-2", "talos": "TALOS, which the paper has not"}
@@ -29,8 +29,8 @@ STRIKER, NORMAL = "right_hand", (1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rung:
-    """A model of the ladder.
+class Fidelity:
+    """A model of the hierarchy.
 
     model, freezes : what tables call it; None where freezes on the way are no matter.
     build : makes it for a robot.
@@ -65,10 +65,10 @@ def _sdc(freezes: int) -> Callable[[Robot], CollisionModel]:
     return lambda robot: SDC(**setting(robot), freezes=freezes, accuracy=None)
 
 
-LADDER = (
-    Rung(model="virtual-mass", freezes=None, build=_virtual_mass),
-    Rung(model="sdc-paper", freezes=0, build=_sdc_paper),
-    *(Rung(model="sdc", freezes=k, build=_sdc(k)) for k in (0, 1, 2, 4, 8)),
+HIERARCHY = (
+    Fidelity(model="virtual-mass", freezes=None, build=_virtual_mass),
+    Fidelity(model="sdc-paper", freezes=0, build=_sdc_paper),
+    *(Fidelity(model="sdc", freezes=k, build=_sdc(k)) for k in (0, 1, 2, 4, 8)),
 )
 
 

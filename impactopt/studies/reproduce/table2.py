@@ -1,4 +1,4 @@
-"""Table II: what each model of the ladder says of the nine motions, against full dynamics.
+"""Table II: what each model of the hierarchy says of the nine motions, against full dynamics.
 
 Errors are (estimate - reference) / reference; the paper's own error columns are by its eq. (24), which has
 the other sign. HRP-2 and its gains are not public: what is to be compared is which model errs by how much.
@@ -12,7 +12,15 @@ from typing import Any
 from impactopt.collision import Collision, CollisionModel
 from impactopt.simulation.cases import Case, errors_against
 from impactopt.studies.report import Report, Say, columns_table
-from impactopt.studies.reproduce.motions import HORIZON, LADDER, ROBOTS, WHOSE, Rung, motions, reference
+from impactopt.studies.reproduce.motions import (
+    HIERARCHY,
+    HORIZON,
+    ROBOTS,
+    WHOSE,
+    Fidelity,
+    motions,
+    reference,
+)
 from impactopt.studies.reproduce.paper import OPENHRP3, TABLE_2, TABLE_3
 
 __all__ = ["run"]
@@ -44,20 +52,20 @@ WORST_COLUMNS = (
 )
 
 
-def run(say: Say, *, robots: Sequence[str] = ROBOTS, rungs: Sequence[Rung] = LADDER) -> Report:
+def run(say: Say, *, robots: Sequence[str] = ROBOTS, fidelities: Sequence[Fidelity] = HIERARCHY) -> Report:
     """Every motion of each robot through every model."""
     rows: list[dict[str, Any]] = []
     references: list[dict[str, Any]] = []
     forms: list[dict[str, Any]] = []
     tables = []
     for robot, cases in motions(robots, say):
-        models = [(rung, rung.build(cases[0].robot)) for rung in rungs]
+        models = [(fidelity, fidelity.build(cases[0].robot)) for fidelity in fidelities]
         own = []
         for case in cases:
             say(f"{robot} {case.name}: full dynamics, and {len(models)} models (compile the first time)")
             true, change = reference(case)
             references.append(_reference_row(robot, case, true, change))
-            own += [row(robot, case, rung, model, true) for rung, model in models]
+            own += [row(robot, case, fidelity, model, true) for fidelity, model in models]
         other, _ = reference(cases[0], form="pinocchio")
         one = references[-len(cases)]
         forms.append(
@@ -84,19 +92,19 @@ def run(say: Say, *, robots: Sequence[str] = ROBOTS, rungs: Sequence[Rung] = LAD
     return Report(name="table2", numbers=numbers, tables=tables)
 
 
-def row(robot: str, case: Case, rung: Rung, model: CollisionModel, true: Collision) -> dict[str, Any]:
+def row(robot: str, case: Case, fidelity: Fidelity, model: CollisionModel, true: Collision) -> dict[str, Any]:
     """One model's collision; the paper's numbers beside it where the robot is its robot's stand-in."""
     found = case.collide(model)
     standin = robot == "standin"
-    printed = PRINTED.get(rung.model, {}).get(case.name) if standin else None
+    printed = PRINTED.get(fidelity.model, {}).get(case.name) if standin else None
     openhrp3 = OPENHRP3[case.name] if standin else None
     return {
         "robot": robot,
         "motion": case.name,
         "m_a_kg": case.effective_mass,
         "v_c_m_s": case.speed,
-        "model": rung.model,
-        "freezes": rung.freezes,
+        "model": fidelity.model,
+        "freezes": fidelity.freezes,
         "impulse_Ns": found.impulse,
         "impulse_reference_Ns": true.impulse,
         "f_max_N": found.peak_force,

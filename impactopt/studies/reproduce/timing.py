@@ -115,7 +115,15 @@ def _sdc_functions(sdc: SDC) -> tuple[Any, Any]:
         ]
 
     frame = sdc.robot.striker(sdc.striker).model_frame
-    recipe = (model_hash(sdc.robot.model), frame, repr(sdc.held_by), sdc.terms, sdc.step_length, MANY, STEPS)
+    recipe = (
+        model_hash(sdc.robot.model),
+        frame,
+        repr(sdc.held_by),
+        sdc.effects,
+        sdc.step_length,
+        MANY,
+        STEPS,
+    )
     functions = cached("timing_sdc", recipe, build)
     return functions["freeze"], functions["steps"]
 

@@ -1,4 +1,4 @@
-"""The contact force as every rung of the ladder of collision models has it (the paper's Fig. 7)."""
+"""The contact force as every model of the hierarchy has it (the paper's Fig. 7)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ REFERENCE: dict[str, Any] = {"color": BLACK, "linewidth": 3.2, "alpha": 0.35}
 
 
 @styled
-def ladder(blows: Mapping[str, Mapping[str, Collision]], *, reference: str = "full dynamics") -> Picture:
+def hierarchy(blows: Mapping[str, Mapping[str, Collision]], *, reference: str = "full dynamics") -> Picture:
     """Force histories on the left, how far the impulse so far is off on the right; a row a blow.
 
     blows : of each blow, by title, the :class:`impactopt.collision.Collision` of each model, by name, the

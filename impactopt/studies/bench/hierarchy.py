@@ -33,8 +33,8 @@ STEP = 1e-4  # [s] that the reference's halving begins with
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rung:
-    """A model of the ladder by name; freezes only of "sdc"."""
+class Fidelity:
+    """A model of the hierarchy by name; freezes only of "sdc"."""
 
     model: str
     freezes: int | None = None
@@ -64,10 +64,10 @@ class Rung:
         return SDC(**options, freezes=self.freezes or 0, accuracy=None)
 
 
-LADDER = (
-    Rung(model="virtual-mass"),
-    Rung(model="sdc-paper"),
-    *(Rung(model="sdc", freezes=n) for n in FREEZES),
+HIERARCHY = (
+    Fidelity(model="virtual-mass"),
+    Fidelity(model="sdc-paper"),
+    *(Fidelity(model="sdc", freezes=n) for n in FREEZES),
 )
 
 

@@ -26,7 +26,7 @@ from impactopt.studies.bench.clock import runner
 __all__ = [
     "EVALUATION",
     "MOTIONS",
-    "Scene",
+    "Setup",
     "compiled",
     "compiled_gradient",
     "graph",
@@ -44,7 +44,7 @@ EVALUATION = ("impulse", "force", "zmp", "torque")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class Setup:
     """One collision: a case, and what is hit how; the paper's contact law and target (its section III)."""
 
     name: str
@@ -54,7 +54,7 @@ class Scene:
     horizon: float = 0.1
 
     @classmethod
-    def of(cls, robot: str) -> Scene:
+    def of(cls, robot: str) -> Setup:
         """The motion of that robot in MOTIONS.
 
         Raises
@@ -77,7 +77,7 @@ class Scene:
 
 def inputs(model: SymbolicModel, case: Case) -> list[Any]:
     """Of the model's functions, all settings being inputs."""
-    return [case.q, case.v, *([case.torque] if model.terms.feedforward else []), *model.settings.values()]
+    return [case.q, case.v, *([case.torque] if model.effects.feedforward else []), *model.settings.values()]
 
 
 def compiled(model: SymbolicModel, outputs: tuple[str, ...], *, every: int = 1) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from impactopt.sweeps.table import merge_kinds
 from impactopt.sweeps.units import Columns
 
-__all__ = ["Progress", "Tally"]
+__all__ = ["ProgressCounter", "SweepProgress"]
 
 BEST = "impulse_Ns"
 OF_LATE = 30.0  # [s]
@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class SweepProgress:
     """Cases of the sweep, done, failed among these, and resumed from runs before.
 
     seconds : since this run began.  rate : its cases a second, of late: workers take a while to start.
@@ -39,7 +39,7 @@ class Progress:
     best_case: int | None
 
 
-class Tally:
+class ProgressCounter:
     """Counts rows as they come.
 
     kinds : of the columns' values, for the table.  reasons : how often each came, numbers left out.
@@ -79,7 +79,7 @@ class Tally:
             if self.best is None or found[at] > self.best:
                 self.best, self.best_case = float(found[at]), first + at
 
-    def progress(self) -> Progress:
+    def progress(self) -> SweepProgress:
         """How it stands now."""
         now = time.perf_counter()
         while len(self._recent) > 2 and now - self._recent[0][0] > OF_LATE:
@@ -87,7 +87,7 @@ class Tally:
         since, before = self._recent[0]
         self._recent.append((now, self.done))
         rate = (self.done - before) / (now - since) if now > since else 0.0
-        return Progress(
+        return SweepProgress(
             cases=self.cases,
             done=self.done,
             failed=self.failed,

@@ -10,17 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import MOST, InputError, check_array, raw_array
 
-__all__ = ["JointFriction", "Terms"]
+__all__ = ["Effects", "JointFriction"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Terms:
-    """Switches of the collision model. The servo's damping (paper, eq. 11) is always there.
+class Effects:
+    """Which effects a collision model takes into account. The servo's damping (paper, eq. 11) is always
+    there.
 
     Attributes
     ----------
     stiffness : servo stiffness Kp (phi_ref - phi) (eq. 10); the reference coasts at the joint velocity at
-        contact, or as the setting `reference` bends it.
+        contact, or follows the setting `reference`.
     feedforward : a feed-forward torque, an input of the functions, inside the saturation.
     saturation : the torque limits (eq. 12).
     friction : joint friction F (eqs. 5, 6), see `JointFriction`.
@@ -36,14 +37,14 @@ class Terms:
     jdot: bool = True
 
     @classmethod
-    def paper(cls, *, friction: bool = False) -> Terms:
+    def paper(cls, *, friction: bool = False) -> Effects:
         """The paper's set: damping and saturation, and friction where it is known."""
         return cls(
             stiffness=False, feedforward=False, saturation=True, friction=friction, bias=False, jdot=False
         )
 
     @classmethod
-    def none(cls) -> Terms:
+    def none(cls) -> Effects:
         """Nothing but the servo's damping."""
         return cls(stiffness=False, feedforward=False, saturation=False, bias=False, jdot=False)
 

@@ -11,11 +11,11 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.problem import ImpactProblem
-from impactopt.sweeps.alarm import Alarm
 from impactopt.sweeps.collisions import Collisions
 from impactopt.sweeps.units import Columns, Unit, Work
+from impactopt.sweeps.watchdog import Watchdog
 
-__all__ = ["GRAINS"]
+__all__ = ["CASE_KINDS"]
 
 Rows = tuple[Columns, Mapping[int, Record]]
 
@@ -34,18 +34,18 @@ _PLAIN = (
 _UNITS = {"N s": "_Ns", "N": "_N", "J": "_J", "m": "_m", "s": "_s", "(N m s)^2": "_N2m2s2"}
 
 
-def _plan(work: Work, unit: Unit, alarm: Alarm) -> Rows:
+def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
     file = _file(work, unit)
     problem = file.build()
     options = {
         "starts": work.starts,
         "seed": work.seed,
-        "report": alarm.building,
-        "callback": alarm.iteration,
+        "report": watchdog.building,
+        "callback": watchdog.iteration,
         **_arguments(file, work),
     }
     solution: Solution | StrikeSolution
-    if work.grain == "strike":
+    if work.case_kind == "strike":
         solution = optimize_strike(problem, **options)
     else:
         solution = solve(problem, start=work.start, **options)
@@ -59,7 +59,7 @@ def _plan(work: Work, unit: Unit, alarm: Alarm) -> Rows:
     return _row(record.summary, problem), {unit.first: record}
 
 
-def _collide(work: Work, unit: Unit, alarm: Alarm) -> Rows:
+def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
     global _kept
     if _kept is None or _kept[0] != work:  # what rows share is made once a worker
         file = problem_file_from_data(work.data, where=work.path)
@@ -70,7 +70,7 @@ def _collide(work: Work, unit: Unit, alarm: Alarm) -> Rows:
 
 
 _kept: tuple[Work, Collisions] | None = None
-GRAINS: dict[str, Callable[[Work, Unit, Alarm], Rows]] = {
+CASE_KINDS: dict[str, Callable[[Work, Unit, Watchdog], Rows]] = {
     "solve": _plan,
     "strike": _plan,
     "collision": _collide,

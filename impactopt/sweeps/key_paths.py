@@ -1,4 +1,4 @@
-"""Tables by dotted keys."""
+"""Tables by key paths."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["flat", "put"]
 
 
 def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys and what they hold; TOML's own dots make tables in tables."""
+    """Key paths and what they hold; TOML's own dots make tables in tables."""
     for key, what in table.items():
         if isinstance(what, Mapping) and not what.keys() & {"from", "to"}:
             yield from flat(what, f"{above}{key}.")
@@ -18,7 +18,7 @@ def flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]
 
 
 def put(table: dict[str, Any], key: str, value: Any) -> None:
-    """Write a value in place of what a dotted key holds, in tables that are made where there are none."""
+    """Write a value in place of what a key path holds, in tables that are made where there are none."""
     name, _, below = key.partition(".")
     if key in table or not below:  # a key of the table may have dots in quotes
         table[key] = value

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.collision.model import JointSpaceModel
-from impactopt.studies.exact.linear_contact import force_coefficients, target_pieces
+from impactopt.studies.exact.linear_contact import force_coefficients, target_modes
 
-__all__ = ["Phase", "Pieces", "Watch"]
+__all__ = ["Modes", "Phase", "Watch"]
 
 Array = NDArray[np.float64]
 
@@ -25,12 +25,12 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Phase:
     """What a phase is told by: compression or restitution; of each joint the sign of the torque limit that
-    it is at, and of the velocity beyond friction's transition band, or 0; the target's piece."""
+    it is at, and of the velocity beyond friction's transition band, or 0; the target's mode."""
 
     compressing: bool
     saturated: Array
     sliding: Array
-    piece: int = 0
+    mode: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class Watch:
     of: list[tuple[str, int]]
 
 
-class Pieces:
+class Modes:
     """Equations and bounds of the phases.
 
     Parameters
@@ -59,7 +59,7 @@ class Pieces:
     def __init__(self, model: JointSpaceModel, data: dict[str, Array]) -> None:
         self.model, self.data, n = model, data, model.n
         self.laws = force_coefficients(model.law, _numbers(model.law_numbers(data)))
-        self.pieces = target_pieces(model.target, _numbers(model.target_numbers(data)))
+        self.modes = target_modes(model.target, _numbers(model.target_numbers(data)))
         self.size = model.n_states + 1
         unit = np.eye(self.size)
         self.part = {name: unit[place] for name, place in model.layout.items()}
@@ -74,18 +74,18 @@ class Pieces:
             self.hand = self.hand + s @ self.part["torque"]
         # the servo's demand (eqs. 10, 11)
         self.demand = -_times(data["kd"], self.u) if n else self.u
-        if n and model.terms.stiffness:
+        if n and model.effects.stiffness:
             self.demand = self.demand + _times(data["kp"], self.part["deviation"])
-        if n and model.terms.feedforward:
+        if n and model.effects.feedforward:
             self.demand = self.demand + np.outer(data["feedforward"], self.one)
         self.joint_velocity = self.u
-        if model.terms.friction:
+        if model.effects.friction:
             self.joint_velocity = self.u + np.outer(data["joint_velocity"], self.one)
 
     # ------------------------------------------------------------ forms
     def rate(self, phase: Phase) -> Array:
         """Of penetration [m/s] (N)."""
-        return self.hand - self._target(self.pieces[phase.piece].velocity, phase, np.zeros(self.size))
+        return self.hand - self._target(self.modes[phase.mode].velocity, phase, np.zeros(self.size))
 
     def force(self, phase: Phase, *, compressing: bool | None = None) -> Array:
         """[N] (N) of the phase's branch, or of the one asked for."""
@@ -101,9 +101,9 @@ class Pieces:
         """M (N, N)."""
         model, force = self.model, self.force(phase)
         tau = np.where(phase.saturated[:, None] == 0, self.demand, 0.0)
-        if model.terms.saturation:
+        if model.effects.saturation:
             tau = tau + np.outer(phase.saturated * self.data["torque_limit"], self.one)
-        if model.terms.friction:
+        if model.effects.friction:
             viscous, coulomb = self.data["viscous"], self.data["coulomb"]
             slope = viscous + np.where(phase.sliding == 0, coulomb / model.transition, 0.0)
             tau = tau - slope[:, None] * self.joint_velocity
@@ -112,7 +112,7 @@ class Pieces:
             "time": self.one,
             "penetration": self.rate(phase),
             "impulse": force,
-            "target": self._target(self.pieces[phase.piece].derivative, phase, force),
+            "target": self._target(self.modes[phase.mode].derivative, phase, force),
             "torque": tau,
             "deviation": -self.u,
             "torque2": self.part["torque"],
@@ -138,8 +138,8 @@ class Pieces:
         """[1/s] the largest rate of any mode, with no joint saturated and friction in its band."""
         none, rates = np.zeros(self.model.n), [1e-12]
         for compressing in (False, True):
-            for piece in range(len(self.pieces)):
-                phase = Phase(compressing=compressing, saturated=none, sliding=none, piece=piece)
+            for mode in range(len(self.modes)):
+                phase = Phase(compressing=compressing, saturated=none, sliding=none, mode=mode)
                 rates.append(float(np.abs(np.linalg.eigvals(self.matrix(phase))).max()))
         return max(rates)
 
@@ -149,10 +149,10 @@ class Pieces:
         rows, bounds, of = [self.rate(phase)], [up if phase.compressing else down], [("rate", 0)]
         if not phase.compressing:
             rows, bounds, of = [*rows, self.force(phase)], [*bounds, up], [*of, ("force", 0)]
-        piece = self.pieces[phase.piece]
-        if piece.watched is not None:
-            rows.append(self._target(piece.watched, phase, self.force(phase)))
-            bounds, of = [*bounds, piece.bounds], [*of, ("target", 0)]
+        mode = self.modes[phase.mode]
+        if mode.watched is not None:
+            rows.append(self._target(mode.watched, phase, self.force(phase)))
+            bounds, of = [*bounds, mode.bounds], [*of, ("target", 0)]
         for name, forms, sides, level in (
             ("saturated", self.demand, phase.saturated, self._limit()),
             ("sliding", self.joint_velocity, phase.sliding, self._band()),
@@ -175,7 +175,7 @@ class Pieces:
         if name == "rate":
             return replace(phase, compressing=not phase.compressing)
         if name == "target":
-            return replace(phase, piece=self.pieces[phase.piece].following)
+            return replace(phase, mode=self.modes[phase.mode].following)
         sides: Array = getattr(phase, name).copy()
         sides[i] = (1.0 if above else -1.0) if sides[i] == 0 else 0.0
         changed: dict[str, Any] = {name: sides}
@@ -183,18 +183,18 @@ class Pieces:
 
     def entering(self, phase: Phase, z: Array) -> Array:
         """z at the phase's begin: a target that has stopped has no speed left, not even by rounding."""
-        if not self.pieces[phase.piece].stopped:
+        if not self.modes[phase.mode].stopped:
             return z
         z = z.copy()
         z[self.model.layout["target"].start] = 0.0
         return z
 
     def _limit(self) -> Array:
-        n, on = self.model.n, self.model.terms.saturation
+        n, on = self.model.n, self.model.effects.saturation
         return self.data["torque_limit"] if on else np.full(n, np.inf)
 
     def _band(self) -> Array:
-        return np.full(self.model.n, self.model.transition if self.model.terms.friction else np.inf)
+        return np.full(self.model.n, self.model.transition if self.model.effects.friction else np.inf)
 
     @staticmethod
     def _side(value: Array, level: Array) -> Array:

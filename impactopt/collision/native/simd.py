@@ -13,9 +13,9 @@ from typing import Any
 import casadi as ca
 
 from impactopt.collision.frozen import FrozenDynamics
-from impactopt.collision.native.generated import Tree
+from impactopt.collision.native.generated import TreeFunctions
 
-__all__ = ["forward_in_lanes", "tree_in_lanes"]
+__all__ = ["simd_forward", "simd_tree"]
 
 _LINEAR = {
     ca.OP_ASSIGN: "{0}",
@@ -28,46 +28,47 @@ _LINEAR = {
 }
 
 
-def tree_in_lanes(frozen: FrozenDynamics, tree: Tree, *, ground: bool) -> list[tuple[Any, str]]:
-    """`forward_in_lanes` of `tree` by q, of `approach`, which is what of it depends on v, by v, and of
+def simd_tree(frozen: FrozenDynamics, tree: TreeFunctions, *, ground: bool) -> list[tuple[Any, str]]:
+    """`simd_forward` of `tree` by q, of `approach`, which is what of it depends on v, by v, and of
     `drift` by both; q's directions are in the basis of v."""
     parts = frozen._tree
     known = [parts.rb.q, parts.rb.v, parts.normal]
     basis = ca.Function("basis", [parts.rb.q], [parts.rb.tangent_map()])
     out = [parts.hand_speed] + ([parts.carrying_wrench] if ground and not frozen.bias else [])
     whole, drift, *_ = tree.functions
-    made = [forward_in_lanes(whole, {0: basis})]
-    made.append(forward_in_lanes(ca.Function("approach", known, out), {1: None}))
+    made = [simd_forward(whole, {0: basis})]
+    made.append(simd_forward(ca.Function("approach", known, out), {1: None}))
     if drift.n_out():
-        made.append(forward_in_lanes(drift, {0: basis, 1: None}))
+        made.append(simd_forward(drift, {0: basis, 1: None}))
     return made
 
 
-def forward_in_lanes(function: Any, ways: Mapping[int, Any]) -> tuple[Any, str]:
+def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
     """(ca.Function <name>_parts, C of <name>_forward) of an SX function with dense outputs.
 
     <name>_parts (the function's inputs) -> the numbers that its derivatives need, <NAME>_PARTS of them.
-    <name>_forward (parts, way, out, count) : way[i] has `count` vectors of directions for each entry of the
-    i-th input that moves; out[i], unless it is null, gets as many for each entry of the i-th output.
+    <name>_forward (parts, seeds, out, count) : seeds[i] has `count` vectors of seed directions for each entry
+    of the i-th input that moves; out[i], unless it is null, gets as many for each entry of the i-th output.
 
     Parameters
     ----------
-    ways : by number of an input that moves: ca.Function of the input to the matrix that takes directions to
+    seeds : by number of an input that moves: ca.Function of the input to the matrix that takes directions to
         its changes; or None, where they are the same.
     """
     name, inputs = function.name(), function.sx_in()
     directions, changes = [], []
-    for number, basis in ways.items():
+    for number, basis in seeds.items():
         matrix = ca.SX.eye(inputs[number].size1()) if basis is None else basis(inputs[number])
         directions.append(ca.SX.sym("direction", matrix.size2()))
         changes.append(ca.mtimes(matrix, directions[-1]))
-    (out,) = ca.forward(function.call(inputs), [inputs[number] for number in ways], [changes])
+    (out,) = ca.forward(function.call(inputs), [inputs[number] for number in seeds], [changes])
     whole = ca.Function("whole", [*inputs, *directions], [ca.densify(part) for part in out])
     numbers, lines = _split(whole, len(inputs))
     registers = sorted({line.split(" ", 1)[0] for line in lines if line.startswith("a")})
     code = [
         f"#define {name.upper()}_PARTS {max(len(numbers), 1)}",
-        f"static void {name}_forward(const double *c, const vec *const *way, vec *const *out, int count) {{",
+        f"static void {name}_forward(",
+        "  const double *c, const vec *const *seeds, vec *const *out, int count) {",
         "  for (int k = 0; k < count; k++) {",
         f"    vec {', '.join(registers or ['a'])};",
         *[f"    {line};" for line in lines],
@@ -107,7 +108,7 @@ def _split(whole: Any, n_given: int) -> tuple[list[Any], list[str]]:
             lines.append(f"if (out[{write[0]}]) out[{write[0]}][{write[1]} * count + k] = {value}")
         elif kind == ca.OP_INPUT and read[0] >= n_given:
             held[write[0]] = f"a{write[0]}"
-            lines.append(f"a{write[0]} = way[{read[0] - n_given}][{read[1]} * count + k]")
+            lines.append(f"a{write[0]} = seeds[{read[0] - n_given}][{read[1]} * count + k]")
         elif kind not in (ca.OP_INPUT, ca.OP_CONST) and any(register in held for register in read):
             lines.append(f"a{write[0]} = " + _LINEAR[kind].format(*map(operand, read)))
             held[write[0]] = f"a{write[0]}"

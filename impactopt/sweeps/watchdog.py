@@ -5,18 +5,18 @@ from __future__ import annotations
 import signal
 from typing import Any
 
-__all__ = ["RANG", "Alarm"]
+__all__ = ["ENDED_BY_WATCHDOG", "Watchdog"]
 
-RANG = -int(signal.SIGALRM)  # exit code of a process that it ended
+ENDED_BY_WATCHDOG = -int(signal.SIGALRM)  # exit code of a process that it ended
 BUILDING = 900.0  # [s]: the longest that one step of building functions may take
 
 
-class Alarm:
+class Watchdog:
     """Ends this process where a case takes much longer than its time; news from the case put it off.
 
     The kernel does, by SIGALRM: nothing else stops compiled code.
 
-    limit [s] : None for no alarm.  grace [s] : how much longer.
+    limit [s] : None for none.  grace [s] : how much longer.
     """
 
     def __init__(self, limit: float | None, grace: float) -> None:

@@ -23,7 +23,7 @@ from impactopt.sweeps.collision_keys import SERVO, setting_of
 from impactopt.sweeps.measures import Blow, Measure
 from impactopt.sweeps.states import ContactStates, Posture, States
 
-__all__ = ["Scene"]
+__all__ = ["AlikeCollisions"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -40,7 +40,7 @@ TOO_STIFF = "the contact is too stiff for the steps of its law: {:.1g} of the im
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class AlikeCollisions:
     """What rows share that differ in numbers and hit points only.
 
     file, section : problem and [at_contact], with the values of keys that make the structure.

@@ -16,19 +16,22 @@ LIGHTEST = 1e-6  # [kg] of a payload that is one: MuJoCo takes no body without i
 
 
 @dataclass(frozen=True, kw_only=True)
-class Conditions:
-    """What a replay finds; the defaults are what was planned, on a floor of friction 0.9.
+class Perturbation:
+    """How the world of a replay differs from the plan. By default it does not, and the floor's friction is
+    0.9.
 
-    mass, stiffness, damping : of the target, and of the contact law, as factors of the planned numbers.
-    distance [m] : how much farther along the normal the target waits; negative: it comes early.
+    mass : of the target, as a factor of the planned one.  stiffness, damping : of the contact law, as
+        factors.
+    distance [m] : how much farther along the normal the target is; negative: nearer, so it is hit early.
     missing : there is no target.
     payload [kg] : a point mass at the striking point that the plan does not know of.
     friction : coefficient between soles and floor.  floor_time [s] : time constant of the floor's contact
-        (MuJoCo's solref), the softness of floor and soles: a sole sinks by as much as its square grows.
-        MuJoCo does not go below two steps.
-    kp, kd, torque_limit : of the servo, as factors.
-    period [s] : the servo reads the joints and sets torques this often, and holds them between; 0: in every
-        step of the simulation.  delay [s] : between reading and setting. Both are rounded to steps.
+        (MuJoCo's solref), the softness of floor and soles: a sole sinks in proportion to its square. MuJoCo
+        takes at least two steps.
+    kp, kd, torque_limit : of the servo, as factors of the robot's.
+    period [s] : time between two samples of the servo, which holds its torques between them; 0: it samples in
+        every step of the simulation.  delay [s] : from reading the joints to setting the torque. Both are
+        rounded to steps.
 
     Raises
     ------
@@ -55,24 +58,26 @@ class Conditions:
             if f.name == "missing":
                 if not isinstance(self.missing, (bool, np.bool_)):
                     raise InputError(
-                        f"conditions: missing is {shortened(repr(self.missing))}; give True or False"
+                        f"perturbation: missing is {shortened(repr(self.missing))}; give True or False"
                     )
                 continue
             value = float(
                 check_array(
-                    f"conditions: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
+                    f"perturbation: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
                 )
             )
             if f.name != "distance" and value < 0:
-                raise InputError(f"conditions: {f.name} is {value:g}; give a number >= 0")
+                raise InputError(f"perturbation: {f.name} is {value:g}; give a number >= 0")
         if 0 < self.payload < LIGHTEST:
-            raise InputError(f"conditions: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg")
+            raise InputError(
+                f"perturbation: payload is {self.payload:g}; give 0, or at least {LIGHTEST:g} kg"
+            )
         for name in ("mass", "stiffness", "friction", "floor_time", "torque_limit"):
             if not getattr(self, name) > 0:
-                raise InputError(f"conditions: {name} is {getattr(self, name):g}; give a number > 0")
+                raise InputError(f"perturbation: {name} is {getattr(self, name):g}; give a number > 0")
 
     def scene(self, planned: Scene) -> Scene:
-        """The scene as it turns out.
+        """The planned scene with this perturbation.
 
         Raises
         ------
@@ -80,7 +85,7 @@ class Conditions:
         """
         law, target = planned.law, planned.target
         of_law, of_target = scaled_numbers(
-            "conditions", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
+            "perturbation", law, target, mass=self.mass, stiffness=self.stiffness, damping=self.damping
         )
         way = self.distance * planned.normal
         solids = planned.solids.moved(way) if self.distance else planned.solids

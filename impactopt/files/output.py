@@ -113,7 +113,7 @@ def record_of(
     plan, robot, result = solution.plan, solution.problem.robot, solution.result
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
-    parts |= {"collision": plan.collision, "solver": result}
+    parts |= {"collision": solution.collision, "solver": result}
     summary = _summary(solution, simulation, replay)
     if "note" not in summary:
         parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}

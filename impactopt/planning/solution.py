@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
 from os import PathLike
@@ -22,7 +22,7 @@ from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
 from impactopt.transcription.mesh import Elements, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
-from impactopt.transcription.plan import Plan, Trajectory
+from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import Rattle
 
@@ -218,19 +218,36 @@ class Solution(Solved):
                 )
         return least, nearest, touches
 
+    @property
+    def collision(self) -> PlannedCollision:
+        """The expected one, at more instants than the program's where they are known."""
+        return self._collisions[0]
+
+    @property
+    def _collisions(self) -> list[PlannedCollision]:
+        """The expected one and those of the scenarios, at more instants than the program's where they are
+        known: between those torque and ZMP may be worse. What they come to is what the plan says.
+        """
+        planned = [self.plan.collision, *(scenario.collision for scenario in self.plan.scenarios)]
+        if self.contact_error is None or self.contact_error.missed or not self.contact_error.finer:
+            return planned
+        finer = zip(self.contact_error.finer, planned, strict=True)
+        return [replace(new, outcome=old.outcome) for new, old in finer]
+
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan
+        expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
-            **blow_numbers(plan),
+            **blow_numbers(plan, expected),
             "objectives": dict(self.objectives),
             "motion_price_pct": self.motion_price_pct,
             "duration_s": plan.duration,
             "nodes_added": self.nodes.total,
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,
-            **plan.margins(self.trajectory),
+            **plan.margins(self.trajectory, expected),
             **self.clearance(),
             "versions": versions(),
         }
@@ -241,7 +258,10 @@ class Solution(Solved):
         }
         if plan.scenarios:
             limits = {name: known[name] for name in ("torque_limit", "polygon")}
-            out["scenarios"] = [scenario.summary(**limits) for scenario in plan.scenarios]
+            out["scenarios"] = [
+                replace(scenario, collision=hit).summary(**limits)
+                for scenario, hit in zip(plan.scenarios, others, strict=True)
+            ]
         if simulation is not None:
             out["simulated"] = simulation.summary(**known)
         if replay is not None:
@@ -249,13 +269,13 @@ class Solution(Solved):
         return out
 
 
-def blow_numbers(hit: Plan | PlannedStrike) -> dict[str, Any]:
+def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
     """What ``summary.json`` says of a planned blow; one without duration knows no force."""
     duration = hit.compression + hit.restitution
     return {
         "impulse_Ns": hit.impulse,
-        "target": hit.collision.outcome,
-        "peak_force_N": float(hit.collision.force.max()) if duration > 0 else None,
+        "target": collision.outcome,
+        "peak_force_N": float(collision.force.max()) if duration > 0 else None,
         "contact_ms": 1e3 * duration,
         "hand_speed_m_s": hit.hand_speed,
     }

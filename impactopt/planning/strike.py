@@ -50,7 +50,7 @@ class StrikeSolution(Solved):
         angles = self.problem.robot.joint_positions(hit.posture)
         return {
             **self.outcome(),
-            **blow_numbers(hit),
+            **blow_numbers(hit, hit.collision),
             "objectives": dict(self.objectives),
             **hit.margins(),
             "posture_rad": {name: float(a) for name, a in zip(names, angles, strict=True)},

@@ -59,7 +59,7 @@ def problem_of_result(result: Path) -> ProblemFile:
 
 def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
     """What a result says of its contact, by who says it: ``planned``, ``simulated`` on held soles, and ``free
-    soles``, as far as there are any; keys as of `collide_once`. The plan's are at its collocation points.
+    soles``, as far as there are any; keys as of `collide_once`.
     """
     a, told = record.arrays, record.summary
     if "collision_time" not in a:

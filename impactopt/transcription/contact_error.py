@@ -9,7 +9,7 @@ not fall to zero at the end, the plan has missed an event: the bodies part, and 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,6 +25,7 @@ from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.mesh import Elements, halved
 from impactopt.transcription.phases import switches
+from impactopt.transcription.plan import PlannedCollision
 from impactopt.transcription.rows import Index
 from impactopt.transcription.structured import StructuredProgram
 
@@ -46,12 +47,15 @@ class ContactError:
     coarse : what of it is the elements'; the rest is that phases hold to one branch of the law.
     of_elements : what each element of each phase adds to `coarse` [%].
     missed : whether an event is missed.
+    finer : the collisions as they are on elements half as long, in the program's order: torque and ZMP are
+        worst between the plan's own points. Empty if none was found.
     """
 
     pct: float
     coarse: float
     of_elements: Elements
     missed: bool
+    finer: tuple[PlannedCollision, ...] = field(default=(), repr=False, compare=False)
 
 
 def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
@@ -65,8 +69,11 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
         unknown = tuple((np.inf,) * len(phase) for phase in t.hit.elements)
         return ContactError(pct=np.inf, coarse=np.inf, of_elements=unknown, missed=False)
     coarse, grown, errors = [], [], []
+    finer, outputs = list[PlannedCollision](), again.program.outputs(branches)
+    approach = float(t.program.outputs(x)["contact"][0, 3])
     for new, old in zip(again.hit.collisions, t.hit.collisions, strict=True):
         assert isinstance(new, Collision) and isinstance(old, Collision)
+        finer.append(new.decode(branches, outputs, approach))
         coarse.append(_off(new, old, branches, x))
         grown.append(_grown(new, old, branches, x))
         errors.append(_off(new, old, law, x))
@@ -76,6 +83,7 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
         coarse=max(coarse, key=abs),
         of_elements=tuple(tuple(map(float, phase)) for phase in np.split(np.max(grown, axis=0), ends)),
         missed=bool(np.isinf(errors).any()),
+        finer=tuple(finer),
     )
 
 

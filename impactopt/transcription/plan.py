@@ -310,16 +310,22 @@ class Plan:
             q[k] = c.join(row, legs)
         return q
 
-    def margins(self, trajectory: Trajectory | None = None) -> dict[str, dict[str, float]]:
+    def margins(
+        self, trajectory: Trajectory | None = None, collision: PlannedCollision | None = None
+    ) -> dict[str, dict[str, float]]:
         """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through.
 
         Of an impact without duration the plan knows neither, so there is no number for the collision.
+
+        trajectory : the reference, if it is known.  collision : the planned one at more instants than the
+        program has, such as `ContactError.finer`.
         """
         ref = self.trajectory() if trajectory is None else trajectory
         limit = self.problem.robot.torque_limit
         phase = ref.phase
-        grounds = [ref.ground[phase == 0], self.collision.ground, ref.ground[phase == 2]]
-        during = self.collision.torque if len(self.collision.ground) else self.collision.torque[:0]
+        hit = self.collision if collision is None else collision
+        grounds = [ref.ground[phase == 0], hit.ground, ref.ground[phase == 2]]
+        during = hit.torque if len(hit.ground) else hit.torque[:0]
         torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
         names = ("swing", "collision", "follow")
         ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}

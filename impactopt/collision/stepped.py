@@ -40,7 +40,8 @@ class SteppedModel(CollisionModel):
     step : [s] of "rk4", its length, below `stable_step(q)`; None: the paper's 1e-4. Of "implicit", which any
         step suits, the histories' spacing; None: 1e-3.
     tolerance : of "implicit", what a step may leave out of the hand's speed and of the impulse, relative to
-        their changes. The impulse is most often that exact; contacts that are pushed on and on by servos
+        their changes, and of what says when the target breaks, starts or stops, relative to its parts. The
+        impulse is most often that exact; contacts that are pushed on and on by servos
         that swing undamped, or saturate to and fro, gather more.
     report : told what is going on while functions are compiled, one line a call.
 

@@ -72,9 +72,7 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
     return NativeCode(
         name="collision",
         code=code,
-        graph=lambda: _guarded(
-            collision, collision_graph(collision, outputs, every=every, as_compiled=True)
-        ),
+        graph=lambda: _guarded(collision, collision_graph(collision, outputs, every=every, as_compiled=True)),
     )
 
 

@@ -61,8 +61,8 @@ class SymbolicModel(SteppedModel):
 
         Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with terms.feedforward; then the settings
         that `parameters` name (any of `settings`), the others being fixed. It does not contain what no
-        output needs. Where an input is NaN, or what holds the robot cannot be told apart at q, all outputs are
-        NaN, `separated` too.
+        output needs. Where an input is NaN, or what holds the robot cannot be told apart at q, all outputs
+        are NaN, `separated` too.
 
         CasADi can differentiate it by all of its inputs: jacobian, forward, reverse; twice by differences.
         What this takes is compiled when it is first evaluated. One number has its adjoint; numbers and
@@ -176,8 +176,8 @@ class SymbolicModel(SteppedModel):
         frames, 6), where the last instant is repeated after separation; and always `separated` (N) of bool,
         False also where there came out no number. With "rk4" also `step_error` (N), what its steps left out
         of each impulse, as an estimate: collisions that it is too large of, more than 1e-2, have no numbers.
-        So have those that the step is unstable of, and all that `collide` refuses: what holds the robot cannot
-        be told apart, events use up the steps, rounding hides the force.
+        So have those that the step is unstable of, and all that `collide` refuses: what holds the robot
+        cannot be told apart, events use up the steps, rounding hides the force.
         `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 
         Raises

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 # as in native/implicit.h, which says what they are
 _JUST_BEYOND, _AT_ONCE, _FIRST_STEP, _WORTH_LONGER, _AIMED_AT = 1e-9, 1e-5, 0.5, 2e-3, 0.2
-_OF_LIMIT, _MOST_TRIES, _TERMS = 1e-2, 200, STAGES + 1
+_OF_LIMIT, _OF_PLACE, _MOST_TRIES, _TERMS = 1e-2, 0.1, 200, STAGES + 1
 _BENT_WORTH_LONGER, _LITTLE, _SHORTER = 0.1, 0.1, 0.3
 _LITTLE_OF_FLAT, _NEAR_SEPARATION = 3e-4, 0.6
 
@@ -224,8 +224,8 @@ class _Run:
             return 0.0
         terms = self.switch_terms(s)
         by_speed = np.abs(by_z @ self.law.slopes(z, force)[2]) * scale
-        parts = np.abs(by_z) @ np.abs(z) + np.abs(by_force * force)
-        size = np.max([parts, by_speed, np.abs(terms[0]), np.abs(terms[1])], axis=0)
+        place = np.maximum(np.abs(terms[0]), np.abs(by_z * z).max(axis=1, initial=0.0))
+        size = np.max([_OF_PLACE * place, np.abs(by_force * force), by_speed, np.abs(terms[1])], axis=0)
         return float(np.max(np.abs(terms[STAGES]) / np.where(size > 0.0, size, np.inf)))
 
     def switch_terms(self, s: Step) -> Array:

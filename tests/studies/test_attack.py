@@ -186,6 +186,17 @@ SWINGS = {
         ([-1.87390057, 0.17942657, -1.87009293], [-0.79000937, -0.69730088, 0.13844472]),
         [36.1087282, -33.26506518, -25.65750432],
     ),
+    # found by seed 3030: 1.1e-5. It is bent so slowly that what is left out of its place counts tenfold
+    "a board that hardly breaks": (
+        ("Hunt-Crossley", "board"),
+        {"target_mass": 0.1398642970508337, "target_stiffness": 652235.0822818414}
+        | {"target_breaking_force": 75.02749432053203, "target_damping": 0.0}
+        | {"contact_stiffness": 3987.455800381034, "contact_dissipation": 0.36053937935686764}
+        | {"contact_exponent": 2.0},
+        {"kp": [1074.83559887, 355.06722493, 1191.0916213], "kd": [7.91186277, 1.1940896, 0.42550164]},
+        ([-2.48055884, 2.49451646, 1.41705362], [-0.27525955, 4.46941278, 0.69894506]),
+        [-50.25561889, 12.57060601, -5.99304019],
+    ),
     # found by seed 1001: 3e-6, where the hand's speed had just no error, and the penetration had
     "a nail": (
         ("Kelvin-Voigt", "nail"),
@@ -206,7 +217,8 @@ def test_a_swing_that_the_hands_speed_does_not_show_is_followed_too(name: str) -
     given = numbers | {of: np.array(gains) for of, gains in servo.items()}
     blow = Blow(q=np.array(q), v=np.array(v), torque=np.array(torque), numbers=given)
     found = model.collide(blow.q, blow.v, blow.torque, **blow.numbers)
-    assert found.impulse == pytest.approx(truth(model, blow).impulse, rel=10 * model.tolerance)
+    accuracy = TOLERANCES["implicit"] if "hardly" in name else 10 * model.tolerance
+    assert found.impulse == pytest.approx(truth(model, blow).impulse, rel=accuracy)
 
 
 def test_a_row_whose_steps_are_used_up_has_no_number_as_alone() -> None:

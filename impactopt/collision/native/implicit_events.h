@@ -145,19 +145,21 @@ static void switching_of(const Data *d, const State *y, const Series *s, Switchi
 }
 /* what a further term would add to the switches, of what is allowed: of the parts that they are made of, or what the
    speed's error makes of it. A board that swings slowly against the hand has a deflection that the hand's speed and
-   the impulse hardly know of, and it is this that says at which of its swings it breaks */
+   the impulse hardly know of, and it is this that says at which of its swings it breaks. A place that is come to slowly
+   is passed that much too late: of a place less is allowed */
 INLINE double error_of_switches(const Resolvent *r, const Series *s, const Switching *x, double scale) {
   double error = 0.0;
 #if SWITCHES
   FOR(k, SWITCHES) {
     const double *w = x->terms[k], by_force = x->begin.by_force[k];
-    double parts = fabs(by_force * s->force[0]), by_speed = 0.0;
+    double place = fabs(w[0]), by_speed = 0.0;
     FOR(i, NZ) {
       const double by_z = x->begin.by_z[k + SWITCHES * i];
-      parts += fabs(by_z * s->target[i][0]);
+      place = fmax(place, fabs(by_z * s->target[i][0]));
       by_speed += by_z * r->contact.at[i];
     }
-    const double size = fmax(fmax(parts, fabs(by_speed) * scale), fmax(fabs(w[0]), fabs(w[1])));
+    const double rest = fmax(fabs(by_force * s->force[0]), fabs(by_speed) * scale);
+    const double size = fmax(fmax(OF_PLACE * place, rest), fabs(w[1]));
     if (size > 0.0) error = fmax(error, fabs(w[STAGES]) / size);
   }
 #endif

@@ -20,7 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.cache import cached, library_path
-from impactopt.collision.checks import ACCURACY, breaks, left_out_by_breaking, too_large
+from impactopt.collision.checks import (
+    ACCURACY,
+    breaks,
+    left_out_by_breaking,
+    too_large,
+    without_contact,
+)
 from impactopt.collision.native import native_collision
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.settings import NO_LIMIT
@@ -57,9 +63,9 @@ class Batch:
         # these say which contacts have not ended, and which steps were too long
         judges = ("step_error", "separated") if model.stepping in ACCURACY else ("separated",)
         self._given = {*outputs, *judges}
-        judges = (*judges, "duration")
+        judges = (*judges, "duration", "impulse")
         if breaks(model):
-            judges = (*judges, "impulse", "target_result")
+            judges = (*judges, "target_result")
         self.model, self._stability = model, stability
         self.outputs = tuple(dict.fromkeys((*outputs, *judges)))
         recipe = (*model._recipe, *self.outputs, every)
@@ -111,8 +117,13 @@ class Batch:
             for name, x in zip(names, found, strict=True):
                 if name != "step_error":
                     x[wrong] = np.nan
+        impulse, duration = (found[names.index(name)][:, 0] for name in ("impulse", "duration"))
+        nothing = ~np.isfinite(impulse) | without_contact(impulse, duration)
+        for name, x in zip(names, found, strict=True):
+            if name != "step_error":
+                x[nothing] = np.nan
         # steps that events have used up before the horizon, which `collide` refuses too
-        separated, duration = (found[names.index(name)][:, 0] for name in ("separated", "duration"))
+        separated = found[names.index("separated")][:, 0]
         cut = ~(separated > 0.5) & (duration < self.model.horizon * (1 - 1e-9))
         for name, x in zip(names, found, strict=True):
             if name not in ("separated", "step_error"):

@@ -14,6 +14,7 @@ from impactopt.errors import InputError
 
 __all__ = [
     "ACCURACY",
+    "LEAST_PIVOT",
     "breaks",
     "check_course",
     "check_finite",
@@ -21,6 +22,7 @@ __all__ = [
     "left_out_by_breaking",
     "spoiled",
     "too_large",
+    "without_contact",
 ]
 
 Array = NDArray[np.float64]
@@ -30,18 +32,18 @@ Array = NDArray[np.float64]
 ACCURACY = {"rk4": 1e-2}
 _ORDERS = {"rk4": 2}
 # of a factorization's pivot, and of the hand's mobility, relative: with less, rounding reaches 1e-7
-_LEAST_PIVOT = 1e-9
+LEAST_PIVOT = 1e-9
 
 
 def check_frozen(frozen: dict[str, Array]) -> None:
     """InputError where rounding spoils what is frozen (with `pivots` and `freedom` among it)."""
-    if not (frozen["pivots"] > _LEAST_PIVOT).all():
+    if not (frozen["pivots"] > LEAST_PIVOT).all():
         raise InputError(
             "q: what holds the robot cannot be told apart here (held frames' directions depend on each "
             "other, so that their wrenches are undetermined): hold fewer frames, or give the legs more "
             "joints, or bend them, or use a virtual base (base_mass, base_inertia)"
         )
-    if not frozen["freedom"].item() > _LEAST_PIVOT and frozen["m"].item() != 0:
+    if not frozen["freedom"].item() > LEAST_PIVOT and frozen["m"].item() != 0:
         raise InputError(
             "q: what holds the robot leaves its striking point no motion along the normal here: an "
             "effective mass without end; bend the arm, or turn the normal"
@@ -53,11 +55,16 @@ def check_frozen(frozen: dict[str, Array]) -> None:
 
 def spoiled(frozen: dict[str, Array]) -> Any:
     """(N) rows that `check_frozen` refuses; numbers (N, ...)."""
-    bad = ~(frozen["pivots"] > _LEAST_PIVOT).all(axis=1)
-    bad |= ~(frozen["freedom"][:, 0] > _LEAST_PIVOT) & (frozen["m"][:, 0] != 0)
+    bad = ~(frozen["pivots"] > LEAST_PIVOT).all(axis=1)
+    bad |= ~(frozen["freedom"][:, 0] > LEAST_PIVOT) & (frozen["m"][:, 0] != 0)
     for name in {*frozen} - {"pivots", "freedom"}:
         bad |= ~np.isfinite(frozen[name]).all(axis=1)
     return bad
+
+
+def without_contact(impulse: Array, duration: Array) -> Any:
+    """Whether contacts ended so soon that rounding hides their force."""
+    return (impulse < 0) & (duration > 0)
 
 
 def check_finite(outputs: dict[str, Array], step: float) -> None:
@@ -110,7 +117,7 @@ def check_course(collision: SteppedModel, result: Collision, error: float) -> No
     if result.duration == 0:
         return
     if method == "implicit":
-        if result.impulse < 0:
+        if without_contact(np.array(result.impulse), np.array(result.duration)):
             raise InputError(
                 f"v: the contact ends within {result.duration:.2g} s, where rounding hides its force: "
                 "give one that approaches faster"

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 # as in native/implicit.h, which says what they are
 _JUST_BEYOND, _AT_ONCE, _FIRST_STEP, _WORTH_LONGER, _AIMED_AT = 1e-9, 1e-5, 0.5, 2e-3, 0.2
-_OF_LIMIT, _MOST_TRIES, _TERMS = 1e-2, 200, STAGES + 1
+_OF_LIMIT, _OF_PLACE, _MOST_TRIES, _TERMS = 1e-2, 0.1, 200, STAGES + 1
 _BENT_WORTH_LONGER, _LITTLE, _SHORTER = 0.1, 0.1, 0.3
 _LITTLE_OF_FLAT, _NEAR_SEPARATION = 3e-4, 0.6
 
@@ -208,13 +208,36 @@ class _Run:
             return float("nan")
         impulse = s.terms[:, self.parts["impulse"]].ravel()
         least = scale / mobility if self.bends else 1e-300
-        error = abs(s.rate[STAGES]) / max(scale, abs(s.rate[1]))
+        error = np.abs(s.rate[STAGES - 1 :]).max() / max(scale, abs(s.rate[1]))
         error = max(error, abs(impulse[STAGES]) / max(impulse[0], abs(impulse[1]), least))
+        error = max(error, self._error_of_switches(s, scale))
         error *= _LEFT_OUT / self.loop.tolerance
         if self.saturates:
             most = float(np.max(np.abs(self.terms_of(now, s)[1][STAGES]) / self.limit))
             error = max(error, most * _LEFT_OUT / _OF_LIMIT)
         return float(error)
+
+    def _error_of_switches(self, s: Step, scale: float) -> float:
+        z, force = s.terms[0, self.parts["target"]], s.force[0]
+        values, by_z, by_force = self.law.switches(z, force)
+        if not values.size:
+            return 0.0
+        terms = self.switch_terms(s)
+        by_speed = np.abs(by_z @ self.law.slopes(z, force)[2]) * scale
+        place = np.maximum(np.abs(terms[0]), np.abs(by_z * z).max(axis=1, initial=0.0))
+        size = np.max([_OF_PLACE * place, np.abs(by_force * force), by_speed, np.abs(terms[1])], axis=0)
+        return float(np.max(np.abs(terms[STAGES]) / np.where(size > 0.0, size, np.inf)))
+
+    def switch_terms(self, s: Step) -> Array:
+        """The target's switches in the step (9, k)."""
+        z = s.terms[:, self.parts["target"]]
+        values, by_z, by_force = self.law.switches(z[0], s.force[0])
+        if self.loop.contact.target_bends:
+            at, forces = s.at_nodes(z), s.at_nodes(s.force)
+            return s.through_nodes(values, lambda i: self.law.switches(at[i], float(forces[i]))[0])
+        terms: Array = z @ by_z.T + np.outer(s.force, by_force)
+        terms[0] = values
+        return terms
 
     @property
     def bends(self) -> bool:
@@ -263,15 +286,7 @@ class _Run:
             falling += _levels(demand, np.zeros(self.model.n), self.limit)
         if self.slides:
             falling += _levels(speeds, self.velocity, np.full(self.model.n, self.model.transition))
-        z = s.terms[:, self.parts["target"]]
-        values, by_z, by_force = self.law.switches(z[0], s.force[0])
-        if values.size and self.loop.contact.target_bends:
-            at, forces = s.at_nodes(z), s.at_nodes(s.force)
-            terms = s.through_nodes(values, lambda i: self.law.switches(at[i], float(forces[i]))[0])
-        else:
-            terms = z @ by_z.T + np.outer(s.force, by_force)
-            terms[0] = values
-        for b in terms.T @ _HULL if values.size else ():
+        for b in self.switch_terms(s).T @ _HULL:
             side = b[0] if b[0] != 0.0 else b[1]
             falling.append(-b if side < 0.0 else b)
         places += [first_negative(b) for b in falling]

@@ -40,8 +40,9 @@ class SteppedModel(CollisionModel):
     step : [s]. With "rk4" the length of its steps, below `stable_step(q)`; None: the paper's 1e-4. With
         "implicit", which chooses its own steps, the spacing of histories; None: 1e-3.
     tolerance : of "implicit", the error of one step in the hand's speed and in the impulse, relative to their
-        changes. The impulse is mostly as exact as that. Errors add up in long contacts, where a servo swings
-        undamped or saturates again and again.
+        changes, and in what says when the target breaks, starts or stops, relative to its parts. The impulse
+        is mostly as exact as that. Errors add up in long contacts, where a servo swings undamped or saturates
+        again and again.
     report : called with a line of text while functions are compiled.
 
     Raises

@@ -65,7 +65,8 @@ class SymbolicModel(SteppedModel):
 
         Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with effects.feedforward; then the settings
         that `parameters` name (any of `settings`); the others are fixed. What no output needs is left out.
-        If an input is NaN, all outputs are, `separated` too.
+        If an input is NaN, or what holds the robot cannot be told apart at q, all outputs are NaN,
+        `separated` too.
 
         CasADi can differentiate it with respect to all inputs (jacobian, forward, reverse), and twice by
         differences. The code for this is compiled when it is first evaluated. A single scalar output has an
@@ -183,7 +184,9 @@ class SymbolicModel(SteppedModel):
         frames, 6), where the last instant is repeated after separation. `separated` (N) of bool is always
         there; it is False too where numbers are not finite. With "rk4" there is `step_error` (N), an
         estimate of the impulse's error by its steps. Where this is above 1e-2, or the step is unstable,
-        all numbers are nan. `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
+        all numbers are nan. So are those of rows that `collide` refuses: what holds the robot cannot be told
+        apart, events use up the steps, rounding hides the force.
+        `freeze_error` (N) is that of `Collision`, nan where the contact has not ended.
 
         Raises
         ------

@@ -156,3 +156,24 @@ def test_a_bound_of_the_rates_only_spares_eigenvalues() -> None:
     alone = [sdc.stable_step([0.0], contact_stiffness=k) <= sdc.step_length for k in stiffness]
     assert sdc._stability.unstable(given).tolist() == alone
     assert {*alone} == {True, False}
+
+
+@pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")
+@pytest.mark.parametrize("compiler", [True, False])
+def test_rows_that_rounding_spoils_have_no_numbers(compiler: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    # soles that hold each other: what rounding leaves of some directions passes for a number now and then
+    if not compiler:
+        monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
+    robot = make_robot("planar walker")
+    sdc = SDC(robot=robot, striker="tip", normal=X, law=LAW, target=TARGET, accuracy=None)
+    rng = np.random.default_rng(0)
+    q = np.hstack([np.zeros((120, 3)), rng.normal(size=(120, 4)), rng.uniform(-1.0, 1.0, (120, robot.n))])
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1)[:, None]
+    v = rng.normal(size=(120, robot.nv))
+    found = sdc.batch(q, v, np.zeros(robot.n), outputs=("impulse", "duration", "time"))
+    assert all(np.isnan(found[name]).all() for name in ("impulse", "duration", "time"))
+    assert not found["separated"].any()
+    alone = sdc.function(("impulse", "separated", "time"))
+    assert all(
+        np.isnan(x).all() for k in range(120) for x in map(np.array, alone(q[k], v[k], np.zeros(robot.n)))
+    )

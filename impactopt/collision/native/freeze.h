@@ -18,6 +18,7 @@ typedef struct {
   double hand_speed;
   double soles[AT_LEAST_1(3 * SOLES)];
   double unmodelled[6];
+  int spoiled;          /* whether rounding has spoilt it */
 } Frozen;
 
 /* x := R^-1 x and x := R^-T x for vectors, a row each, or numbers */
@@ -46,6 +47,7 @@ static void roots(const double *q, const double *v, const double *normal, Frozen
 static void hold(Frozen *F) {
   vec U[C1][VC];
   double inverse[C1];
+  F->spoiled = 0;
   FOR(c, C) {
     vec u[VC] = {0}, z[V] = {0};
     for (int k = HELD_ROWS[c]; k < HELD_ROWS[c + 1]; k++) {
@@ -54,6 +56,7 @@ static void hold(Frozen *F) {
       FOR(i, VC) u[i] += w * F->held[r][i];
       FOR(i, V) z[i] += w * F->root[r][i];
     }
+    const double whole = ((double *)u)[c] + GAMMA[c];
     FOR(k, c) {
       const double l = ((double *)U[k])[c] * inverse[k];
       FOR(i, VC) u[i] -= l * U[k][i];
@@ -61,7 +64,9 @@ static void hold(Frozen *F) {
     }
     FOR(i, VC) U[c][i] = u[i];
     FOR(i, V) F->Z[c][i] = z[i];
-    inverse[c] = 1.0 / (((double *)U[c])[c] + GAMMA[c]);
+    const double pivot = ((double *)U[c])[c] + GAMMA[c];
+    F->spoiled |= !(pivot > LEAST_PIVOT * whole);
+    inverse[c] = 1.0 / pivot;
   }
   FOR(c, C) {
     const double scale = F->R[c][c] = sqrt(inverse[c]);
@@ -189,10 +194,22 @@ static void wrenches(Frozen *F) {
 #endif
 }
 
+/* no numbers where rounding would be most of them: see `check_frozen` in collision/checks.py */
+static void no_number_of_spoiled(Frozen *F) {
+  double whole = 0.0;
+  FOR(r, NV) whole += ((double *)F->root[r])[N] * ((double *)F->root[r])[N];
+  const double left = ((double *)F->Q[N])[N];
+  if (C) F->spoiled |= !(left > LEAST_PIVOT * whole) && left != 0.0;
+  if (!F->spoiled) return;
+  F->hand_speed = NAN;
+  FOR(j, N + 1) FOR(i, V) F->Q[j][i] = (vec){0} + NAN;
+}
+
 static void freeze(const double *q, const double *v, const double *normal, double yields, Frozen *F) {
   roots(q, v, normal, F);
   hold(F);
   inverse_inertia(F);
+  no_number_of_spoiled(F);
   meeting(v, yields, F);
   drifts(q, normal, F);
   wrenches(F);

@@ -13,7 +13,8 @@
 #define JUST_BEYOND 1e-9
 #define AT_ONCE 1e-5
 /* of the stiffest of contact's modes, the first step; how much an error has to be below what is allowed for longer
-   steps; error of a joint's demand, of its limit */
+   steps; error of a joint's demand, of its limit; and
+   what is allowed of a place at which the target changes, of what is allowed else */
 #define FIRST_STEP 0.5
 #define WORTH_LONGER 2e-3
 #define AIMED_AT 0.2
@@ -27,6 +28,7 @@
 #define LITTLE_OF_FLAT 3e-4
 #define NEAR_SEPARATION 0.6
 #define OF_LIMIT 1e-2
+#define OF_PLACE 0.1
 #define MOST_TRIES 200
 
 /* law and target in the piece where the step begins, and the inverse of I - g dz'/dz */

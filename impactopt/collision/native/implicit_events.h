@@ -109,7 +109,65 @@ static void switch_in(const Data *d, const Series *s, double theta, Switch *x) {
 }
 #endif
 
-static void find_event(const Data *d, const State *y, const Instant *now, const Series *s, double end, Event *e) {
+/* the switches in a step, in the polynomials of the step's other series */
+typedef struct {
+#if SWITCHES
+  Switch begin;
+  double terms[SWITCHES][TERMS];
+#else
+  int none;
+#endif
+} Switching;
+static void switching_of(const Data *d, const State *y, const Series *s, Switching *x) {
+#if SWITCHES
+  switches_at(d, y->target, s->force[0], &x->begin);
+  FOR(k, SWITCHES) {
+    double *w = x->terms[k];
+    w[0] = x->begin.values[k];
+    for (int j = 1; j < TERMS; j++) {
+      w[j] = 0.0;
+      if (TARGET_BENDS) continue;
+      w[j] = x->begin.by_force[k] * s->force[j];
+      FOR(i, NZ) w[j] += x->begin.by_z[k + SWITCHES * i] * s->target[i][j];
+    }
+  }
+#if TARGET_BENDS
+  FOR(i, NODES) {
+    double z[NZ1];
+    Switch there;
+    FOR(k, NZ) z[k] = at_node(s->target[k], i);
+    switches_at(d, z, at_node(s->force, i), &there);
+    FOR(k, SWITCHES) for (int j = 1; j < TERMS; j++)
+      x->terms[k][j] += FROM_NODES[j][i] * (there.values[k] - x->begin.values[k]);
+  }
+#endif
+#endif
+}
+/* what a further term would add to the switches, of what is allowed: of the parts that they are made of, or what the
+   speed's error makes of it. A board that swings slowly against the hand has a deflection that the hand's speed and
+   the impulse hardly know of, and it is this that says at which of its swings it breaks. A place that is come to slowly
+   is passed that much too late: of a place less is allowed */
+INLINE double error_of_switches(const Resolvent *r, const Series *s, const Switching *x, double scale) {
+  double error = 0.0;
+#if SWITCHES
+  FOR(k, SWITCHES) {
+    const double *w = x->terms[k], by_force = x->begin.by_force[k];
+    double place = fabs(w[0]), by_speed = 0.0;
+    FOR(i, NZ) {
+      const double by_z = x->begin.by_z[k + SWITCHES * i];
+      place = fmax(place, fabs(by_z * s->target[i][0]));
+      by_speed += by_z * r->contact.at[i];
+    }
+    const double rest = fmax(fabs(by_force * s->force[0]), fabs(by_speed) * scale);
+    const double size = fmax(fmax(OF_PLACE * place, rest), fabs(w[1]));
+    if (size > 0.0) error = fmax(error, fabs(w[STAGES]) / size);
+  }
+#endif
+  return error * (LEFT_OUT / TOLERANCE);
+}
+
+static void find_event(const Data *d, const Instant *now, const Series *s, const Switching *switching, double end,
+                       Event *e) {
   double b[TERMS];
   *e = (Event){.at = end};
   hull(s->rate, b);
@@ -136,28 +194,8 @@ static void find_event(const Data *d, const State *y, const Instant *now, const 
   }
 #endif
 #if SWITCHES
-  Switch here;
-  switches_at(d, y->target, s->force[0], &here);
-#if TARGET_BENDS
-  Switch there[NODES];
-  FOR(i, NODES) {
-    double z[NZ1];
-    FOR(k, NZ) z[k] = at_node(s->target[k], i);
-    switches_at(d, z, at_node(s->force, i), &there[i]);
-  }
-#endif
   FOR(k, SWITCHES) {
-    double w[TERMS] = {here.values[k]};
-#if TARGET_BENDS
-    FOR(i, NODES) for (int j = 1; j < TERMS; j++)
-      w[j] += FROM_NODES[j][i] * (there[i].values[k] - here.values[k]);
-#else
-    for (int j = 1; j < TERMS; j++) {
-      w[j] = here.by_force[k] * s->force[j];
-      FOR(i, NZ) w[j] += here.by_z[k + SWITCHES * i] * s->target[i][j];
-    }
-#endif
-    hull(w, b);
+    hull(switching->terms[k], b);
     const double side = b[0] != 0.0 ? b[0] : b[1];
     look_at(b, side < 0.0 ? -1.0 : 1.0, 0.0, OF_SWITCH, k, e);
   }

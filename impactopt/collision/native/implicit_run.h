@@ -59,6 +59,7 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
   Resolvent r = {.h = 0.0};
   Series s;
   Bend bend;
+  Switching switching;
   Event e;
   int made = 0, column = 0, repeated = 0;
   double scale = 0.0, h = 0.0, first = 0.0;
@@ -85,7 +86,8 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
         h *= SHORTER;
         continue;
       }
-      error = error_of(d, &r, &s, scale);
+      switching_of(d, y, &s, &switching);
+      error = fmax(error_of(d, &r, &s, scale), error_of_switches(&r, &s, &switching, scale));
       if (!(error > 1.0)) break;
       h *= fmax(0.2, 0.9 * pow(error, -1.0 / TERMS));
     }
@@ -96,7 +98,7 @@ static Instant run(const Data *d, State *y, int steps, const Record *record, Tap
     }
     if (first == 0.0) first = h;
     const double end = fmin(1.0, left / h);
-    find_event(d, y, &now, &s, end, &e);
+    find_event(d, &now, &s, &switching, end, &e);
     /* events that follow each other at once, because rounding hides that they are over: farther each time */
     repeated = e.kind && e.at < AT_ONCE && repeated < 8 ? repeated + 1 : 0;
     const double beyond = JUST_BEYOND * fmax(e.at, AT_ONCE * (1 << 3 * repeated));

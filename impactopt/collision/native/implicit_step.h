@@ -105,9 +105,11 @@ static void make_series(const Data *d, const State *y, const Instant *now, const
   make_terms(d, r, &b, n, s);
 }
 
-/* what a further term would add to the hand's speed and the joints' demands, of what is allowed */
+/* what a further term would add to the hand's speed and the joints' demands, of what is allowed. A speed that swings
+   has terms that swing: one of them may be next to nothing while the penetration's is not, two in a row are not */
 INLINE double error_of(const Data *d, const Resolvent *r, const Series *s, double scale) {
-  double error = fabs(s->rate[STAGES]) / fmax(scale, fabs(s->rate[1]));
+  const double speed = fmax(fabs(s->rate[STAGES]), fabs(s->rate[STAGES - 1]));
+  double error = speed / fmax(scale, fabs(s->rate[1]));
   double impulse = fmax(s->impulse[0], fabs(s->impulse[1]));
   /* a force that bends where it begins is never that exact by its own measure, but soon by that of a plastic blow */
   if (BENDS) impulse = fmax(impulse, scale / r->contact.yields);

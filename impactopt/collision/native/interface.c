@@ -28,9 +28,11 @@ static int has_nan(const double **arg) {
 }
 
 EXPORT int NAME(const double **arg, double **res, Int *iw, double *w, int mem) {
+  ROOM *room = (ROOM *)(((size_t)w + 63) & ~(size_t)63);
   if (!has_nan(arg)) {
-    evaluate(arg, res, (ROOM *)(((size_t)w + 63) & ~(size_t)63));
-    return 0;
+    evaluate(arg, res, room);
+    /* a collision's work is what every room begins with */
+    if (!((const Work *)room)->frozen.spoiled) return 0;
   }
   FOR(k, N_OUT) {
     if (!res[k]) continue;

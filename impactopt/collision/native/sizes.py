@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.contact_slopes import law_is_linear, target_is_linear
 from impactopt.collision.course import GIVES_WAY, cuts
 from impactopt.collision.graph import MOST_STEPS, columns_of, joint_space_model
@@ -144,6 +145,7 @@ def sizes(collision: SteppedModel, outputs: tuple[str, ...], every: int, tree: T
         "TOLERANCE": repr(float(collision.tolerance)),
         "GAMMA_OF_STEPS": repr(gamma()),
         "GIVES_WAY": repr(GIVES_WAY),
+        "LEAST_PIVOT": repr(LEAST_PIVOT),
         "HORIZON": repr(float(collision.horizon)),
         "TRANSITION": repr(float(model.transition)),
         "STIFFNESS": int(effects.stiffness and n > 0),

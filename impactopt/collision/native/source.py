@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.codegen.library import NativeCode
+from impactopt.collision.checks import LEAST_PIVOT
 from impactopt.collision.graph import collision_graph, frozen_dynamics, gradient_graph, joint_space_model
 from impactopt.collision.native.generated import (
     backwards,
@@ -71,7 +72,7 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
     return NativeCode(
         name="collision",
         code=code,
-        graph=lambda: _no_nan(collision_graph(collision, outputs, every=every, as_compiled=True)),
+        graph=lambda: _guarded(collision, collision_graph(collision, outputs, every=every, as_compiled=True)),
     )
 
 
@@ -86,7 +87,7 @@ def native_gradient(collision: SteppedModel, output: str) -> NativeCode:
     def graph() -> Any:
         if collision.stepping == "implicit" or collision.n_freezes:
             raise InputError(_NEEDS_COMPILER.format("gradient_function", "; or take method 'rk4'"))
-        return _no_nan(gradient_graph(collision, output))
+        return _guarded(collision, gradient_graph(collision, output))
 
     return NativeCode(
         name="collision_gradient",
@@ -124,12 +125,19 @@ def native_differences(
     return NativeCode(name="collision_differences", code=code, graph=none)
 
 
-def _no_nan(graph: ca.Function) -> ca.Function:
-    """A function that gives no numbers where an input is none, as C code does."""
+def _guarded(collision: SteppedModel, graph: ca.Function) -> ca.Function:
+    """A function that gives no numbers where an input is none, or rounding spoils what is frozen, as C code
+    does."""
     inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
     # a comparison with none is false; x == x would be simplified
     finite = ca.mmin(ca.vertcat(1, *[ca.vec(ca.densify(x)) >= -np.inf for x in inputs]))
-    out = [ca.if_else(finite, x, np.nan) for x in graph.call(inputs)]
+    q, v, normal = (inputs[graph.name_in().index(name)] for name in ("q", "v", "normal"))
+    frozen = frozen_dynamics(collision).function("frozen", ("pivots", "freedom", "m"))
+    pivots, freedom, m = frozen.call([q, v, normal, 0.0])
+    # as `check_frozen` has it
+    known = ca.logic_or(freedom > LEAST_PIVOT, m == 0)
+    sound = ca.logic_and(known, ca.mmin(ca.vertcat(1, pivots)) > LEAST_PIVOT)
+    out = [ca.if_else(ca.logic_and(finite, sound), x, np.nan) for x in graph.call(inputs)]
     return ca.Function(graph.name(), inputs, out, graph.name_in(), graph.name_out())
 
 

@@ -24,7 +24,7 @@ __all__ = ["Blow", "Frozen", "StruckTarget", "Truth", "Unjudged", "force_of", "s
 
 Array = NDArray[np.float64]
 
-_MOST_PIECES, _MOST_SLOPES = 300, 400_000
+_MOST_PIECES, _MOST_SLOPES = 2_000, 400_000
 
 
 class Unjudged(Exception):

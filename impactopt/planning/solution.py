@@ -20,13 +20,30 @@ from impactopt.planning.multistart import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
-from impactopt.transcription.mesh import Elements, contact_elements
+from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import Rattle
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelError:
+    """How far a model of the collision is from the next one, at a plan's state at contact.
+
+    impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
+    has no ZMP.  by : name of the next model.
+    """
+
+    impulse_pct: float
+    zmp_mm: float | None
+    by: str
+
+    def __str__(self) -> str:
+        zmp = "" if self.zmp_mm is None else f", ZMP off by {self.zmp_mm:.2g} mm"
+        return f"impulse {self.impulse_pct:+.2g} %{zmp}, by {self.by}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -39,6 +56,10 @@ class Solved:
     violations : what is not met, worst first.
     objectives : what each of the problem's objectives comes to, by name, in its own unit.
     attempts : what came of each start.
+    model_error : of the model of the collision, estimated; None where nothing is frozen in it.
+    apart : the rows that its program had between bodies.
+    elements, shares : of the contact's phases, fractions of them, where it took others than the problem asks
+        for; () where not. And of its time, that each phase lasts, where something is frozen on the way.
     rattle : what is left out, as a nail and a striker that rattle are held together; None where they do not.
     """
 
@@ -51,6 +72,10 @@ class Solved:
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
     rattle: Rattle | None = None
+    model_error: ModelError | None = None
+    apart: Mapping[Any, Any] = field(default_factory=dict)
+    elements: Elements = ()
+    shares: Shares = ()
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -76,6 +101,10 @@ class Solved:
             "max_violation": self.result.max_violation,
             "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
             "starts": [attempt.summary() for attempt in self.attempts],
+            "collision_model": self.problem.collision,
+            "freezes": self.problem.freezes,
+            "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
+            "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),
             **({} if self.rattle is None else {"caution": str(self.rattle)}),
         }
@@ -88,17 +117,13 @@ class Solution(Solved):
     plan : the motion; for a status that is not usable, that of the best iterate.
     nodes : what its program had beside the ends and middles of its splines' intervals, as
         :func:`impactopt.solve` adds them.
-    elements : of the contact's phases, fractions of them, where it took finer ones than the problem asks for;
-        () where not.
     contact_error : what the impulse is off by for the contact's elements, estimated; None of an impact
         without duration, and where nothing usable was found.
-    apart : the rows that its program had between bodies.  The rest: :class:`Solved`.
+    The rest: :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
-    apart: Mapping[Any, Any] = field(default_factory=dict)
-    elements: Elements = ()
     contact_error: ContactError | None = None
 
     @property
@@ -109,7 +134,7 @@ class Solution(Solved):
     @property
     def contact_elements(self) -> list[int]:
         """How many each phase of the contact has; none of an impact without duration."""
-        if self.problem.collision != "dynamics":
+        if not self.problem.lasts:
             return []
         return [len(phase) for phase in self.elements or contact_elements(self.problem)]
 

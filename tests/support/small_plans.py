@@ -25,7 +25,7 @@ from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.apart import LENGTHS, apart
 from impactopt.transcription.blocks import BlockExpression, builders
-from impactopt.transcription.extra_blocks import extra_blocks
+from impactopt.transcription.extra_blocks import extra_blocks, own_blocks
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.structured import derivative_functions
@@ -76,6 +76,10 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     c = problem.coordinates
     edges = len(support_polygon(problem.robot, c))
     found: dict[str, Callable[[], BlockExpression]] = {f"apart{n}": partial(apart, n) for n in LENGTHS}
+    if problem.frozen is not None:
+        return Transcription(
+            problem, c, _functions(found | own_blocks(problem, c, edges)) | _extra_functions(problem)
+        )
     for instant in (False, True):
         found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant)
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))

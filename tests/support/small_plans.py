@@ -28,6 +28,7 @@ from impactopt.transcription.blocks import BlockExpression, builders
 from impactopt.transcription.extra_blocks import extra_blocks, own_blocks
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.start import first_iterate
+from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.transcription import Transcription
 from support.small_robots import arm, biped, striking_point
@@ -83,6 +84,13 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     for instant in (False, True):
         found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant)
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
+
+
+def struck(problem: ImpactProblem) -> StrikeTranscription:
+    """The problem's strike; only the blocks of its own model of the collision are built."""
+    c = problem.coordinates
+    own = own_blocks(problem, c, len(support_polygon(problem.robot, c)))
+    return StrikeTranscription(problem, c, _functions(own) | _extra_functions(problem))
 
 
 def _functions(builders: Mapping[str, Callable[[], BlockExpression]]) -> dict[str, Any]:

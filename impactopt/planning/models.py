@@ -1,8 +1,7 @@
-"""Models of the collision for a plan: what the next one says of its blow; the cheapest that is good enough.
+"""Models of the collision for a plan: how far each is from full dynamics; the cheapest that is good enough.
 
-The models are rungs of a ladder. What the next one would change is asked of that model alone, at the plan's
-state at contact: a collision of the compiled SDC, which takes microseconds. The full dynamics have there the
-SDC that is frozen so often that it makes no difference.
+That is asked of models alone, at the plan's state at contact: collisions of the compiled SDC, which take
+microseconds. Full dynamics are there the SDC that is frozen so often that it makes no difference.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from impactopt.transcription.start import carried_over, strike_rates
 
 Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)
-# which model a model's error is told by: the SDC with the same freezes, or enough of them for full dynamics
+# freezes of the SDC that stands for full dynamics
 _OFTEN, _MOST = 8, 64
 _LADDER = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
 _HORIZON = 0.2  # [s] at least
@@ -36,10 +35,9 @@ _GUESSED = 1.0  # [m/s] at which the first rung is chosen
 
 
 def model_error(t: ContactProgram, x: Array) -> ModelError | None:
-    """How far the model of a program's collision is from the next, for solver variables (n,).
+    """How far the model of a program's collision is from full dynamics, for solver variables (n,).
 
-    None where nothing is frozen; for an impact with a given restitution; and where the next model has no end
-    of the contact.
+    None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
     """
     problem, c = t.problem, t.coordinates
     if problem.collision in ("full", "auto", "rigid"):
@@ -56,21 +54,16 @@ def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: 
     scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
     scene["horizon"] = max(_HORIZON, 4 * duration)
     own = frozen_model(problem.collision, problem.freezes, **scene)
-    frozen = problem.collision == "sdc"
-    often = min(max(_OFTEN, 4 * problem.freezes), _MOST) if frozen else 0
+    often = min(max(_OFTEN, 4 * problem.freezes), _MOST)
     try:
         bend: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}
         known = {name: x for name, x in bend.items() if name in own.settings}
         alone = own.collide(q, v, torque, **known)
-        above = frozen_model("sdc", often, **scene).collide(q, v, torque, **bend)
+        full = frozen_model("sdc", often, **scene).collide(q, v, torque, **bend)
     except InputError:  # a contact that does not end
         return None
-    told = errors_against(alone, above)
-    return ModelError(
-        impulse_pct=float(told["impulse_error_pct"] or 0.0),
-        zmp_mm=told["zmp_error_mm"],
-        by="full" if frozen else "sdc",
-    )
+    told = errors_against(alone, full)
+    return ModelError(impulse_pct=float(told["impulse_error_pct"] or 0.0), zmp_mm=told["zmp_error_mm"])
 
 
 def carried_start(
@@ -112,7 +105,7 @@ def climbed(
         done = new if done is None else _both(done, new)
         if not done.status.usable or done.model_error is None or good_enough(problem, done.model_error):
             break
-        say(f"{rung}: {done.model_error}, which is more than was asked for: on with the next model")
+        say(f"{rung}: {done.model_error}, which is more than was asked for: on with full dynamics")
     assert done is not None
     return done
 

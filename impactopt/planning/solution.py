@@ -31,19 +31,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class ModelError:
-    """How far a model of the collision is from the next one, at a plan's state at contact.
+    """How far a model of the collision is from full dynamics, at a plan's state at contact.
 
     impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
-    has no ZMP.  by : name of the next model.
+    has no ZMP.
     """
 
     impulse_pct: float
     zmp_mm: float | None
-    by: str
 
     def __str__(self) -> str:
         zmp = "" if self.zmp_mm is None else f", ZMP off by {self.zmp_mm:.2g} mm"
-        return f"impulse {self.impulse_pct:+.2g} %{zmp}, by {self.by}"
+        return f"impulse {self.impulse_pct:+.2g} %{zmp}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

@@ -121,7 +121,7 @@ def optimize_strike(
     budget = budget.started()
     t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
-        start = carried_start(t, partial(_program_of, start), start, {}).x
+        start = carried_start(t, partial(_program_of, start), start, start.apart).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")

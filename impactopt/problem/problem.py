@@ -88,8 +88,9 @@ class ImpactProblem:
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
     collision : its model. "full", the whole equation of motion while the contact lasts; "sdc", with H, J and
         bias frozen at contact and ``freezes`` times on the way, as :class:`impactopt.SDC` has them;
-        "sdc-paper", with the terms of `SDC.paper`; "auto", the cheapest of "sdc" and "full" whose impulse
-        and ZMP the next one would change by less than ``auto_impulse_pct`` and ``auto_zmp_mm``. And impacts
+        "sdc-paper", with the terms of `SDC.paper`; "auto", "sdc" where it is good enough, else "full": where
+        full dynamics, at the plan's state at contact, would change the impulse by more than
+        ``auto_impulse_pct``, or the ZMP by more than ``auto_zmp_mm``. And impacts
         in no time, to compare with what others plan with, as they know nothing of torque, ZMP and servo
         meanwhile: "virtual-mass", with the restitution of two masses under the contact law, and "rigid",
         with ``coefficient_of_restitution`` (speed of separation over that of approach).

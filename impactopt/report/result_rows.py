@@ -118,7 +118,7 @@ def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
 
 
 def _model_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """The model of the collision that the plan has in it, and how far it is from the next one."""
+    """The model of the collision that the plan has in it, and how far it is from full dynamics."""
     plan, others = sources[0], (Cell(""),) * (len(sources) - 1)
     if (name := plan.get("collision_model")) is not None:
         freezes = plan.get("freezes") or 0

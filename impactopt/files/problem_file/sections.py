@@ -107,7 +107,7 @@ class Collision(Section):
         "model",
     )
     freezes: Freezes = optional('of the model "sdc", on the way')
-    auto_impulse_pct: Positive = optional('of "auto": by how much the next model may change the impulse [%]')
+    auto_impulse_pct: Positive = optional('of "auto": by how much full dynamics may change the impulse [%]')
     auto_zmp_mm: Positive = optional('of "auto": and the ZMP [mm]')
     coefficient_of_restitution: Restitution = optional('of the model "rigid"')
     contact_duration: ContactDuration = optional(

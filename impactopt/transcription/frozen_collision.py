@@ -67,6 +67,7 @@ class FrozenCollision(Collision):
         self.joined_way = add("hand travel in compression", joined, 1, **hand)
         self.begins = [add(f"hand speed, stretch {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
         self.frozen_at = [add(f"freeze {k}", 1, b.ny, labels=c.labels) for k in range(self.freezes)]
+        self.frozen_legs = [add(f"legs of freeze {k}", 1, b.nl, **legs) for k in range(self.freezes)]
         carried = int(not self.terms.bias and b.nw > 0)
         self.carried = add("sole wrench that carries", carried, b.nw, **b.limits.of_wrenches)
         self._meeting: InstantImpact | None = None
@@ -75,6 +76,7 @@ class FrozenCollision(Collision):
             mass = 1 / gives_way if gives_way > 0 else np.inf
             self._meeting = InstantImpact(b, contact, mass=mass, named=f"{self._named}meeting: ")
         self._stretches = [self._stretch(s) for s in stages]
+        self._legs_at: list[Affine] = []
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
 
     def _add_reference(self, count: int) -> None:
@@ -111,7 +113,8 @@ class FrozenCollision(Collision):
                 out = out + group[m] * w
             return out
 
-        return _Freeze(phase, place, self.frozen_at[k][0], value(self.u, u0), value(self.legs, state.legs))
+        self._legs_at.append(value(self.legs, state.legs))
+        return _Freeze(phase, place, self.frozen_at[k][0], value(self.u, u0), self.frozen_legs[k][0])
 
     def _element_at(self, phase: int, place: float) -> Stage:
         """A stage of the element that a place in a phase is in."""
@@ -236,10 +239,11 @@ class FrozenCollision(Collision):
     def held_over(self) -> list[Group]:
         met = [] if self._meeting is None else [self._meeting.du, self._meeting.w, self._meeting.blow]
         own = [*self._of_reference(), self.joined_way, self.carried]
-        return [*super().held_over(), *own, *self.begins, *self.frozen_at, *met]
+        return [*super().held_over(), *own, *self.begins, *self.frozen_at, *self.frozen_legs, *met]
 
     def determined(self) -> list[Determined]:
-        out = super().determined()
+        out = [determined(Turn.LIFTED, group.index(0)) for group in self.frozen_legs if group.size]
+        out += super().determined()
         for k in range(self.coast_legs.count):
             legs = [leg for g in self._of_reference() for leg in by_leg(g.index(k))]
             out += [determined(Turn.STAGE_LEGS, leg, j) for j, leg in enumerate(legs)]
@@ -277,6 +281,16 @@ class FrozenCollision(Collision):
                 measure=measure,
             )
             b.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
+        for group, legs in zip(self.frozen_legs, self._legs_at, strict=True):
+            b.rows.add(
+                term="state to freeze at",
+                place=group.name,
+                components=group.labels,
+                affine=legs - group[0],
+                lower=0,
+                upper=0,
+                measure=along(group.labels, "off"),
+            )
 
     def _reference_rows(self, start: int, size: int) -> None:
         b, part = self._b, self._b.parts("coasting")
@@ -330,6 +344,8 @@ class FrozenCollision(Collision):
             for group, value in zip(self._of_reference(), (there, *motion), strict=True):
                 x[group.index(k)] = value
         self.leg_rates.write(x, self.coast_rates.read(x)[:1])
+        for group in self.frozen_legs:
+            group.write(x, legs)
 
     def _speed(self, y: Array, rates: Array, legs: Array) -> float:
         """Of the hand along the normal [m/s]."""

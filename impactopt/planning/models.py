@@ -19,10 +19,12 @@ from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
 from impactopt.planning.solution import ModelError, Solved
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import VelocityLimit
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.guess import fastest
 from impactopt.transcription.start import carried_over, strike_rates
 
 Array = NDArray[np.float64]
@@ -31,7 +33,7 @@ AnySolution = TypeVar("AnySolution", bound=Solved)
 _OFTEN, _MOST = 8, 64
 _LADDER = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
 _HORIZON = 0.2  # [s] at least
-_GUESSED = 1.0  # [m/s] at which the first rung is chosen
+_SHARE, _GUESSED = 0.5, 1.0  # of the fastest blow, or [m/s] where there is none: how the first rung is chosen
 
 
 def model_error(t: ContactProgram, x: Array) -> ModelError | None:
@@ -120,12 +122,18 @@ def _silent(_: str) -> None:
 
 
 def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
-    """Whether the first rung is not good enough for a gentle blow in the posture that a search starts at."""
+    """Whether the first rung is not good enough in the posture that a search starts at.
+
+    Of a blow half as fast as the joints allow: a fast one moves the robot far while it lasts.
+    """
     first, c = replace(problem, collision=_LADDER[0]), problem.coordinates
     y, legs = c.split(problem.contact_posture)
+    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
+    most = fastest(c, problem.striker, problem.normal, problem.contact_posture, limit)
+    speed = _SHARE * most if np.isfinite(most) else _GUESSED
     try:
         legs = c.solve_legs(y, legs)
-        rates = strike_rates(c, problem.striker, y, legs, _GUESSED * problem.normal)
+        rates = strike_rates(c, problem.striker, y, legs, speed * problem.normal)
         q, v, _ = c.complete_motion(y, rates, np.zeros(c.ny), legs)
         torque = holding_torque(problem.robot, q, v, stance=problem.stance)
     except InputError:
@@ -133,7 +141,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     error = _error(first, q, v, torque, 0.05)
     if error is None or good_enough(problem, error):
         return False
-    say(f"{_LADDER[0]} at {_GUESSED:g} m/s: {error}, which is more than was asked for: {_LADDER[1]} at once")
+    say(f"{_LADDER[0]} at {speed:.2g} m/s: {error}, which is more than was asked for: {_LADDER[1]} at once")
     return True
 
 

@@ -21,6 +21,7 @@ from impactopt.errors import InputError
 from impactopt.planning.models import good_enough
 from impactopt.planning.solution import ModelError
 from impactopt.problem.problem import COLLISIONS, ImpactProblem
+from impactopt.problem.scenario import Scenario
 from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
 from impactopt.transcription.planned_strike import PlannedStrike
@@ -132,6 +133,20 @@ def test_nails_and_boards_too(name: str, model: str, freezes: int) -> None:
     assert solution.status.usable
     found = alone(solution.strike)
     assert solution.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+
+
+def test_scenarios_are_frozen_too() -> None:
+    """Each meets its own target, from the same state at contact."""
+    heavy = Scenario(name="heavy", mass=2.0)
+    problem = dataclasses.replace(arm_problem(), collision="sdc", collision_elements=FINE, scenarios=(heavy,))
+    _, strike = planned(problem)
+    (other,) = strike.scenarios
+    assert strike.impulse == pytest.approx(alone(strike).impulse, rel=IMPULSE)
+    target = FreeMass(**heavy.numbers(problem.law, problem.target)[1])
+    met = dataclasses.replace(problem, target=target, scenarios=())
+    found = alone(dataclasses.replace(strike, problem=met))
+    assert other.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+    assert abs(other.impulse / strike.impulse - 1) > 0.05
 
 
 def test_weight_and_legs_by_the_papers_terms() -> None:

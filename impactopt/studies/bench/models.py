@@ -15,6 +15,7 @@ from impactopt.files.problem_file import load_problem
 from impactopt.files.replay import has_mujoco
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.problem.checks import INSTANT
 from impactopt.problem.problem import ImpactProblem
 from impactopt.studies.report import Report, Say, columns_table
 
@@ -56,7 +57,7 @@ def run(
             say(f"{name}: {model}" + (f", {freezes} freezes" if freezes else ""))
             own = {**dict.fromkeys(KEYS), "problem": name, "model": model, "freezes": freezes}
             try:
-                rows.append({**own, **_row(replace(problem, collision=model, freezes=freezes), say)})
+                rows.append({**own, **_row(_with_model(problem, model, freezes), say)})
             except InputError as error:  # a model that does not know the law or the target stays in
                 rows.append({**own, "reason": str(error)})
     title = "plans by the model of their collision, replayed in full dynamics"
@@ -72,6 +73,12 @@ def run(
         tables=(columns_table(title, COLUMNS, rows),),
         figures={"models": picture},
     )
+
+
+def _with_model(problem: ImpactProblem, model: str, freezes: int) -> ImpactProblem:
+    """The problem with another model; those of no duration know no scenarios."""
+    known = () if model in INSTANT else problem.scenarios
+    return replace(problem, collision=model, freezes=freezes, scenarios=known)
 
 
 def _row(problem: ImpactProblem, say: Say) -> dict[str, Any]:

@@ -20,17 +20,9 @@ OFTEN = 16  # freezes of a saved result: a plan's contacts are long
 
 class Model(str, enum.Enum):
     sdc = "sdc"
-    paper = "paper"
+    paper = "sdc-paper"
     virtual_mass = "virtual-mass"
     full = "full"
-
-
-_MODELS = {
-    Model.sdc: "sdc",
-    Model.paper: "paper's sdc",
-    Model.virtual_mass: "virtual mass",
-    Model.full: "full dynamics",
-}
 
 
 def collide(
@@ -96,7 +88,7 @@ def collide(
             raise typer.BadParameter("a result has its own; leave it out", param_hint="--posture")
         changes = parse_settings(settings or ())
         read = problem_of_result(what).changed(changes) if saved else read_problem_file(what, changes)
-        at_contact: dict[str, Any] = {"model": _MODELS[model]}
+        at_contact: dict[str, Any] = {"model": model.value}
         if freezes is None and saved and model is Model.sdc:
             freezes = OFTEN
         at_contact |= {} if freezes is None else {"freezes": freezes}

@@ -121,6 +121,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         ("duration_s?", "collision_error_pct?", "nodes_added?", "motion_price_pct?", "capture_margin_m?"),
         _NUMBER,
     ),
+    **dict.fromkeys(("freezes?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
     "collision_elements?": ([(int,)], type(None)),
     "scenarios?": ([(_SCENARIO,)],),
     "simulated?": (_SIMULATED,),
@@ -128,7 +129,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "versions?": ({"*": _TEXT},),
     "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
-    **dict.fromkeys(("note?", "caution?", "command?"), _TEXT),
+    **dict.fromkeys(("note?", "caution?", "command?", "collision_model?"), _TEXT),
 }
 _DEEPEST = 20
 

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Program = TypeVar("Program", bound="ContactProgram")
 Starts = Iterable[tuple[str, Callable[[], Array | SolverResult]]]
 SOLVERS = ("sqp", "ipopt")
+EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
@@ -223,3 +224,13 @@ def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, 
 def _rank(result: SolverResult) -> tuple[bool, float]:
     met = result.status.usable or result.max_violation <= VIOLATED
     return not met, result.objective if met else result.max_violation
+
+
+def one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
+    """The new result, with the effort of both."""
+    later = tuple(
+        replace(r, iteration=old.iterations + r.iteration, seconds=old.seconds + r.seconds)
+        for r in new.history
+    )
+    effort = {key: getattr(old, key) + getattr(new, key) for key in EFFORT}
+    return replace(new, history=old.history + later, **effort)

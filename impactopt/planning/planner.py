@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.keeping_apart import DEEP, Margins, Violated, rows_near, rows_to_add, same_bodies
+from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     VIOLATED,
     Budget,
@@ -22,9 +23,11 @@ from impactopt.planning.multistart import (
     attempt_of,
     check_starts,
     drawn,
+    one_after_the_other,
     solve_from,
     violations_of,
 )
+from impactopt.planning.rounds import Round, more_of, start_of
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
 from impactopt.planning.verdict import second_look, with_reason
@@ -32,7 +35,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
-from impactopt.transcription.mesh import Elements
+from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.rattle import rattle
 from impactopt.transcription.start import carried_over, first_iterate, iterate_from_strike, strike_iterate
@@ -41,7 +44,6 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 _LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
 _BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
 _BARRIER_DEEP = 1e-3  # and breaks by far
@@ -88,12 +90,23 @@ def solve(
     """
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=not isinstance(start, str))
+    if problem.collision == "auto":
+        common: dict[str, Any] = {"solver": solver, "options": options, "between": between}
+        common |= {"report": report, "callback": callback}
+
+        def run(rung: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
+            if other is not None:
+                return solve(rung, start=other, time_limit=left, **common)
+            return solve(rung, start=start, starts=starts, seed=seed, time_limit=left, **common)
+
+        return climbed(problem, run, time_limit=time_limit, report=report)
     given: str | Array | SolverResult
     nodes: MoreNodes = NO_MORE
     elements: Elements = ()
+    shares: Shares = ()
     apart: Mapping[ApartRow, Held] = {}
     if isinstance(start, Solution):
-        given, nodes, elements = start.result, start.nodes, start.elements
+        given, nodes, elements, shares = start.result, start.nodes, start.elements, start.shares
         if start.problem.keeps_apart and same_bodies(problem, start.problem):
             apart = start.apart
     else:
@@ -106,7 +119,9 @@ def solve(
     began = time.perf_counter()
     functions = block_functions(problem, problem.coordinates, report, elements)
     budget = budget.started()
-    t = Transcription(problem, problem.coordinates, functions, nodes, elements)
+    t = Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
+    if isinstance(start, Solution):
+        given = carried_start(t, partial(_program_of, start), start, apart)
     if not isinstance(given, str):
         check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
     if report is not None:
@@ -125,11 +140,20 @@ def solve(
         plan=t.decode(result.x),
         nodes=t.nodes,
         elements=t.hit.elements if t.hit.guarded else (),
+        shares=t.hit.shares,
+        model_error=model_error(t, result.x) if result.status.usable else None,
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         rattle=rattle(t, result.x) if result.status.usable else None,
         apart=t.apart_rows,
         **fields,
     )
+
+
+def _program_of(solution: Solution) -> Transcription:
+    """The program of a solution, without rows between bodies."""
+    p = solution.problem
+    functions = block_functions(p, p.coordinates, None, solution.elements)
+    return Transcription(p, p.coordinates, functions, solution.nodes, solution.elements, solution.shares)
 
 
 def _on(
@@ -154,17 +178,6 @@ def _on(
         "objectives": finer.achieved(result.x),
         "attempts": tuple(attempts),
     }
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Round:
-    """A program that is to be solved next, and from where: from one after the other, until it is."""
-
-    program: Transcription
-    starts: tuple[Array | SolverResult, ...]
-    name: str
-    why: str
-    barrier: float | None = None
 
 
 class _Refining:
@@ -211,7 +224,7 @@ class _Refining:
     def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
         """A result without a verdict with that of another solver, from the same start."""
         new = second_look(self.budget, t.program, x0, result, self.report)
-        return result if new is result else _one_after_the_other(result, new)
+        return result if new is result else one_after_the_other(result, new)
 
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
@@ -243,8 +256,8 @@ class _Refining:
         last, result, _ = self.rounds(free, self.budget.run(free.program, x0), x0)
         result = self._judged(last, result)
         if result.status.usable:
-            return last, _one_after_the_other(stuck, result)
-        return t, _one_after_the_other(result, stuck)
+            return last, one_after_the_other(stuck, result)
+        return t, one_after_the_other(result, stuck)
 
     def rounds(
         self, t: Transcription, result: SolverResult, x0: Array
@@ -269,8 +282,8 @@ class _Refining:
             if not new.status.usable:
                 break
             if following.program.layout.n != len(x0):  # more nodes or elements: the start has them too
-                x0 = _start_of(following.program, t, x0)
-            t, result = following.program, _one_after_the_other(result, new)
+                x0 = start_of(following.program, t, x0)
+            t, result = following.program, one_after_the_other(result, new)
             found.append((t, following.name, new))
         return t, result, found
 
@@ -291,9 +304,9 @@ class _Refining:
                 return replace(result, status=Status.FAILED, max_violation=worst, message=message)
         return result
 
-    def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> _Round | None:
+    def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> Round | None:
         """What is to be solved next; None if the solution is right."""
-        nodes, violated = t.nodes, None
+        nodes, shares, violated = t.nodes, t.hit.shares, None
         elements: Elements | None = None
         error: ContactError | None = None
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
@@ -307,6 +320,9 @@ class _Refining:
                 nodes = nodes_to_add(t.decode(old.x), known)
             error = self.error(t, old.x)
             elements = refined_elements(error, t.hit.elements)
+            shares = t.hit.drifted(old.x) or shares
+            if shares != t.hit.shares:
+                elements = contact_elements(t.problem, shares)
         if violated is None and nodes == t.nodes and elements is None:
             return None
         rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
@@ -315,7 +331,7 @@ class _Refining:
             self._refined += 1
             finer_elements = elements or (t.hit.elements if t.hit.guarded else ())
             functions = block_functions(t.problem, t.coordinates, self.report, finer_elements)
-            finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements)
+            finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements, shares)
         finer = finer.with_apart(rows) if self.margins is not None else finer
         starts: tuple[Array | SolverResult, ...]
         if error is not None and error.missed:
@@ -325,8 +341,8 @@ class _Refining:
             starts = (replace(old, x=x, multipliers=y, bound_multipliers=z),)
         if violated is not None and finer.layout.n == len(old.x):
             starts = (*starts, old.x, x0)
-        name = _more(nodes, elements, len(rows) - len(t.apart_rows))
-        return _Round(
+        name = more_of(nodes, elements, len(rows) - len(t.apart_rows))
+        return Round(
             program=finer,
             starts=starts,
             barrier=None if violated is None else _BARRIER,
@@ -334,13 +350,13 @@ class _Refining:
             why=f"the plan is not what it says between nodes: {name}, and on from there",
         )
 
-    def _apart_again(self, t: Transcription, old: SolverResult, x0: Array, violated: Violated) -> _Round:
+    def _apart_again(self, t: Transcription, old: SolverResult, x0: Array, violated: Violated) -> Round:
         """On with rows between bodies that are deep in each other: from where they are, if that may lead out
         on the side they came in, and has not failed to, else from the start.
         """
         program = t.with_apart({**t.apart_rows, **violated.rows})
         words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
-        round_of = partial(_Round, program=program, name="rows between bodies")
+        round_of = partial(Round, program=program, name="rows between bodies")
         if violated.depth > _LOST or violated.deep & self._tried:
             self._tried = frozenset()
             return round_of(starts=(x0, old.x), why=f"{words}: from the start again, with rows between them")
@@ -349,29 +365,6 @@ class _Refining:
         warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
         why = f"{words}: on with rows between them"
         return round_of(starts=(warm, x0, old.x), why=why, barrier=_BARRIER_DEEP)
-
-
-def _start_of(finer: Transcription, t: Transcription, x0: Array) -> Array:
-    """What a program started from, for one with more nodes or elements."""
-    return carried_over(finer, t, x0, np.zeros(t.program.m), np.zeros(t.layout.n))[0]
-
-
-def _more(nodes: MoreNodes, elements: Elements | None, rows: int) -> str:
-    """What is more in a program, in words."""
-    words = [f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"] if nodes.total else []
-    words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
-    words += [f"{rows} more rows between bodies"] if rows else []
-    return ", ".join(words)
-
-
-def _one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
-    """The new result, with the effort of both."""
-    later = tuple(
-        replace(r, iteration=old.iterations + r.iteration, seconds=old.seconds + r.seconds)
-        for r in new.history
-    )
-    effort = {key: getattr(old, key) + getattr(new, key) for key in _EFFORT}
-    return replace(new, history=old.history + later, **effort)
 
 
 def _starts(

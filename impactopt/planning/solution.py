@@ -20,13 +20,29 @@ from impactopt.planning.multistart import Attempt
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
-from impactopt.transcription.mesh import Elements, contact_elements
+from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import Rattle
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelError:
+    """How far a model of the collision is from full dynamics, at a plan's state at contact.
+
+    impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
+    has no ZMP.
+    """
+
+    impulse_pct: float
+    zmp_mm: float | None
+
+    def __str__(self) -> str:
+        zmp = "" if self.zmp_mm is None else f", ZMP off by {self.zmp_mm:.2g} mm"
+        return f"impulse {self.impulse_pct:+.2g} %{zmp}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -39,6 +55,11 @@ class Solved:
     violations : rows that are not met, worst first.
     objectives : value of each of the problem's objectives, by name, in its own unit.
     attempts : result of each start.
+    model_error : estimated error of the model of the collision; None where nothing is frozen in it.
+    apart : rows of the program between bodies.
+    elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
+        they are finer than the problem asks for; and the share of each phase in the contact's time, where
+        something is frozen during contact. Else ().
     rattle : error of a plan in which a nail and a striker that rattle stay together; None if they do not
         rattle.
     """
@@ -52,6 +73,10 @@ class Solved:
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
     rattle: Rattle | None = None
+    model_error: ModelError | None = None
+    apart: Mapping[Any, Any] = field(default_factory=dict)
+    elements: Elements = ()
+    shares: Shares = ()
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -77,6 +102,10 @@ class Solved:
             "max_violation": self.result.max_violation,
             "violations": [{"row": v.what, "by": v.by, "amount": v.amount} for v in self.violations],
             "starts": [attempt.summary() for attempt in self.attempts],
+            "collision_model": self.problem.collision,
+            "freezes": self.problem.freezes,
+            "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
+            "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),
             **({} if self.rattle is None else {"caution": str(self.rattle)}),
         }
@@ -88,17 +117,13 @@ class Solution(Solved):
 
     plan : the motion; for a status that is not usable, that of the best iterate.
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
-    elements : lengths of the collocation elements of the contact's phases, as fractions of them, if they are
-        finer than the problem asks for; else ().
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    apart : rows of the program between bodies.  The rest: :class:`Solved`.
+    The rest: :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
-    apart: Mapping[Any, Any] = field(default_factory=dict)
-    elements: Elements = ()
     contact_error: ContactError | None = None
 
     @property
@@ -109,7 +134,7 @@ class Solution(Solved):
     @property
     def contact_elements(self) -> list[int]:
         """How many each phase of the contact has; none of an impact without duration."""
-        if self.problem.collision != "dynamics":
+        if not self.problem.lasts:
             return []
         return [len(phase) for phase in self.elements or contact_elements(self.problem)]
 

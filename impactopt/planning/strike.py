@@ -13,14 +13,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near
-from impactopt.planning.multistart import Budget, Starts, check_starts, drawn, solve_from
+from impactopt.planning.models import carried_start, climbed, model_error
+from impactopt.planning.multistart import (
+    Budget,
+    Starts,
+    check_starts,
+    drawn,
+    one_after_the_other,
+    solve_from,
+)
 from impactopt.planning.solution import Solved, blow_numbers, versions
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult
+from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import rattle
-from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.start import carried_over, strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
@@ -67,7 +76,7 @@ def optimize_strike(
     solver: str = "sqp",
     starts: int = 1,
     seed: int = 0,
-    start: ArrayLike | None = None,
+    start: ArrayLike | StrikeSolution | None = None,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
     report: Callable[[str], None] | None = None,
@@ -83,7 +92,7 @@ def optimize_strike(
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
         drawn by ``seed``; the best strike is kept. ``StrikeSolution.attempts`` has all.
-    start (n,) : solver variables to start from instead, such as ``result.x`` of a neighbouring problem.
+    start : to start from instead: solver variables (n,), or the solution of a neighbouring problem.
 
     Raises
     ------
@@ -94,10 +103,27 @@ def optimize_strike(
     check_starts(starts, seed, given=start is not None)
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
+    if problem.collision == "auto":
+        common: dict[str, Any] = {
+            "solver": solver,
+            "options": options,
+            "report": report,
+            "callback": callback,
+        }
+
+        def run(rung: ImpactProblem, other: StrikeSolution | None, left: float | None) -> StrikeSolution:
+            if other is not None:
+                return optimize_strike(rung, start=other, time_limit=left, **common)
+            return optimize_strike(rung, start=start, starts=starts, seed=seed, time_limit=left, **common)
+
+        return climbed(problem, run, time_limit=time_limit, report=report)
     began = time.perf_counter()
-    functions = block_functions(problem, problem.coordinates, report)
+    mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
+    functions = block_functions(problem, problem.coordinates, report, *mesh[:1])
     budget = budget.started()
-    t = StrikeTranscription(problem, problem.coordinates, functions)
+    t = StrikeTranscription(problem, problem.coordinates, functions, *mesh)
+    if isinstance(start, StrikeSolution):
+        start = carried_start(t, partial(_program_of, start), start, start.apart).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
@@ -107,7 +133,22 @@ def optimize_strike(
     )
     result = fields["result"] = with_reason(t, fields["result"])
     held = rattle(t, result.x) if result.status.usable else None
-    return StrikeSolution(strike=t.decode(result.x), rattle=held, **fields)
+    return StrikeSolution(
+        strike=t.decode(result.x),
+        rattle=held,
+        model_error=model_error(t, result.x) if result.status.usable else None,
+        elements=t.hit.elements if t.hit.guarded else (),
+        shares=t.hit.shares,
+        apart=t.apart_rows,
+        **fields,
+    )
+
+
+def _program_of(solution: StrikeSolution) -> StrikeTranscription:
+    """The program of a solution, without rows between bodies."""
+    p, elements = solution.problem, solution.elements
+    functions = block_functions(p, p.coordinates, None, elements)
+    return StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
 
 
 def clear_strike(
@@ -118,9 +159,9 @@ def clear_strike(
     """
     x0 = start.x if isinstance(start, SolverResult) else start
     if margins is None:
-        return t, budget.run(t.program, x0)
+        return _settled(budget, t, budget.run(t.program, x0))
     t = t.with_apart(rows_near(t, x0, margins, FAR))
-    result = budget.run(t.program, x0)
+    t, result = _settled(budget, t, budget.run(t.program, x0))
     for _ in range(ROUNDS):
         more = missing_rows(t, result.x, margins) if result.status.usable and budget.left != 0 else {}
         if not more:
@@ -130,6 +171,26 @@ def clear_strike(
         if not new.status.usable:
             break
         result = new
+    return t, result
+
+
+def _settled(
+    budget: Budget, t: StrikeTranscription, result: SolverResult
+) -> tuple[StrikeTranscription, SolverResult]:
+    """A strike whose freezes on the way come when they are to, by the time that its contact takes."""
+    for _ in range(ROUNDS):
+        shares = t.hit.drifted(result.x) if result.status.usable and budget.left != 0 else None
+        if shares is None:
+            break
+        elements = contact_elements(t.problem, shares)
+        functions = block_functions(t.problem, t.coordinates, None, elements)
+        finer = StrikeTranscription(t.problem, t.coordinates, functions, elements, shares)
+        finer = finer.with_apart(t.apart_rows)
+        x, *_ = carried_over(finer, t, result.x, result.multipliers, result.bound_multipliers)
+        new = budget.run(finer.program, x)
+        if not new.status.usable:
+            break
+        t, result = finer, one_after_the_other(result, new)
     return t, result
 
 

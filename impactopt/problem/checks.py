@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
-from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.errors import MOST, InputError, check_number, check_whole, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.terms import Term
 from impactopt.robots.robot import Robot
 
-__all__ = ["COLLISIONS", "check_apart", "check_at_rest", "check_collision", "check_names"]
+__all__ = ["COLLISIONS", "INSTANT", "check_apart", "check_at_rest", "check_collision", "check_names"]
 
-COLLISIONS = ("dynamics", "rigid", "virtual mass")
+# models of the collision, cheapest first; those of no duration; "auto": the cheapest that is good enough
+INSTANT = ("rigid", "virtual-mass")
+COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
+MOST_FREEZES = 64
 MANY = 100  # scenarios or obstacles
 
 
@@ -77,17 +80,19 @@ def check_collision(problem: Any) -> None:
         raise InputError(
             f'coefficient_of_restitution is for collision="rigid"; with {problem.collision!r} leave it out'
         )
-    if problem.collision == "virtual mass" and not isinstance(problem.law, SpringDamper):
+    check_freezes(problem)
+    if problem.collision == "virtual-mass" and not isinstance(problem.law, SpringDamper):
         raise InputError(
-            'collision="virtual mass" has a closed form for the law SpringDamper only, not '
+            'collision="virtual-mass" has a closed form for the law SpringDamper only, not '
             f"{type(problem.law).__name__}"
         )
-    if problem.collision != "dynamics" and not isinstance(problem.target, (FreeMass, RigidWall)):
+    instant = problem.collision in INSTANT
+    if instant and not isinstance(problem.target, (FreeMass, RigidWall)):
         raise InputError(
             f"collision={problem.collision!r} knows the targets FreeMass and RigidWall only, not "
-            f'{type(problem.target).__name__}; take collision="dynamics"'
+            f'{type(problem.target).__name__}; take collision="full"'
         )
-    if problem.collision == "dynamics":  # refuses what has switches
+    if not instant:  # refuses what has switches
         target = problem.target
         target.smooth([0.0] * target.n_states, 0.0, 0)
         if not target.turns and law.formula()[0] != law.formula()[1]:
@@ -96,6 +101,19 @@ def check_collision(problem: Any) -> None:
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
                 "approach and part several times in a blow"
             )
+
+
+def check_freezes(problem: Any) -> None:
+    """InputError for freezes of a model that has none, and for bounds of "auto" that are not positive."""
+    freezes = check_whole("freezes", problem.freezes, least=0, most=MOST_FREEZES)
+    object.__setattr__(problem, "freezes", freezes)
+    if freezes and problem.collision != "sdc":
+        raise InputError(f'freezes are for collision="sdc"; with {problem.collision!r} leave them out')
+    for name in ("auto_impulse_pct", "auto_zmp_mm"):
+        bound = check_number(name, getattr(problem, name))
+        object.__setattr__(problem, name, bound)
+        if not 0 < bound <= MOST:
+            raise InputError(f"{name} must be a number > 0, at most {MOST:g}, not {bound:g}")
 
 
 def check_names(robot: Robot, term: Term) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import Bodies
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.bodies.world import WorldBody, ground, obstacle_bodies, target_bodies
+from impactopt.collision.effects import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import (
@@ -24,15 +25,22 @@ from impactopt.errors import (
     check_name,
     check_number,
     check_whole,
-    raw_array,
     shortened,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import reach
 from impactopt.kinematics.stance import BothSoles, Stance
-from impactopt.problem.checks import COLLISIONS, check_apart, check_at_rest, check_collision, check_names
+from impactopt.problem.checks import (
+    COLLISIONS,
+    INSTANT,
+    check_apart,
+    check_at_rest,
+    check_collision,
+    check_names,
+)
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
+from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
@@ -52,46 +60,8 @@ __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)
 
-SHORTEST, LONGEST = 1e-3, 1e3  # [s] of a phase: no servo is faster, and no blow is prepared for longer
-FINEST = 2000  # intervals of a phase: nodes of a swing of 1 s come as often as a servo of 4 kHz samples
-STEEPEST = 1e3  # grading
 LONGEST_CONTACT = 100.0  # [s]
 MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
-
-
-@dataclass(frozen=True, kw_only=True)
-class Phase:
-    """A phase of the motion: its duration and its spline.
-
-    ``duration`` [s] : (shortest, longest), or one number.  ``intervals`` : how many the spline has.
-    ``grading`` : longest over shortest interval; the short ones are at the contact. The program's nodes are
-    the ends and the middles of the intervals.
-    """
-
-    duration: tuple[float, float]
-    intervals: int = 12
-    grading: float = 3.0
-
-    def __post_init__(self) -> None:
-        one = raw_array("a phase's duration [s]", self.duration).ndim == 0
-        given: Any = (self.duration,) * 2 if one else self.duration
-        duration = check_array("a phase's duration [s]", given, (None,)).tolist()
-        if len(duration) != 2 or not SHORTEST <= duration[0] <= duration[1] <= LONGEST:
-            raise InputError(
-                f"a phase's duration [s] is a number of {SHORTEST:g} to {LONGEST:g} or (shortest, longest), "
-                f"not {shortened(str(self.duration))}"
-            )
-        object.__setattr__(self, "duration", tuple(duration))
-        object.__setattr__(self, "grading", check_number("a phase's grading", self.grading))
-        if not 1 <= self.grading <= STEEPEST:
-            raise InputError(f"a phase's grading must be 1 to {STEEPEST:g}, not {self.grading:g}")
-        intervals = check_number("a phase's intervals", self.intervals)
-        if not 6 <= intervals <= FINEST or intervals != round(intervals):
-            raise InputError(
-                f"a phase needs 6 to {FINEST} spline intervals, a whole number, not "
-                f"{shortened(str(self.intervals))}"
-            )
-        object.__setattr__(self, "intervals", round(intervals))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,11 +87,14 @@ class ImpactProblem:
         fractions that sum to 1. With a `Nail` or a `Board` those of compression are used before and after the
         event, and every element is cut in two halves.
     collision_stages : 2 or 3, Radau IIA stages an element (order 3 or 5).
-    collision : the model of the impact. "dynamics": the whole equation of motion while the contact lasts.
-        "rigid": an impact without duration, with ``coefficient_of_restitution`` (speed of separation over
-        speed of approach). "virtual mass": likewise, with the restitution of two masses under the contact
-        law. The last two know nothing of torque, ZMP and servo during the impact. They are there to compare
-        with.
+    collision : the model of the impact. "full": the whole equation of motion while the contact lasts. "sdc":
+        H, J and bias are frozen at contact, and ``freezes`` times during it, as in :class:`impactopt.SDC`.
+        "sdc-paper": likewise, with the effects of `SDC.paper`. "auto": "sdc" where it is good enough, else
+        "full", where full dynamics at the plan's state at contact would change the impulse by more than
+        ``auto_impulse_pct`` or the ZMP by more than ``auto_zmp_mm``. Two impacts without duration are there
+        to compare with; they know nothing of torque, ZMP and servo meanwhile: "virtual-mass", with the
+        restitution of two masses under the contact law, and "rigid", with ``coefficient_of_restitution``
+        (speed of separation over speed of approach).
     scenarios : other targets, or none, that the robot has to survive with the same swing.
     body : the target's shape, which all of the robot but the striking point keeps off.
     obstacles : bodies in the world that the robot keeps off.
@@ -150,7 +123,10 @@ class ImpactProblem:
     contact_duration: tuple[float, float] = (0.0, 0.2)
     collision_elements: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.8), (1.0,))
     collision_stages: int = 3
-    collision: str = "dynamics"
+    collision: str = "full"
+    freezes: int = 0
+    auto_impulse_pct: float = 0.5
+    auto_zmp_mm: float = 2.0
     coefficient_of_restitution: float = 0.0
     scenarios: tuple[Scenario, ...] = ()
     body: TargetBody = field(default_factory=TargetBody)
@@ -228,8 +204,10 @@ class ImpactProblem:
         if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
             raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
         object.__setattr__(self, "scenarios", tuple(self.scenarios))
-        if self.scenarios and self.collision != "dynamics":
-            raise InputError(f'scenarios need collision="dynamics", not {self.collision!r}')
+        if self.scenarios and not self.lasts:
+            raise InputError(
+                f'scenarios need a contact that lasts, as collision="full", not {self.collision!r}'
+            )
         check_apart("scenario", [s.name for s in self.scenarios])
 
     def _check_world(self) -> None:
@@ -268,9 +246,9 @@ class ImpactProblem:
             raise InputError("HitCone takes the place of Incidence: give one of them")
 
     def _check_objectives(self) -> None:
-        lasts, stands = self.collision == "dynamics", self.robot.floating
+        stands = self.robot.floating
         turns = not isinstance(self.target, Target) or self.target.turns
-        checked = check_objectives(self.objectives, contact=lasts, turns=turns, balance=stands)
+        checked = check_objectives(self.objectives, contact=self.lasts, turns=turns, balance=stands)
         object.__setattr__(self, "objectives", checked)
 
     def _check_start(self) -> None:
@@ -278,6 +256,16 @@ class ImpactProblem:
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
         check_at_rest(self.robot, self.coordinates, self.stance.sole_names(self.robot), posture)
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the model of the collision gives the contact a duration."""
+        return self.collision not in INSTANT
+
+    @property
+    def frozen(self) -> Effects | None:
+        """The effects of a model of the collision with frozen dynamics; None of the others."""
+        return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
 
     @property
     def brake_after(self) -> float | None:
@@ -385,9 +373,11 @@ class ImpactProblem:
             "law": repr(self.law),
             "hash": self.hash,
         }
-        if self.collision != "dynamics":
-            restitution = f", restitution {self.coefficient_of_restitution:g}"
-            out["collision"] = self.collision + (restitution if self.collision == "rigid" else "")
+        if self.collision != "full":
+            more = {"rigid": f", restitution {self.coefficient_of_restitution:g}"}
+            if self.freezes:
+                more["sdc"] = f", {self.freezes} freezes"
+            out["collision"] = self.collision + more.get(self.collision, "")
         if self.scenarios:
             out["scenarios"] = [str(s) for s in self.scenarios]
         if self.objectives != DEFAULT_OBJECTIVES:

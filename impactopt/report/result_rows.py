@@ -82,6 +82,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("left uncertain by steps [%]", "step_error_pct", 3),
     ):
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
+    yield from _model_rows(sources)
     stands = [None, *(source.get("standing") for source in sources[1:])]
     yield _of_replays(_word_row("stands at the end", stands, no_is_bad=True))
 
@@ -114,6 +115,21 @@ def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
     yield _word_row("the board breaks", [target.get("broken") for target in targets])
+
+
+def _model_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    """The model of the collision that the plan has in it, and how far it is from full dynamics."""
+    plan, others = sources[0], (Cell(""),) * (len(sources) - 1)
+    if (name := plan.get("collision_model")) is not None:
+        freezes = plan.get("freezes") or 0
+        often = f", {freezes:g} freeze{'s' if freezes > 1 else ''} on the way" if freezes else ""
+        yield Row("model of the collision", (Cell(f"{name}{often}"), *others))
+    for label, key, digits in (
+        ("model error, impulse [%]", "model_error_pct", 2),
+        ("model error, ZMP [mm]", "model_error_zmp_mm", 1),
+    ):
+        row = number_row(label, [plan.get(key)], digits)
+        yield None if row is None else Row(row.label, (*row.cells, *others))
 
 
 def number_row(

@@ -97,6 +97,13 @@ def _margins(
     """What planning with margin costs in impulse, and what it buys in robustness, one option at a time."""
 
 
+@_command("models")
+def _models(
+    quick: Annotated[bool, typer.Option("--quick", help="The two arms only.")] = False,
+) -> None:
+    """Plan time against plan truth: every model of the collision in a push, a hammer's blow, G1, an arm."""
+
+
 @_command("fidelity")
 def _fidelity(
     workers: Compilers = 2,
@@ -213,6 +220,7 @@ def _all(
         "robustness": {"draws": draws, **drawn},
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
+        "models": {"quick": True},
         "fidelity": {"workers": workers, "quick": True},
         "freezes": drawn,
         "collision": {"quick": True},

@@ -21,6 +21,7 @@ BENCHES = {
     "replay": "replay",
     "baselines": "baselines",
     "margins": "margins",
+    "models": "models",
     "fidelity": "fidelity",
     "freezes": "freezes",
     "virtual-base": "virtual_base",

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from impactopt.collision import SDC, CollisionModel, VirtualMass
+from impactopt.collision import CollisionModel
+from impactopt.collision.rungs import frozen_model
 from impactopt.errors import InputError
 from impactopt.files.problem_file.mistakes import mistakes_of, report_mistakes
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.values import Positive
-from impactopt.kinematics.stance import FixedBase, Stance
+from impactopt.kinematics.stance import Stance
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 
 __all__ = ["AtContact", "check_at_contact", "collision_model"]
 
-_VIRTUAL_BASE = {"base_mass": 1e5, "base_inertia": 1e5}  # of the paper
 _FIRST_STEP = 1e-4  # [s] of the full dynamics, which halve it
 
 
@@ -43,7 +42,7 @@ class AtContact(Section):
     kp_scale: Positive = 1.0
     kd_scale: Positive = 1.0
     torque_limit_scale: Positive = 1.0
-    model: Literal["sdc", "paper's sdc", "virtual mass", "full dynamics"] = "sdc"
+    model: Literal["virtual-mass", "sdc-paper", "sdc", "full"] = "sdc"
     freezes: int = Field(default=0, ge=0)
     horizon: Positive = Field(default=0.2, alias="horizon_s")
 
@@ -85,11 +84,6 @@ def collision_model(
         "stance": stance,
         "horizon": section.horizon,
     }
-    if section.model == "virtual mass":
-        return VirtualMass(**options)
-    if section.model == "full dynamics":
+    if section.model == "full":
         return FullDynamics(**options, step=_FIRST_STEP)
-    if section.model == "sdc":
-        return SDC(**options, freezes=section.freezes, accuracy=accuracy)
-    soft: Any = stance if isinstance(stance, FixedBase) else replace(stance, **_VIRTUAL_BASE)  # type: ignore[type-var]
-    return SDC.paper(**{**options, "stance": soft})
+    return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)

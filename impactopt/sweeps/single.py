@@ -36,10 +36,10 @@ _STAYS = (
 _OWN_ERRORS = {
     "sdc": "H, J, the bias and the acceleration of the servo's reference are frozen {}; what it differs by "
     "from the plan and its replays is its own error",
-    "paper's sdc": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: of ZMP, "
+    "sdc-paper": "it has no servo stiffness, no feed-forward torque, no bias and no dJ/dt v: of ZMP, "
     "forces on soles and torques believe the plan and its replays",
-    "virtual mass": "a point mass, which no servo pushes on: believe the plan and its replays",
-    "full dynamics": "nothing is frozen; it differs from the replay on held soles by their steps, and from "
+    "virtual-mass": "a point mass, which no servo pushes on: believe the plan and its replays",
+    "full": "nothing is frozen; it differs from the replay on held soles by their steps, and from "
     "the plan by what that has between its collocation points",
 }
 

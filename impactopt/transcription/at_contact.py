@@ -15,9 +15,9 @@ from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
 from impactopt.transcription.apart import ApartRow, Held, add_apart_rows
 from impactopt.transcription.batched import Block
-from impactopt.transcription.blocks import DEPTH_SCALE
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact_blocks import DEPTH_SCALE
 from impactopt.transcription.elimination import Turn, by_choice, determined
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.impulse import InstantImpact

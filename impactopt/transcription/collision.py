@@ -7,21 +7,20 @@ feed-forward and the servo; durations, motion, force and wrenches are each one's
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from impactopt.errors import InputError
 from impactopt.problem.objectives import PeakForce
 from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
-from impactopt.transcription.blocks import FORCE_SCALE, typical_state
 from impactopt.transcription.builder import Builder
+from impactopt.transcription.collocated import Collocated
 from impactopt.transcription.contact import Contact
+from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import blow, effective_mass
+from impactopt.transcription.guess import blow, coasted, effective_mass
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import Stage
@@ -31,7 +30,7 @@ from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
 from impactopt.transcription.rows import Measure, Place, along, by_leg, percent, rates
 
 
-class Collision:
+class Collision(Collocated):
     """Variables and rows of the contact with one target.
 
     contact : what all start from.  stages : collocation points of its phases.
@@ -58,15 +57,15 @@ class Collision:
         self.number, self.scenario = number, scenario
         p, c, limits = b.problem, b.coordinates, b.limits
         phases = range(len(p.target.phases))
-        self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in phases]
-        named = f"{scenario.name}: " if scenario is not None else ""
+        self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in phases]
+        self._named = named = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.law, self.target = p.law.parameters, p.target.parameters
         if scenario is not None:
             self.law, self.target = scenario.numbers(p.law, p.target)
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
-        n = len(self.stages)
+        n = len(stages)
 
         def add(name: str, size: int, **options: Any) -> Group:
             return b.layout.add(named + name, n, size, **options)
@@ -80,8 +79,7 @@ class Collision:
             b.duration(f"{named}{name} duration", (least, longest), 0.01)
             for name, least in zip(p.target.phases, self.shortest, strict=True)
         ]
-        self.coast_legs = add("coasting legs", b.nl, labels=c.leg_labels)
-        self.coast_rates = add("coasting leg rates", b.nl, labels=c.leg_labels)
+        self._add_reference(n)
         self.u = add("collision rate", b.ny, labels=c.labels)
         self.d = add("collision travel", b.ny, labels=c.labels)
         self.legs = add("collision legs", b.nl, **limits.of_legs)
@@ -96,7 +94,7 @@ class Collision:
         most = np.where(last, 0.0, np.inf)
         self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
-        self.xt = add("target travel", 1)
+        self.xt = add("target travel", 1, labels=["target"])
         self.p = add("impulse so far", 1)
         self.w = add("collision sole wrench", b.nw, **limits.of_wrenches)
         joined = int(bool(p.target.guards))
@@ -104,6 +102,12 @@ class Collision:
         self.joined_x = b.layout.add(f"{named}target travel in compression", joined, 1)
         wanted = int(after is not None)
         self.after = b.layout.add(f"{named}position after contact", wanted, b.ny, **(after or {}))
+
+    def _add_reference(self, count: int) -> None:
+        """Variables of the legs of the reference: angles and rates, at so many instants."""
+        nl, add, labels = self._b.nl, self._b.layout.add, {"labels": self._b.coordinates.leg_labels}
+        self.coast_legs = add(f"{self._named}coasting legs", count, nl, **labels)
+        self.coast_rates = add(f"{self._named}coasting leg rates", count, nl, **labels)
 
     @property
     def impulse(self) -> Affine:
@@ -115,70 +119,92 @@ class Collision:
         """Of the target, at separation."""
         return self.state[self.end[-1]]
 
-    def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
-        """Time [s], travel and the target's travel in the phases before one, both divided by that time."""
-        if phase == 0:
-            return Affine.zeros(1), Affine.zeros(self._b.ny), Affine.zeros(1)
-        if phase == 1:
-            return self.T[0][0], self.d[self.end[0]], self.xt[self.end[0]]
-        return self.T[0][0] + self.T[1][0], self.joined[0], self.joined_x[0]
-
     def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         """Slots and parameters of each block's instances, one a stage."""
-        b, p, r = self._b, self._b.problem, self._b.robot
-        y, u0, ff = self.contact.state.y, self.contact.u0[0], self.contact.feedforward[0]
+        b, p = self._b, self._b.problem
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
         phases = np.column_stack([np.eye(len(self.end)), self.shortest])
         within = phases if p.target.guards else phases[:, :0]
-        gains = np.concatenate([r.kp, r.kd, r.torque_limit, b.limits.units])
-        coasting, collision, force, coasting_p, collision_p, force_p = [], [], [], [], [], []
+        collision, force, force_p = [], [], []
         for i, s in enumerate(self.stages):
-            u, u1 = self._slots(self.u, i, u0)
             state = self._slots(self.state, i, still)
             travelled = self._slots(self.xt, i, none, anew=True)
-            given = self._slots(self.p, i, none)[1]
-            T, (T1, d1, x1) = self.T[s.phase][0], self._before(s.phase)
-            coast, travel = [self.coast_legs[i], self.coast_rates[i]], [d1, T1, self.d[i], T]
-            hit = [self.legs[i], self.f[i], self.w[i]]
-            after = float(s.phase > 0)
-            coasting.append([y, u0, T1, T, *coast])
-            coasting_p.append([s.place, after])
-            collision.append([y, u0, *coast, ff, *travel, u, u1, *hit])
-            collision_p.append(np.concatenate([p.normal, [s.place, after], gains]))
-            force.append([y, *travel, u, self.f[i], *state, *travelled, x1, given])
+            given, x1 = self._slots(self.p, i, none)[1], self._before(s.phase)[2]
+            collision.append(self._dynamics(i))
+            force.append([*self._of_hand(i), self.f[i], *state, *travelled, x1, given])
             branch = [float(self._restitution(i)), *within[s.phase]]
             numbers = [*self.law.values(), *self.target.values()]
             force_p.append([*p.point, *p.normal, *branch, *numbers])
+        gains = np.concatenate([*self._gains(), b.robot.torque_limit, b.limits.units])
+        collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], gains]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
             "force": (force, force_p),
+            **self._reference(),
         }
-        if b.coordinates.legs:
-            out["coasting"] = coasting, coasting_p
         if p.target.guards:
-            out["join"] = self._join(), [np.zeros(0)] * (b.ny + 1)
+            join = self._join()
+            out["join"] = join, [np.zeros(0)] * len(join)
         return out
 
-    def _join(self) -> list[list[Affine]]:
-        """Slots of the block ``join``: ways in the first two phases of three as one."""
-        first, second = self.end[:2]
-        times = self.T[0][0], self.T[1][0]
-        ways = self.d[first], self.d[second], self.joined[0]
-        slots = [[*times, *(way[k : k + 1] for way in ways)] for k in range(self._b.ny)]
-        return [*slots, [*times, self.xt[first], self.xt[second], self.joined_x[0]]]
+    def _travel(self, i: int) -> list[Affine]:
+        """Slots of y = y0 + T1 d1 + T d at a stage."""
+        s = self.stages[i]
+        T1, d1, _ = self._before(s.phase)
+        return [d1, T1, self.d[i], self.T[s.phase][0]]
+
+    def _dynamics(self, i: int) -> list[Affine]:
+        """Slots of the block ``collision``."""
+        y, u0, ff = self.contact.state.y, self.contact.u0[0], self._feedforward()
+        coast = [self.coast_legs[i], self.coast_rates[i]]
+        hit = [self.legs[i], self.f[i], self.w[i]]
+        return [y, u0, *coast, ff, *self._travel(i), *self._slots(self.u, i, u0), *hit]
+
+    def _of_hand(self, i: int) -> list[Affine]:
+        """The slots of the block ``force`` that say where the hand is, and how fast."""
+        return [self.contact.state.y, *self._travel(i), self.u[i]]
+
+    def _feedforward(self) -> Affine:
+        """Torques over limit (n)."""
+        return self.contact.feedforward[0]
+
+    def integrated(self) -> list[tuple[Group, Group]]:
+        """Integrals over the phase so far, and what they are of."""
+        return [(self.d, self.u)]
+
+    def states(self) -> tuple[Group, ...]:
+        """What has a slope, and a value at contact, beside the rates of `integrated`."""
+        return self.state, self.xt, self.p
+
+    def held_over(self) -> list[Group]:
+        """What finer elements do not change."""
+        return [*self.T, self.joined, self.joined_x, self.after]
+
+    def _at_stage(self) -> tuple[Group, ...]:
+        """Legs at each collocation point, in the order of their rows."""
+        return self.coast_legs, self.coast_rates, self.legs
+
+    def loose(self) -> list[Group]:
+        """What has a value at each collocation point, and none that is known at contact."""
+        return [self.coast_legs, self.coast_rates, self.legs, self.f, self.w]
+
+    def _gains(self) -> tuple[Array, Array]:
+        """Kp and Kd."""
+        return self._b.robot.kp, self._b.robot.kd
+
+    def _reference(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        """Slots and parameters of the block ``coasting``."""
+        if not self._b.coordinates.legs:
+            return {}
+        start = [self.contact.state.y, self.contact.u0[0]]
+        slots = [
+            [*start, self._before(s.phase)[0], self.T[s.phase][0], self.coast_legs[i], self.coast_rates[i]]
+            for i, s in enumerate(self.stages)
+        ]
+        return {"coasting": (slots, [[s.place, float(s.phase > 0)] for s in self.stages])}
 
     def _restitution(self, i: int) -> bool:
         return self.stages[i].phase == len(self.end) - 1
-
-    def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
-        """Value and d/ds of a collocated group at stage i; ``start``: at contact; ``anew``: of each phase."""
-        s = self.stages[i]
-        slope = Affine.zeros(group.size)
-        for m, w in zip(s.members, s.weights, strict=True):
-            slope = slope + group[m] * w
-        begins = s.previous < 0 or (anew and s.new_phase)
-        before = start if begins else group[s.previous]
-        return group[i], slope + before * s.start
 
     def determined(self) -> list[Determined]:
         """Of each stage, leg by leg; and element by element what its rows determine.
@@ -187,19 +213,21 @@ class Collision:
         """
         out: list[Determined] = []
         for i in range(len(self.stages)):
-            legs = [leg for g in (self.coast_legs, self.coast_rates, self.legs) for leg in by_leg(g.index(i))]
+            legs = [leg for g in self._at_stage() for leg in by_leg(g.index(i))]
             out += [determined(Turn.STAGE_LEGS, leg, k) for k, leg in enumerate(legs)]
-        groups, last = (self.u, self.w, self.f, self.state, self.xt, self.p), self.end[-1]
+        ways, states = zip(*self.integrated(), strict=True)
+        groups = (*states, self.w, self.f, *self.states())
+        last = self.end[-1]
         step = 0
         for members in sorted({s.members for s in self.stages}):
             # the last force is given
             part = [g.index(i) for i in members for g in groups if g is not self.f or i != last]
-            out += [determined(Turn.ELEMENT, self.d.index(i), step) for i in members]
+            out += [determined(Turn.ELEMENT, way.index(i), step) for i in members for way in ways]
             out.append(determined(Turn.ELEMENT, np.concatenate(part), step + 1))
             step += 2
         if self.joined.count:
-            ways = np.concatenate([self.joined.index(0), self.joined_x.index(0)])
-            out.append(determined(Turn.ELEMENT, ways, step))
+            whole = np.concatenate([joined.index(0) for _, joined in self._ways()])
+            out.append(determined(Turn.ELEMENT, whole, step))
         if self.scenario is not None:
             out.append(determined(Turn.AFTER, self.after.index(0)))
         return out
@@ -209,15 +237,15 @@ class Collision:
         """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
         for i, s in enumerate(self.stages):
             place = self._place(s)
-            self._integral_rows(i, place)
+            for way, rate in self.integrated():
+                self._integral_rows(i, place, way, rate)
             first = {name: start + i * size for name, (start, size) in at.items()}
             self._dynamics_rows(i, place, first)
-        start, size = at["force"]
-        part, where = self._b.parts("force"), self.suffix.lstrip(", ")
-        target, order = self._b.problem.target, percent("off")
+        (start, size), order = at["force"], percent("off")
+        part, where, target = self._b.parts("force"), self.suffix.lstrip(", "), self._b.problem.target
         if target.guards:  # first, as they determine variables of their own
-            names = [*self._b.coordinates.labels, "target"]
-            outputs = at["join"][0] + np.arange(self._b.ny + 1)
+            names = [label for way, _ in self._ways() for label in way.labels]
+            outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
         ends = [(name, "target", k, "event", order) for k, name in enumerate(target.guards)]
         if target.turns:
@@ -227,33 +255,10 @@ class Collision:
         for term, component, k, name, measure in ends:
             self._b.equal(term, where, [component], start + self.end[k] * size + part[name], measure)
 
-    def _place(self, s: Stage) -> Place:
-        time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
-        suffix = self.suffix.replace("{", "{{").replace("}", "}}")
-        return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
-
-    def _integral_rows(self, i: int, place: Place) -> None:
-        """d is the integral of u in the phase so far."""
-        s, labels = self.stages[i], self._b.coordinates.labels
-        way = self.d[i]
-        for m, w in zip(s.members, s.quadrature, strict=True):
-            way = way - self.u[m] * w
-        if not s.new_phase:
-            way = way - self.d[s.previous]
-        self._b.rows.add(
-            term="collision kinematics",
-            place=place,
-            components=labels,
-            affine=way,
-            lower=0,
-            upper=0,
-            measure=rates(labels),
-        )
-
     def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         b, c, joints = self._b, self._b.coordinates, self._b.robot.joint_names
         closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
-        if c.legs:
+        if "coasting" in first:
             names = [*closure, *[f"{n} rate" for n in closure]]
             measures = [*along(closure, "off"), *rates(closure)]
             outputs = first["coasting"] + np.arange(len(names))
@@ -343,7 +348,6 @@ class Collision:
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)
         before = np.concatenate([[0.0], np.cumsum(times)])
-        elapsed = before[phase] + place * times[phase]
         per_time = (1 / found.durations[phase])[:, None]
         d = found.way[:, None] * per_time * rates
         self.u.write(x, found.speed[:, None] * rates)
@@ -357,27 +361,30 @@ class Collision:
             self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
             self.joined_x.write(x, (share * self.xt.read(x)[self.end[:2]]).sum(axis=0))
         self.after.write(x, y + float(found.way[self.end].sum()) * rates)
+        self.guess_model(x, y, rates, legs)
         if c.legs:
             self.legs.write(x, legs)
             self.w.write(x, self.contact.state.w.evaluate(x))
-            for k, at in enumerate(elapsed):
-                with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
-                    legs = c.solve_legs(y + rates * at, legs)
-                v = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)[1]
-                x[self.coast_legs.index(k)], x[self.coast_rates.index(k)] = legs, v[c.base + c.dependent]
+
+    def guess_model(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """What a model of the collision has for itself: here the legs of the reference."""
+        if not legs.size:
+            return
+        elapsed = np.ravel([self._time(s.phase, s.place).evaluate(x) for s in self.stages])
+        for k, (there, motion) in enumerate(coasted(self._b.coordinates, elapsed, y, rates, legs)):
+            x[self.coast_legs.index(k)], x[self.coast_rates.index(k)] = there, motion[0]
 
     def durations(self, x: Array) -> tuple[float, float]:
         """Compression and restitution [s]."""
-        *compression, restitution = (float(g.read(x)[0, 0]) for g in self.T)
-        return sum(compression), restitution
+        *before, last = (float(g.read(x)[0, 0]) for g in self.T)
+        return sum(before), last
 
     def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
         """The collision that solver variables (n,) stand for; ``outputs`` are the blocks'."""
         b, target = self._b, self._b.problem.target
         durations = [float(g.read(x)[0, 0]) for g in self.T]
         time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
-        first = float(b.problem.law.branch(0.0, approach, True, self.law))
-        wrench = self.w.read(x)
+        first, wrench = float(b.problem.law.branch(0.0, approach, True, self.law)), self.w.read(x)
         start = self.number * len(self.stages)  # of its instances in the blocks
         of_stages = slice(start, start + len(self.stages))
         torque = outputs["collision"][of_stages, b.parts("collision")["torque"]]
@@ -386,7 +393,7 @@ class Collision:
             time=np.array([0.0, *time]),
             force=np.array([first, *self.f.read(x)[:, 0]]),
             target_speed=np.array([0.0, *speed]),
-            torque=np.vstack([self.contact.feedforward.read(x), torque]) * b.robot.torque_limit,
+            torque=np.vstack([self._feedforward().evaluate(x), torque]) * b.robot.torque_limit,
             sole_wrench=wrench,
             ground=total_ground_wrench(b.coordinates, wrench),
             outcome=target.outcome(self.state.read(x)[-1], self.target),

@@ -16,10 +16,10 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from impactopt.transcription.at_contact import ContactProgram
-from impactopt.transcription.blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact import Contact, ContactState, add_coasting
+from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.finer_contact import carry_contact, same_places
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
@@ -114,7 +114,7 @@ class _Again:
         self._of, b = t.hit, Builder(t.problem, t.coordinates, t.functions)
         given = ContactState(*(Affine.constant(e.evaluate(x)) for e in t.hit.contact.state))
         self._builder = b
-        self.hit = Hit(b, Contact(given, *add_coasting(b)), halved(t.hit.elements), after=False)
+        self.hit = Hit(b, Contact(given, *add_coasting(b)), halved(t.hit.elements), t.hit.shares, after=False)
         self.hit.add_rows()
         # a plan has no law where contact ends, as force is zero there; here it is what it comes to
         last = len(self.hit.stages) - 1

@@ -28,6 +28,22 @@ class ExtraBlock:
     build: Callable[[], BlockExpression]
 
 
+def own_blocks(
+    problem: ImpactProblem, c: StanceCoordinates, edges: int = 0
+) -> dict[str, Callable[[], BlockExpression]]:
+    """Name -> what builds it, of all that a problem's program has in any case; ``edges`` : of its polygon."""
+    return builders(
+        c,
+        problem.striker,
+        problem.law,
+        problem.target,
+        edges,
+        instant=not problem.lasts,
+        frozen=problem.frozen,
+        freezes=problem.freezes,
+    )
+
+
 def extra_blocks(
     problem: ImpactProblem, c: StanceCoordinates, elements: Elements = ()
 ) -> dict[str, ExtraBlock]:
@@ -39,7 +55,7 @@ def extra_blocks(
     ------
     InputError : a name that is taken or none for a function, something else than a block.
     """
-    taken = {*builders(c, problem.striker, problem.law, problem.target, 0)}
+    taken = {*own_blocks(problem, c)}
     out: dict[str, ExtraBlock] = {}
     things: list[Term | Objective] = [*problem.objectives, *problem.terms]
     for thing in sorted(things, key=lambda t: not type(t).__module__.startswith("impactopt.")):

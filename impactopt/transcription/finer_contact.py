@@ -8,7 +8,7 @@ import numpy as np
 
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.layout import Array
-from impactopt.transcription.mesh import Stage
+from impactopt.transcription.mesh import Stage, lagrange
 
 
 def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None:
@@ -23,18 +23,15 @@ def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None
         of_old = np.vstack([getattr(old, name).read(x), at_contact])
         getattr(new, name).write(into, weights @ of_old)
     loose = _weights(new.stages, old.stages, known=False)[:, :-1]
-    for name in ("coast_legs", "coast_rates", "legs", "f", "w"):
-        getattr(new, name).write(into, loose @ getattr(old, name).read(x))
-    u = new.u.read(into)
-    d = np.zeros_like(u)
-    for i, s in enumerate(new.stages):  # by their rows, which are linear
-        d[i] = s.quadrature @ u[list(s.members)] + (0.0 if s.new_phase else d[s.previous])
-    new.d.write(into, d)
-    for mine, its in zip(
-        (*new.T, new.joined, new.joined_x, new.after),
-        (*old.T, old.joined, old.joined_x, old.after),
-        strict=True,
-    ):
+    for mine, its in zip(new.loose(), old.loose(), strict=True):
+        mine.write(into, loose @ its.read(x))
+    for way, rate in new.integrated():
+        u = rate.read(into)
+        d = np.zeros_like(u)
+        for i, s in enumerate(new.stages):  # by their rows, which are linear
+            d[i] = s.quadrature @ u[list(s.members)] + (0.0 if s.new_phase else d[s.previous])
+        way.write(into, d)
+    for mine, its in zip(new.held_over(), old.held_over(), strict=True):
         mine.write(into, its.read(x))
 
 
@@ -61,7 +58,5 @@ def _weights(new: Sequence[Stage], old: Sequence[Stage], *, anew: bool = False, 
             begins = first.previous < 0 or (anew and first.new_phase)
             at.append(len(old) if begins else first.previous)
             places.append(0.0 if first.new_phase else old[first.previous].place)
-        for k, place in zip(at, places, strict=True):
-            others = np.array([p for p in places if p != place])
-            out[i, k] = np.prod((s.place - others) / (place - others))
+        out[i, at] = lagrange(places, s.place)
     return out

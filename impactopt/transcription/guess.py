@@ -5,6 +5,8 @@ The law and the target are the true ones, switches and all, integrated by SciPy.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,7 @@ from scipy.optimize import linprog
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
+from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
 from impactopt.transcription.layout import Array
@@ -56,6 +59,17 @@ def effective_mass(
     v = c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
     mass = 1 / float(normal @ body.inverse_mass() @ normal)
     return mass, max(float(normal @ body.hand @ v), 0.1)
+
+
+def coasted(
+    c: StanceCoordinates, elapsed: Array, y: Array, rates: Array, legs: Array
+) -> Iterator[tuple[Array, tuple[Array, Array]]]:
+    """Legs of a robot that coasts, at times [s] since y: angles, and rates and accelerations; (nl,) each."""
+    for at in elapsed:
+        with contextlib.suppress(InputError):  # out of the legs' reach: the solver has to mend it
+            legs = c.solve_legs(y + rates * at, legs)
+        _, v, a = c.complete_motion(y + rates * at, rates, np.zeros(c.ny), legs)
+        yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
 
 
 def _ways(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array) -> tuple[Array, Array]:

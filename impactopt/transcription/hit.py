@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,23 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.elimination import Turn, determined
+from impactopt.transcription.frozen_collision import FrozenCollision
 from impactopt.transcription.guess import effective_mass
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Array
-from impactopt.transcription.mesh import Elements, contact_elements, contact_mesh
+from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
 from impactopt.transcription.rows import Index, percent
+
+DRIFT = 2e-3  # of the contact's time: how far a freeze may be from where it is asked for
 
 
 class Hit:
     """Takes what all collisions start from; hands them back.
 
     elements : lengths of each phase's; none: those that the problem asks for.
+    shares : of the contact's time that each phase lasts, by which freezes on the way come when they do; none:
+        those of a point mass.
     after : whether the position after the expected target is among the variables.
 
     Attributes
@@ -31,27 +37,34 @@ class Hit:
     contact : what all collisions start from.
     expected, scenarios : the collisions; all of them, the expected one first, are `collisions`.
     elements, stages : of every collision's phases, and their collocation points.
+    shares : of the phases, where something is frozen on the way.
     guarded : the elements are given, and finer, because a plan was wrong on others: it may have pulled within
         a phase.
     """
 
-    def __init__(self, b: Builder, contact: Contact, elements: Elements = (), *, after: bool) -> None:
+    def __init__(
+        self, b: Builder, contact: Contact, elements: Elements = (), shares: Shares = (), *, after: bool
+    ) -> None:
         p, self._b, self.contact = b.problem, b, contact
         self.guarded = bool(elements)
-        self.elements = elements or contact_elements(p)
+        self.shares = shares or (guessed_shares(p) if p.freezes else ())
+        self.elements = elements or contact_elements(p, self.shares)
         self.stages = contact_mesh(p, self.elements)
         self.scenarios: list[Collision] = []
         self.expected: Collision | InstantImpact
-        if p.collision == "dynamics":
+        if p.lasts:
             hit = [s for s in p.scenarios if not s.missing]
             common: dict[str, Any] = {"mass": self.mass, "guarded": self.guarded}
             labels = {"labels": b.coordinates.labels}
+            kind: Callable[..., Collision] = Collision
+            if p.frozen is not None:
+                kind = partial(FrozenCollision, shares=self.shares)
             self.scenarios = [
-                Collision(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
+                kind(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
                 for k, s in enumerate(hit, start=1)
             ]
             own = b.limits.of_y if after else None
-            self.expected = Collision(b, contact, self.stages, number=0, after=own, **common)
+            self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
         else:
             self.expected = InstantImpact(b, contact)
         self.collisions = [self.expected, *self.scenarios]
@@ -122,6 +135,18 @@ class Hit:
         self.contact.u0.write(x, rates)
         for collision in self.collisions:
             collision.guess(x, y, rates, legs)
+
+    def drifted(self, x: Array) -> Shares | None:
+        """The phases' shares of the contact's time in solver variables (n,), where freezes on the way went by
+        others; None where they did not.
+        """
+        if not self.shares or not isinstance(self.expected, Collision):
+            return None
+        times = np.concatenate([T.read(x)[0] for T in self.expected.T])
+        found = times / times.sum()
+        if np.abs(found - self.shares).max() <= DRIFT:
+            return None
+        return tuple(float(share) for share in found)
 
     def impulse(self, x: Array) -> float:
         """To the expected target [N s], for solver variables (n,)."""

@@ -2,7 +2,7 @@
 
 H (u+ - u-) = -J^T n I + J_c^T w, joints without torque: the generalized impulse balance. The impulse I comes
 from Newton's restitution ("rigid"), or from the two-mass collision of the virtual mass with the contact law
-("virtual mass"; paper, sec. 2 and fig. 1), in closed form for the spring-damper.
+("virtual-mass"; paper, sec. 2 and fig. 1), in closed form for the spring-damper.
 """
 
 from __future__ import annotations
@@ -15,25 +15,33 @@ from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.plan import PlannedCollision
 from impactopt.transcription.rows import Measure, percent
 
 
 class InstantImpact:
-    """Variables and rows of an impact in no time; no row of torque or wrench while it lasts."""
+    """Variables and rows of an impact in no time; no row of torque or wrench while it lasts.
 
-    def __init__(self, b: Builder, contact: Contact) -> None:
-        self._b, self.contact = b, contact
-        add, c = b.layout.add, b.coordinates
+    mass : of a target that hand and robot have met, when they move on together; None: the problem's, which
+    parts as its model of the collision says.  named : begin of the variables' names.
+    """
+
+    def __init__(self, b: Builder, contact: Contact, *, mass: float | None = None, named: str = "") -> None:
+        self._b, self.contact, self._meets = b, contact, mass is not None
+        c = b.coordinates
         self.target = b.problem.target
         # a wall takes any impulse without moving
-        self.mass = self.target.parameters.get("mass", np.inf)
-        self.du = add("change of rate", 1, b.ny, labels=c.labels)
-        self.blow = add("impulse", 1, 1, lower=1e-3, scale=10.0)
+        self.mass = self.target.parameters.get("mass", np.inf) if mass is None else mass
+
+        def add(name: str, size: int, **options: Any) -> Group:
+            return b.layout.add(named + name, 1, size, **options)
+
+        self.du = add("change of rate", b.ny, labels=c.labels)
+        self.blow = add("impulse", 1, lower=1e-3, scale=10.0)
         scale = 0.05 * b.limits.wrench_scale
-        self.w = add("impulsive sole wrench", 1, b.nw, **{**b.limits.of_wrenches, "scale": scale})
+        self.w = add("impulsive sole wrench", b.nw, **{**b.limits.of_wrenches, "scale": scale})
 
     @property
     def impulse(self) -> Affine:
@@ -49,7 +57,7 @@ class InstantImpact:
         """Slots and parameters of the block ``impact``."""
         b, p, state = self._b, self._b.problem, self.contact.state
         slots = [state.y, state.legs, self.contact.u0[0], self.du[0], self.w[0], self.blow[0]]
-        rigid = float(p.collision == "rigid")
+        rigid = float(self._meets or p.collision == "rigid")
         law = [p.law.parameters.get(name, 1.0) for name in ("stiffness", "damping")]
         numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
         return {"impact": ([slots], [np.concatenate([numbers, b.robot.torque_limit, b.limits.units])])}

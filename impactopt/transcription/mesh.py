@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 from impactopt.contact.targets import Target
 from impactopt.kinematics.splines import Radau
 from impactopt.problem.problem import ImpactProblem
+from impactopt.transcription.guess import blow, effective_mass
 
 Array = NDArray[np.float64]
 Elements = tuple[tuple[float, ...], ...]  # lengths of each phase's, as fractions of it
+Shares = tuple[
+    float, ...
+]  # of the contact's time that each phase lasts; where something is frozen on the way
+SNAP = 0.1  # of a stretch between freezes: an element is not shorter
 
 
 @dataclass(frozen=True)
@@ -64,10 +69,19 @@ def collision_mesh(
     return stages
 
 
-def contact_elements(problem: ImpactProblem) -> Elements:
+def lagrange(places: Sequence[float], at: float) -> Array:
+    """Weights (k,) of values at k places in the polynomial through them, at one place."""
+    x = np.asarray(places)
+    gaps, ahead = x[:, None] - x + np.eye(len(x)), at - x + np.zeros((len(x), 1))
+    np.fill_diagonal(ahead, 1.0)
+    return np.asarray(np.prod(ahead / gaps, axis=1))
+
+
+def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     """Those that a problem asks for, of each phase of its contact; halved if its target has events.
 
-    Where an event may come at once, the phase before it is one element.
+    Where an event may come at once, the phase before it is one element. Where something is frozen on the
+    way, stretches begin with elements; ``shares`` : if the phases' are not those of a point mass.
     """
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
@@ -75,7 +89,45 @@ def contact_elements(problem: ImpactProblem) -> Elements:
     before = [first] * (len(target.phases) - 1)
     if target.at_once:
         before[0] = (1.0,)
-    return (*before, last)
+    own = (*before, last)
+    if problem.freezes < 2:
+        return own
+    shares = shares or guessed_shares(problem)
+    begins = [place_of(k / problem.freezes, shares) for k in range(1, problem.freezes)]
+    return tuple(
+        _cut(lengths, [s for at, s in begins if at == phase], SNAP / (problem.freezes * share))
+        for phase, (lengths, share) in enumerate(zip(own, shares, strict=True))
+    )
+
+
+def guessed_shares(problem: ImpactProblem) -> Shares:
+    """Of the contact's time that each phase lasts, as a point mass meets the target."""
+    c, phases = problem.coordinates, len(problem.target.phases)
+    y, legs = c.split(problem.contact_posture)
+    mass = effective_mass(c, problem.striker, problem.normal, y, legs, np.zeros(c.ny))[0]
+    found = blow(problem.law, problem.target, mass, 1.0, np.arange(phases, dtype=np.intp), np.ones(phases))
+    return tuple(float(share) for share in found.durations / found.durations.sum())
+
+
+def place_of(fraction: float, shares: Shares) -> tuple[int, float]:
+    """Phase, and place in it, of a fraction of the contact's time."""
+    ends = np.cumsum(shares)
+    phase = min(int(np.searchsorted(ends, fraction)), len(ends) - 1)
+    return phase, float((fraction - ends[phase]) / shares[phase] + 1)
+
+
+def stretch_of(phase: int, begin: float, end: float, shares: Shares, freezes: int) -> int:
+    """Which of the stretches between freezes an element is of, that begins and ends at these places."""
+    before = float(np.cumsum([0.0, *shares])[phase])
+    middle = before + shares[phase] * (begin + end) / 2
+    return min(int(middle * freezes), freezes - 1)
+
+
+def _cut(lengths: tuple[float, ...], places: Sequence[float], near: float) -> tuple[float, ...]:
+    """Elements of a phase, cut at places but where an end is near; ends of its own that are near give way."""
+    kept = [s for s in places if near < s < 1 - near]
+    own = [s for s in np.cumsum(lengths)[:-1] if min((abs(s - k) for k in kept), default=1.0) > near]
+    return tuple(float(h) for h in np.diff([0.0, *sorted([*own, *kept]), 1.0]))
 
 
 def halved(elements: Elements) -> Elements:

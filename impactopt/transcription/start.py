@@ -22,6 +22,9 @@ from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 
+# ends of names of variables that models of the collision have each for itself
+OF_MODEL = ("coasting legs", "coasting leg rates")
+
 
 def strike_rates(
     c: StanceCoordinates, striker: str, y: Array, legs: Array, velocity: Array, *, base: float = 0.3
@@ -121,15 +124,18 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
     return _finished(t, out)
 
 
-def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
-    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements.
+def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
+    """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements,
+    or of another model of the collision that lasts.
 
     What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
     multipliers are those of the same rows and variables.
     """
     stages = same_places(t.hit.stages, old.hit.stages)
-    places = {"swing": (old.swing_nodes, t.swing_nodes)}
-    places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
+    places = {}
+    if isinstance(t, Transcription) and isinstance(old, Transcription):
+        places = {"swing": (old.swing_nodes, t.swing_nodes)}
+        places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
     for name, group in t.layout.groups.items():
         known = old.layout.groups.get(name)
@@ -139,6 +145,8 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
             _carry_by_label(group, known, (new, x), (bounds, z))
             continue
         pairs = [(k, k) for k in range(group.count)]
+        if name.endswith(OF_MODEL) and _model(t) != _model(old):
+            continue
         if name.split()[0] in places and known.count != group.count:
             before, now = places[name.split()[0]]
             pairs = [(int(i), k) for k, i in enumerate(np.flatnonzero(np.isin(now, before)))]
@@ -150,7 +158,12 @@ def carried_over(t: Transcription, old: Transcription, x: Array, y: Array, z: Ar
         for i, k in pairs:
             bounds[group.index(i)] = z[known.index(k)]
     for mine, its in zip(t.hit.collisions, old.hit.collisions, strict=True):
-        if t.hit.elements != old.hit.elements and isinstance(mine, Collision) and isinstance(its, Collision):
+        if not isinstance(mine, Collision) or not isinstance(its, Collision):
+            continue
+        if _model(t) != _model(old):
+            state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
+            mine.guess_model(new, *state)
+        elif t.hit.elements != old.hit.elements:
             carry_contact(mine, its, new, x)
     of_rows = dict(zip(_keys(old), y, strict=True))
     rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
@@ -169,7 +182,11 @@ def _carry_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -
             new[group.index(k)[there]] = old[known.index(k)[here]]
 
 
-def _keys(t: Transcription) -> Iterator[tuple[str, str, str, int]]:
+def _model(t: ContactProgram) -> tuple[str, int]:
+    return t.problem.collision, t.problem.freezes
+
+
+def _keys(t: ContactProgram) -> Iterator[tuple[str, str, str, int]]:
     """What a row is, and how many of that name come before it."""
     seen: dict[tuple[str, str, str], int] = {}
     for row in t.program.origins:

@@ -21,6 +21,7 @@ from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact import Contact, ContactState, add_coasting
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, wrench_prices
 from impactopt.transcription.plan import total_ground_wrench
@@ -34,10 +35,16 @@ class StrikeTranscription(ContactProgram):
     """The program of one problem's strike, with the groups that its solution is read from.
 
     Terms and objectives are the problem's, but for those that only a whole motion has.
+    elements, shares : of the contact, as of `Hit`.
     """
 
     def __init__(
-        self, problem: ImpactProblem, coordinates: StanceCoordinates, functions: dict[str, Any]
+        self,
+        problem: ImpactProblem,
+        coordinates: StanceCoordinates,
+        functions: dict[str, Any],
+        elements: Elements = (),
+        shares: Shares = (),
     ) -> None:
         b, c = Builder(problem, coordinates, functions), coordinates
         add, limits = b.layout.add, b.limits
@@ -49,7 +56,7 @@ class StrikeTranscription(ContactProgram):
         coasting = add_coasting(b, {"lower": -fastest, "upper": fastest})
         still, one = Affine.zeros(b.ny), Affine.constant(1.0)
         state = ContactState(self.y[0], coasting.u0[0], still, one, self.legs[0], self.w[0])
-        super().__init__(b, Hit(b, Contact(state, *coasting), after=True))
+        super().__init__(b, Hit(b, Contact(state, *coasting), elements, shares, after=True))
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
         self.hit.add_feedforward_rows(torque)

@@ -20,21 +20,21 @@ from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription import blocks as symbolic
 from impactopt.transcription.apart import apart_functions
 from impactopt.transcription.at_contact import BodyState, ContactProgram
 from impactopt.transcription.balance import add_balance
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.clearance import add_clearance
 from impactopt.transcription.contact import Contact, add_coasting
+from impactopt.transcription.contact_blocks import typical_state
 from impactopt.transcription.courses import TorqueCourse, torque_courses
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.extra_blocks import ExtraBlock, extra_blocks
+from impactopt.transcription.extra_blocks import ExtraBlock, extra_blocks, own_blocks
 from impactopt.transcription.follow import Brake, FollowThrough
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.lanes import in_lanes
 from impactopt.transcription.layout import Affine, Array, Group
-from impactopt.transcription.mesh import Elements
+from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, motion_prices
@@ -68,11 +68,14 @@ def block_functions(
         edges,
     )
     target = problem.target
-    contact = (problem.law.formula(), target.formula(), symbolic.typical_state(target))
+    frozen = () if problem.frozen is None else (problem.frozen,)
+    contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     out: dict[str, Any] = {}
-    instant = problem.collision != "dynamics"
-    builders = symbolic.builders(coordinates, problem.striker, problem.law, target, edges, instant=instant)
-    found = {name: ExtraBlock(contact if name == "force" else (), build) for name, build in builders.items()}
+    keys = {"force": contact, "collision": frozen, "coasting": frozen}
+    found = {
+        name: ExtraBlock(keys.get(name, ()), build)
+        for name, build in own_blocks(problem, coordinates, edges).items()
+    }
     for name, block in {**found, **extra_blocks(problem, coordinates, elements)}.items():
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
@@ -88,7 +91,7 @@ class Transcription(ContactProgram):
     """The program of one problem, with the parts that its solution is read from.
 
     nodes : beside the ends and middles of the splines' intervals.
-    elements : of the contact; none: those that the problem asks for.
+    elements, shares : of the contact, as of `Hit`.
 
     Attributes
     ----------
@@ -105,11 +108,12 @@ class Transcription(ContactProgram):
         functions: dict[str, Any],
         nodes: MoreNodes = NO_MORE,
         elements: Elements = (),
+        shares: Shares = (),
     ) -> None:
         b, self.nodes = Builder(problem, coordinates, functions), nodes
         self.swing = Swing(b, nodes.swing)
         contact = Contact(self.swing.end, *add_coasting(b))
-        super().__init__(b, Hit(b, contact, elements, after=False))
+        super().__init__(b, Hit(b, contact, elements, shares, after=False))
         self.follow = FollowThrough(b, nodes.follow)
         after = problem.brake_after
         self.brake = None if after is None else Brake(b, nodes.follow, after=after)

@@ -37,7 +37,7 @@ from impactopt.files.problem_file.changes import parse_settings
 from impactopt.files.problem_file.mistakes import key_lines
 from impactopt.files.problem_file.names import problem_file
 from impactopt.kinematics.held import holding_torque, striking_velocity
-from impactopt.problem.problem import FINEST
+from impactopt.problem.phase import FINEST
 from impactopt.report.page import html_page
 from impactopt.simulation import simulate
 from impactopt.solvers.sqp.ordering import elimination_blocks

@@ -107,7 +107,7 @@ def test_many_collisions_have_the_column_unless_others_are_named(monkeypatch: py
     monkeypatch.setattr(SDC, "_freeze_error", None)
     named = collide_many("arm_planar", rows, at_contact=state, outputs=["impulse_Ns"])
     np.testing.assert_array_equal(named["impulse_Ns"], found["impulse_Ns"])
-    many = collide_many("arm_planar", rows, at_contact={**state, "model": "virtual mass"})
+    many = collide_many("arm_planar", rows, at_contact={**state, "model": "virtual-mass"})
     assert (many["reason"] == "").all() and np.isnan(many["freeze_error_pct"]).all()
 
 

@@ -181,7 +181,7 @@ price = 50.0
     assert problem.contact_duration == (0.004, 0.1)
     assert problem.collision_stages == 3
     assert problem.collision_elements == (default, (0.25, 0.75))
-    assert (problem.collision, problem.coefficient_of_restitution) == ("dynamics", 0.0)
+    assert (problem.collision, problem.coefficient_of_restitution) == ("full", 0.0)
     assert problem.scenarios == (
         Scenario(
             name="all of it",
@@ -464,11 +464,11 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
     problem = load_problem(write(tmp_path, GOOD + rigid))
     assert (problem.collision, problem.coefficient_of_restitution) == ("rigid", 0.4)
     assert problem.collision_elements == ImpactProblem.collision_elements
-    problem = load_problem(write(tmp_path, GOOD + '[collision]\nmodel = "virtual mass"\n'))
-    assert problem.collision == "virtual mass"
+    problem = load_problem(write(tmp_path, GOOD + '[collision]\nmodel = "virtual-mass"\n'))
+    assert problem.collision == "virtual-mass"
     for name in COLLISIONS:
         load_problem(write(tmp_path, GOOD + f'[collision]\nmodel = "{name}"\n'))
-    assert "leave it out" in message(write(tmp_path, GOOD + rigid.replace('"rigid"', '"dynamics"')))
+    assert "leave it out" in message(write(tmp_path, GOOD + rigid.replace('"rigid"', '"full"')))
     scenario = "[[scenarios]]\nname = 'a'\n"
     assert "scenarios need" in message(write(tmp_path, GOOD + rigid + scenario))
     assert "two scenarios are called 'a'" in message(write(tmp_path, GOOD + 2 * scenario))
@@ -515,7 +515,7 @@ def test_the_collisions_model_reaches_the_problem(tmp_path: Path) -> None:
         (
             "[target]",
             "[collision]\nmodel = 'rigit'\n[target]",
-            ["line 8", "[collision] model", "did you mean 'rigid'", "'virtual mass'"],
+            ["line 8", "[collision] model", "did you mean 'rigid'", "'virtual-mass'"],
         ),
         (
             "[target]",

@@ -222,7 +222,7 @@ def test_impacts_without_duration_and_one_foot_come_back() -> None:
     punch = load_problem("punch_one_foot")
     for changes in (
         {"collision": "rigid", "coefficient_of_restitution": 0.3, "scenarios": ()},
-        {"collision": "virtual mass", "scenarios": ()},
+        {"collision": "virtual-mass", "scenarios": ()},
         {"terms": (terms.SelfCollision(margin=0.02), terms.KeepOut())},
         {"terms": (terms.SelfCollision(), terms.KeepOut(enabled=False))},
         {"stance": OneSole("left")},

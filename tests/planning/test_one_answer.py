@@ -300,7 +300,7 @@ def test_a_result_has_one_answer(name: str, kind: str, tmp_path: Path, punch: So
     def answer(model: str, **more: Any) -> dict[str, Any]:
         return collide_once(file, {"result": str(result), "model": model, **more})
 
-    full = answer("full dynamics")
+    full = answer("full")
     assert set(full["saved"]) == ({"planned", "simulated"} if kind == "solve" else {"planned"})
     within(full, full["saved"]["planned"], OF_MOTION if kind == "solve" else OF_PLAN, weight)
     if kind == "solve":
@@ -316,7 +316,7 @@ def test_a_result_has_one_answer(name: str, kind: str, tmp_path: Path, punch: So
     )
     # rungs that leave out the servo's stiffness, feed-forward and more say that it is theirs
     # (the paper's steps are too long for the arms' contacts, and refused)
-    for model in ("virtual mass", *(["paper's sdc"] if robot.floating else [])):
+    for model in ("virtual-mass", *(["sdc-paper"] if robot.floating else [])):
         assert "believe the plan" in answer(model)["believe"]
 
 

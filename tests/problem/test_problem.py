@@ -173,18 +173,18 @@ def test_a_fixed_base_holds_no_soles() -> None:
         ({"stance": BothSoles(base_mass=1e6, base_inertia=1e6)}, "virtual base"),
         (
             {"collision": "rigd"},
-            "unknown collision 'rigd'.*did you mean 'rigid'.*dynamics, rigid, virtual mass",
+            "unknown collision 'rigd'.*did you mean 'rigid'.*rigid, virtual-mass, sdc-paper, sdc, full, auto",
         ),
         ({"collision": "rigid", "coefficient_of_restitution": -0.1}, "between 0 and 1, not -0.1"),
         ({"collision": "rigid", "coefficient_of_restitution": 1.1}, "between 0 and 1, not 1.1"),
         ({"collision": "rigid", "coefficient_of_restitution": np.nan}, "coefficient_of_restitution: nan"),
-        ({"coefficient_of_restitution": 0.5}, "for collision=\"rigid\"; with 'dynamics' leave it out"),
+        ({"coefficient_of_restitution": 0.5}, "for collision=\"rigid\"; with 'full' leave it out"),
         (
-            {"collision": "virtual mass", "coefficient_of_restitution": 0.5},
-            "with 'virtual mass' leave it out",
+            {"collision": "virtual-mass", "coefficient_of_restitution": 0.5},
+            "with 'virtual-mass' leave it out",
         ),
-        ({"collision": "virtual mass", "law": Spring(rate=1e4)}, "SpringDamper only, not Spring"),
-        ({"collision": "rigid", "scenarios": (Scenario(name="a"),)}, "scenarios need.*dynamics.*not 'rigid'"),
+        ({"collision": "virtual-mass", "law": Spring(rate=1e4)}, "SpringDamper only, not Spring"),
+        ({"collision": "rigid", "scenarios": (Scenario(name="a"),)}, "scenarios need.*full.*not 'rigid'"),
         ({"scenarios": (Scenario(name="a"), Scenario(name="a", mass=2.0))}, "two scenarios are called 'a'"),
         ({"scenarios": Scenario(name="a")}, r"a tuple of Scenario, not Scenario\("),
         ({"scenarios": ("heavy",)}, r"a tuple of Scenario, not \('heavy',\)"),
@@ -341,7 +341,7 @@ def test_scenarios_and_the_collision_are_described(robot: Robot) -> None:
     json.dumps(p.describe())
     rigid = problem(robot, collision="rigid", coefficient_of_restitution=0.25)
     assert rigid.describe()["collision"] == "rigid, restitution 0.25"
-    assert problem(robot, collision="virtual mass").describe()["collision"] == "virtual mass"
+    assert problem(robot, collision="virtual-mass").describe()["collision"] == "virtual-mass"
 
 
 def test_balance_may_ask_for_nothing() -> None:

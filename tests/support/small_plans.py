@@ -25,9 +25,10 @@ from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.apart import LENGTHS, apart
 from impactopt.transcription.blocks import BlockExpression, builders
-from impactopt.transcription.extra_blocks import extra_blocks
+from impactopt.transcription.extra_blocks import extra_blocks, own_blocks
 from impactopt.transcription.plan import Plan, Trajectory
 from impactopt.transcription.start import first_iterate
+from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.transcription import Transcription
 from support.small_robots import arm, biped, striking_point
@@ -76,9 +77,20 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     c = problem.coordinates
     edges = len(support_polygon(problem.robot, c))
     found: dict[str, Callable[[], BlockExpression]] = {f"apart{n}": partial(apart, n) for n in LENGTHS}
+    if problem.frozen is not None:
+        return Transcription(
+            problem, c, _functions(found | own_blocks(problem, c, edges)) | _extra_functions(problem)
+        )
     for instant in (False, True):
         found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant)
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
+
+
+def struck(problem: ImpactProblem) -> StrikeTranscription:
+    """The problem's strike; only the blocks of its own model of the collision are built."""
+    c = problem.coordinates
+    own = own_blocks(problem, c, len(support_polygon(problem.robot, c)))
+    return StrikeTranscription(problem, c, _functions(own) | _extra_functions(problem))
 
 
 def _functions(builders: Mapping[str, Callable[[], BlockExpression]]) -> dict[str, Any]:

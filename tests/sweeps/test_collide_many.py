@@ -130,7 +130,7 @@ def test_of_a_robot_on_soles_with_its_margins() -> None:
 
 
 def test_structure_may_differ_from_row_to_row() -> None:
-    models = ["sdc", "virtual mass", "paper's sdc", "sdc"]
+    models = ["sdc", "virtual-mass", "sdc-paper", "sdc"]
     columns = {"at_contact.model": models, "target.mass": [0.5, 0.5, 0.5, 2.0], "at_contact.speed": [1.0]}
     found = collide_many(arm_file(), columns)["impulse_Ns"]
     for i, name in enumerate(models):
@@ -142,7 +142,7 @@ def test_structure_may_differ_from_row_to_row() -> None:
 
 def test_freezes_come_near_the_full_dynamics() -> None:
     given = {"posture": "ready", "speed_m_s": 1.5, "horizon_s": 0.1}
-    true = collide_many(arm_file(), {"at_contact.model": ["full dynamics"]}, at_contact=given)["impulse_Ns"]
+    true = collide_many(arm_file(), {"at_contact.model": ["full"]}, at_contact=given)["impulse_Ns"]
     near = collide_many(arm_file(), {"at_contact.freezes": [2, 4, 8]}, at_contact=given)["impulse_Ns"]
     errors = np.abs(near / true - 1)
     assert all(two < one for one, two in pairwise(errors))
@@ -279,7 +279,7 @@ def test_what_is_impossible_says_why() -> None:
         ({"target.mass": [1.0], "target.mass_kg": [1.0]}, {}, "two columns are of one key"),
         ({}, {"posture": "redy"}, "did you mean 'ready'"),
         ({}, {"posture": "ready", "result": "there"}, "give one of them"),
-        ({}, {"model": "virtual mass", "freezes": 2}, "freezes"),
+        ({}, {"model": "virtual-mass", "freezes": 2}, "freezes"),
     ],
 )
 def test_mistakes_are_told_before_work_starts(

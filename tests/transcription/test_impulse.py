@@ -22,7 +22,7 @@ from impactopt.problem.terms import TorqueLimit
 from impactopt.report.console import result_table
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
-from impactopt.transcription.blocks import two_mass_restitution
+from impactopt.transcription.contact_blocks import two_mass_restitution
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.transcription import Transcription
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 RESTITUTION = 0.3
 KINDS: dict[str, dict[str, Any]] = {
     "rigid": {"collision": "rigid", "coefficient_of_restitution": RESTITUTION},
-    "virtual mass": {"collision": "virtual mass"},
+    "virtual-mass": {"collision": "virtual-mass"},
 }
 
 
@@ -184,7 +184,7 @@ def in_soles_axes(problem: ImpactProblem, q: Array, wrench: Array) -> Array:
 # ---- plans
 
 
-@pytest.fixture(scope="module", params=[("arm", "rigid"), ("arm", "virtual mass"), ("biped", "virtual mass")])
+@pytest.fixture(scope="module", params=[("arm", "rigid"), ("arm", "virtual-mass"), ("biped", "virtual-mass")])
 def solved(request: pytest.FixtureRequest) -> Planned:
     who, kind = request.param
     transcription = changed(request.getfixturevalue(f"{who}_transcription"), **KINDS[kind])

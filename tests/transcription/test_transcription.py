@@ -43,7 +43,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         )
     },
     "rigid": {"collision": "rigid", "coefficient_of_restitution": 0.3},
-    "virtual mass": {"collision": "virtual mass"},
+    "virtual-mass": {"collision": "virtual-mass"},
 }
 
 

@@ -29,7 +29,9 @@ from impactopt.files.problem_file.values import (
     ContactDuration,
     Duration,
     Fractions,
+    Freezes,
     NotNegative,
+    Positive,
     Posture,
     Preset,
     Restitution,
@@ -100,9 +102,14 @@ class FollowSection(PhaseSection):
 class CollisionSection(Section):
     """How the collision is modelled and discretized."""
 
-    collision: Literal["dynamics", "rigid", "virtual mass"] = optional(
-        '"dynamics": the whole equation of motion; or an impact without duration, to compare with', "model"
+    collision: Literal["rigid", "virtual-mass", "sdc-paper", "sdc", "full", "auto"] = optional(
+        '"full": the whole equation of motion; "sdc": frozen at contact; "sdc-paper": so, by the paper; '
+        '"auto": the cheapest that is good enough; "virtual-mass", "rigid": no duration, to compare with',
+        "model",
     )
+    freezes: Freezes = optional('of the model "sdc", during contact')
+    auto_impulse_pct: Positive = optional('of "auto": by how much full dynamics may change the impulse [%]')
+    auto_zmp_mm: Positive = optional('of "auto": by how much they may change the ZMP [mm]')
     coefficient_of_restitution: Restitution = optional(
         'speed of separation over speed of approach, of the model "rigid"'
     )

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, PlainValidator
 
 from impactopt.errors import did_you_mean, shortened
 from impactopt.files.problem_file.ipopt_options import ALLOWED
+from impactopt.problem.checks import MOST_FREEZES
 from impactopt.robots.presets import robot_names
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
 
@@ -151,6 +152,7 @@ def _ipopt_options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 Positive = Annotated[float, Field(gt=0)]
+Freezes = Annotated[int, Field(ge=0, le=MOST_FREEZES)]
 NotNegative = Annotated[float, Field(ge=0)]
 NotNegativeOrAny = Annotated[float, Field(ge=0, allow_inf_nan=True)]  # inf: any; nan is refused by ge
 AtLeastOne = Annotated[float, Field(ge=1)]

@@ -96,7 +96,7 @@ def check_objectives(
             raise InputError(f"two objectives are called {o.name!r}: give {type(o).__name__} another name")
         if o.contact and not contact:
             raise InputError(
-                f'{kind.__name__} is of a contact that lasts: give collision="dynamics", or leave it out'
+                f'{kind.__name__} is of a contact that lasts: give collision="full", or leave it out'
             )
         o.check_fits(turns=turns, balance=balance)
     return tuple(objectives)

@@ -74,7 +74,7 @@ def methods(file: Path, say: Say) -> Iterator[tuple[str, Callable[[], Method]]]:
     problem = ours.problem
     loose = tuple(t for t in problem.terms if not isinstance(t, Balance))
     yield "minimum-jerk reach", lambda: _minimum_jerk(problem)
-    for kind, label in (("rigid", "rigid impact"), ("virtual mass", "virtual-mass collision")):
+    for kind, label in (("rigid", "rigid impact"), ("virtual-mass", "virtual-mass collision")):
         for terms, what in (((*loose, ANY_BALANCE), ""), (problem.terms, ", balance after it")):
             changed = replace(problem, collision=kind, terms=terms, scenarios=())
             full = f"{label}{what}"

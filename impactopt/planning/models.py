@@ -1,0 +1,156 @@
+"""Models of the collision for a plan: how far each is from full dynamics; the cheapest that is good enough.
+
+That is asked of models alone, at the plan's state at contact: collisions of the compiled SDC, which take
+microseconds. Full dynamics are there the SDC that is frozen so often that it makes no difference.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.collision.rungs import frozen_model
+from impactopt.errors import InputError
+from impactopt.kinematics.held import holding_torque
+from impactopt.planning.solution import ModelError, Solved
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import VelocityLimit
+from impactopt.simulation.cases import errors_against
+from impactopt.simulation.reference.coasting import coasting_reference
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.guess import fastest
+from impactopt.transcription.start import carried_over, strike_rates
+
+Array = NDArray[np.float64]
+AnySolution = TypeVar("AnySolution", bound=Solved)
+# freezes of the SDC that stands for full dynamics
+_OFTEN, _MOST = 8, 64
+_LADDER = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
+_HORIZON = 0.2  # [s] at least
+_SHARE, _GUESSED = 0.5, 1.0  # of the fastest blow, or [m/s] where there is none: how the first rung is chosen
+
+
+def model_error(t: ContactProgram, x: Array) -> ModelError | None:
+    """How far the model of a program's collision is from full dynamics, for solver variables (n,).
+
+    None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
+    """
+    problem, c = t.problem, t.coordinates
+    if problem.collision in ("full", "auto", "rigid"):
+        return None
+    y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)
+    q, v, _ = c.complete_motion(y, t.u0.read(x)[0], np.zeros(c.ny), legs)
+    torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
+    return _error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
+
+
+def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: float) -> ModelError | None:
+    """Of a blow of about this duration [s]."""
+    names = ("robot", "striker", "normal", "law", "target", "stance")
+    scene: dict[str, Any] = {name: getattr(problem, name) for name in names}
+    scene["horizon"] = max(_HORIZON, 4 * duration)
+    own = frozen_model(problem.collision, problem.freezes, **scene)
+    often = min(max(_OFTEN, 4 * problem.freezes), _MOST)
+    try:
+        bend: dict[str, Any] = {**coasting_reference(problem.coordinates, q, v, until=2 * duration)}
+        known = {name: x for name, x in bend.items() if name in own.settings}
+        alone = own.collide(q, v, torque, **known)
+        full = frozen_model("sdc", often, **scene).collide(q, v, torque, **bend)
+    except InputError:  # a contact that does not end
+        return None
+    told = errors_against(alone, full)
+    return ModelError(impulse_pct=float(told["impulse_error_pct"] or 0.0), zmp_mm=told["zmp_error_mm"])
+
+
+def carried_start(
+    t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, rows: Any
+) -> SolverResult:
+    """What a program starts from that has another model of the collision than a solution: that solution.
+
+    old : makes the solution's program.  rows : between bodies, of both.
+    """
+    was, now = start.problem, t.problem
+    if (was.collision, was.freezes) == (now.collision, now.freezes):
+        return start.result
+    result, new = start.result, t.with_apart(rows)
+    x, y, z = carried_over(
+        new, old().with_apart(rows), result.x, result.multipliers, result.bound_multipliers
+    )
+    return replace(result, x=x, multipliers=y, bound_multipliers=z)
+
+
+def climbed(
+    problem: ImpactProblem,
+    run: Callable[[ImpactProblem, AnySolution | None, float | None], AnySolution],
+    *,
+    time_limit: float | None,
+    report: Callable[[str], None] | None,
+) -> AnySolution:
+    """The solution of a problem by the cheapest model of the collision that is good enough for it.
+
+    run : solves a problem, from a solution by another model, or None: from the start asked for; within a time
+    [s].
+    """
+    began = time.perf_counter()
+    say = report if report is not None else _silent
+    rungs = _LADDER[1:] if _skips_first(problem, say) else _LADDER
+    done: AnySolution | None = None
+    for rung in rungs:
+        left = None if time_limit is None else max(time_limit - (time.perf_counter() - began), 1e-3)
+        new = run(replace(problem, collision=rung), done, left)
+        done = new if done is None else _both(done, new)
+        if not done.status.usable or done.model_error is None or good_enough(problem, done.model_error):
+            break
+        say(f"{rung}: {done.model_error}, which is more than was asked for: on with full dynamics")
+    assert done is not None
+    return done
+
+
+def good_enough(problem: ImpactProblem, error: ModelError) -> bool:
+    """Whether a problem's "auto" is content with this error."""
+    return abs(error.impulse_pct) <= problem.auto_impulse_pct and (error.zmp_mm or 0.0) <= problem.auto_zmp_mm
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
+    """Whether the first rung is not good enough in the posture that a search starts at.
+
+    Of a blow half as fast as the joints allow: a fast one moves the robot far while it lasts.
+    """
+    first, c = replace(problem, collision=_LADDER[0]), problem.coordinates
+    y, legs = c.split(problem.contact_posture)
+    limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
+    most = fastest(c, problem.striker, problem.normal, problem.contact_posture, limit)
+    speed = _SHARE * most if np.isfinite(most) else _GUESSED
+    try:
+        legs = c.solve_legs(y, legs)
+        rates = strike_rates(c, problem.striker, y, legs, speed * problem.normal)
+        q, v, _ = c.complete_motion(y, rates, np.zeros(c.ny), legs)
+        torque = holding_torque(problem.robot, q, v, stance=problem.stance)
+    except InputError:
+        return False
+    error = _error(first, q, v, torque, 0.05)
+    if error is None or good_enough(problem, error):
+        return False
+    say(f"{_LADDER[0]} at {speed:.2g} m/s: {error}, which is more than was asked for: {_LADDER[1]} at once")
+    return True
+
+
+def _both(old: AnySolution, new: AnySolution) -> AnySolution:
+    """The new solution, with the time and the attempts of both."""
+    attempts = [*(replace(a, kept=False) for a in old.attempts), *new.attempts]
+    return replace(
+        new,
+        build_seconds=old.build_seconds + new.build_seconds,
+        solve_seconds=old.solve_seconds + new.solve_seconds,
+        attempts=tuple(attempts),
+    )

@@ -1,0 +1,320 @@
+"""The nonlinear pieces of a contact as CasADi functions of (variables z, parameters p): see `blocks`.
+
+One set of functions serves all models of the collision: what is frozen is a point of the contact of its own,
+given to the same rigid-body functions. Numbers of steps and equations are the paper's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from impactopt.collision.effects import Effects
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.striking_point import striker_kinematics
+from impactopt.problem.block import BlockExpression, make_block
+
+__all__ = [
+    "DEPTH_SCALE",
+    "FORCE_SCALE",
+    "RESTITUTING",
+    "base_scale",
+    "carried",
+    "coasting",
+    "collision",
+    "force",
+    "impact",
+    "join",
+    "leg_part",
+    "moved",
+    "two_mass_restitution",
+    "typical_state",
+]
+
+FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
+DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
+RESTITUTING = 6  # which parameter of `force` says so
+
+
+def base_scale(c: StanceCoordinates, weight: Any, lever: Any) -> Any:
+    """Of base rows: the weight [N], and with the lever [m] of moments."""
+    return ca.vertcat(*[weight] * 3, *[weight * lever] * 3) if c.base else ca.SX(0, 1)
+
+
+def leg_part(c: StanceCoordinates, v: Any) -> Any:
+    """Of the held legs' joints (nl), out of (nv)."""
+    return ca.vertcat(*[v[c.base + int(j)] for j in c.dependent])
+
+
+def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpression:
+    """The legs of the reference that coasts through the collision: soles in place and at rest, as residuals.
+
+    z = y0, u0 (ydot) at contact, T1, T, legs, leg rates [rad/s], of a freeze their accelerations [rad/s^2];
+    p = s (place in the phase), 1 in restitution else 0.
+    out = pose error of the held soles [m, rad], twist of the held soles [m/s, rad/s]; of a freeze, what rates
+        and accelerations are off by.
+    """
+    y0, u0 = ca.SX.sym("y0", c.ny), ca.SX.sym("u0", c.ny)
+    legs, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("rates", c.nl)
+    T1, T, s, after = (ca.SX.sym(name) for name in ("T1", "T", "s", "after"))
+    y = y0 + u0 * (after * T1 + T * s)
+    z = [y0, u0, T1, T, legs, rates]
+    if frozen is None:
+        out = {"closure": c.closure(y, legs), "twist": c.sole_twists(y, legs, u0, rates)}
+        return make_block(z, [s, after], out, lanes=4)
+    bends = ca.SX.sym("bends", c.nl)
+    v, a = (leg_part(c, x) for x in c.motion(y, legs, u0, ca.SX.zeros(c.ny)))
+    out = {"closure": c.closure(y, legs), "rate": rates - v, "acceleration": bends - a}
+    return make_block([*z, bends], [s, after], out, lanes=2)
+
+
+def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None) -> BlockExpression:
+    """Equation of motion (6) at one collocation point of the collision.
+
+    H, J and bias are those at the point, anew at each (steps 1a to 4a of the paper); or those that a freeze
+    has stored (1b), with its terms. Then accelerations are linear in torques and forces (3b to 5b), and so
+    are those of legs and striker in the frozen Jacobians (6b).
+    The servo (equation 10; 12 as rows) follows a reference that coasts at its velocity at contact:
+    tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
+
+    z = y0, u0 (ydot) at contact; feed-forward over torque limit (n); d1, T1, d, T: y = y0 + T1 d1 + T d;
+        u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
+      not frozen: legs and leg rates of the coasting reference.
+      frozen: y, ydot and legs of the freeze; rates of the reference's legs when its stretch began, their
+        acceleration, time [s] since; rates of the legs and their lag behind the reference, each with its
+        slope; slope of the hand's speed; wrenches that carry the weight, where the model has no bias (nw).
+    p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight
+        [N], lever [m].
+    out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit; frozen: what the
+        slopes of the legs' rates, of their lag and of the hand's speed are off by.
+    """
+    ny, n, nl, nw = c.ny, c.robot.n, c.nl, 6 * len(c.legs)
+    y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
+    legs, ff, w = ca.SX.sym("legs", nl), ca.SX.sym("ff", n), ca.SX.sym("w", nw)
+    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
+    normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
+    kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
+    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    t = after * T1 + T * s
+    y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
+    through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
+    at, carried, slopes = (y, u, legs), ca.SX.zeros(nw), {}
+    if frozen is None:
+        lag, slower = (ca.SX.sym(s, nl) for s in ("ref_legs", "ref_rates"))
+        more = [lag, slower]
+    else:
+        of_freeze = ca.SX.sym("yf", ny), ca.SX.sym("uf", ny), ca.SX.sym("legsf", nl)
+        of_legs = [ca.SX.sym(s, nl) for s in ("began", "bends", "r", "r1", "lag", "lag1")]
+        began, bends, r, r1, lag, lag1 = of_legs
+        since, faster = ca.SX.sym("since"), ca.SX.sym("h1")
+        at, more = of_freeze, [*of_freeze, *of_legs, since, faster]
+        if not frozen.bias:
+            carried = ca.SX.sym("carried", nw)
+            more.append(carried)
+    v, a = _motion(c, *at, ydd, jdot=frozen is None or frozen.jdot)
+    q = c.configuration(at[0], at[2])
+    row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{striker}")[:3, :])])(q)
+    tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
+    tau += ca.mtimes(row.T, normal) * f - c.sole_wrench_map(at[2], w - carried)
+    # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
+    if frozen is None:
+        lag, slower = lag - legs, slower - leg_part(c, v)
+    else:
+        slower = began + bends * since - r
+        tip = striker_kinematics(c, striker)(q, v if frozen.jdot else 0 * v, a)[2]
+        slopes = {"legs": r1 - T * leg_part(c, a), "lag": lag1 - T * slower}
+        slopes["hand"] = faster - T * ca.dot(normal, tip)
+    ahead = c.configuration(y0 + u0 * t - y, lag)[c.base :]
+    servo = ff + (kp * ahead + kd * c.configuration(u0 - u, slower)[c.base :]) / limit
+    out = {
+        "closure": c.closure(y, legs),
+        "base": tau[: c.base] / base_scale(c, weight, lever),
+        "joints": tau[c.base :] / limit - servo,
+        "torque": servo,
+        **slopes,
+    }
+    z = [y0, u0, *more[: 2 * (frozen is None)], ff, d1, T1, d, T, u, u1, legs, f, w]
+    z += more if frozen is not None else []
+    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through, lanes=4)
+
+
+def _motion(
+    c: StanceCoordinates, y: Any, u: Any, legs: Any, ydd: Any, *, jdot: bool = True
+) -> tuple[Any, Any]:
+    """v and a (nv) of rates u and second rates on held soles; without dJ/dt v, a as if nothing moved."""
+    return c.motion(y, legs, u, ydd) if jdot else (c.velocity(y, legs, u), c.velocity(y, legs, ydd))
+
+
+def _inverse_dynamics(c: StanceCoordinates, q: Any, v: Any, a: Any, *, bias: bool = True) -> Any:
+    """H a (nv), and Coriolis, centrifugal and gravity forces."""
+    rb = c.rb
+    if not bias:
+        return ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])(q, a)
+    return ca.Function("rnea", [rb.q, rb.v, rb.a], [rb.rnea(rb.v, rb.a)])(q, v, a)
+
+
+def force(
+    c: StanceCoordinates, striker: str, law: ContactLaw, target: Target, frozen: Effects | None = None
+) -> BlockExpression:
+    """Contact law and target at one collocation point (equations 14 to 17, integrated).
+
+    z = y0; d1, T1, d, T, u as in :func:`collision`, or where its dynamics are frozen in place of y0, d1, d
+        and u those of the hand along the normal (no y0; 7b); f [N]; the target's state and its slope (in s);
+        travel x of its surface, x' and x1 as d, u and d1; slope p' of the impulse.
+    p = point (3), normal (3), 1 in restitution else 0, the law's parameters, the target's; of a target with
+        events before them, of each phase, 1 in it else 0, and how long [s] it has to last.
+    out = (f - law) / 100 N, state' - T d(state)/dt over its typical size, x' - speed [m/s], p' - T f [N s],
+        approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N, speed of the target's
+        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts.
+    """
+    ny, n = c.ny if frozen is None else 1, target.n_states
+    y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
+    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
+    state, slope = ca.SX.sym("state", n), ca.SX.sym("slope", n)
+    x, rate_x, x1, rate_p = (ca.SX.sym(s) for s in ("x", "rate_x", "x1", "rate_p"))
+    point, normal = ca.SX.sym("point", 3), ca.SX.sym("n", 3)
+    restituting, phases = ca.SX.sym("restituting"), range(len(target.phases) if target.guards else 0)
+    within, shortest = ca.SX.sym("within", len(phases)), ca.SX.sym("shortest", min(len(phases), 1))
+    of_law = ca.SX.sym("law", len(law.parameters))
+    of_target = ca.SX.sym("target", len(target.parameters))
+    y, gone = ca.SX.sym("y", ny), ca.SX.sym("gone")
+    if frozen is None:
+        q, vel, _ = c.upper_motion(y, u, ca.SX.zeros(ny))
+        place, twist, _ = striker_kinematics(c, striker)(q, vel, ca.SX.zeros(c.rb.nv))
+        way, approach = ca.dot(normal, place - point), ca.dot(normal, twist)
+    else:
+        way, approach = y, u
+    named = {name: of_law[i] for i, name in enumerate(law.parameters)}
+    numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
+    pieces = [target.smooth(state, f, k, numbers) for k in phases or (0,)]
+    speed, moves = ca.SX(pieces[0][0]), ca.vertcat(ca.SX(0, 1), *pieces[0][1])
+    event = lasting = ca.SX(0, 1)
+
+    def of_phase(parts: list[list[Any]]) -> Any:
+        return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
+
+    if target.guards:
+        speed, moves = of_phase([[v] for v, _ in pieces]), of_phase([rates for _, rates in pieces])
+        event = of_phase(
+            [[target.guard(state, f, T - shortest, k, numbers)] for k in range(len(target.guards))]
+        )
+        lasting = of_phase([target.invariant(state, f, k, numbers) for k in phases])
+    penetration, rate = way - gone, approach - speed
+    compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
+    out = {
+        "law": (f - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE,
+        "target": (slope - T * moves) / np.array(typical_state(target)),
+        "travel": rate_x - speed,
+        "impulse": rate_p - T * f,
+        "rate": rate,
+        "penetration": penetration / DEPTH_SCALE,
+        "separation": ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE,
+        "speed": speed,
+        "event": event,
+        "lasting": lasting,
+    }
+    z = [*([y0] if frozen is None else []), d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
+    start = y0 if frozen is None else 0.0
+    through = [(y, start + T1 * d1 + T * d), (gone, T1 * x1 + T * x)]
+    p = [point, normal, restituting, within, shortest, of_law, of_target]
+    return make_block(z, p, out, through, lanes=4)
+
+
+def moved(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """Where the robot is in contact, to freeze there anew, and how fast its hand moves.
+
+    z = y0, d1, T1, d, T, u as in :func:`collision`;  p = normal (3).  out = y; speed along the normal [m/s].
+    """
+    y0, d1, d, u, y = (ca.SX.sym(s, c.ny) for s in ("y0", "d1", "d", "u", "y"))
+    T1, T, normal = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("n", 3)
+    q, v, _ = c.upper_motion(y, u, ca.SX.zeros(c.ny))
+    twist = striker_kinematics(c, striker)(q, v, ca.SX.zeros(c.rb.nv))[1]
+    out = {"y": y, "speed": ca.dot(normal, twist)}
+    return make_block([y0, d1, T1, d, T, u], [normal], out, [(y, y0 + T1 * d1 + T * d)], lanes=4)
+
+
+def carried(c: StanceCoordinates) -> BlockExpression:
+    """What soles bear beside the forces of a model without bias: weight, Coriolis and centrifugal forces.
+
+    z = y, legs, u at contact; wrenches (6 a sole);  p = weight [N], lever [m].  out = base rows.
+    """
+    y, u, legs = ca.SX.sym("y", c.ny), ca.SX.sym("u", c.ny), ca.SX.sym("legs", c.nl)
+    w, weight, lever = ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("weight"), ca.SX.sym("lever")
+    v = c.velocity(y, legs, u)
+    force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv)) - c.sole_wrench_map(
+        legs, w
+    )
+    out = {"base": force[: c.base] / base_scale(c, weight, lever)}
+    return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
+
+
+def typical_state(target: Target) -> tuple[float, ...]:
+    """Sizes of the numbers of a target's state."""
+    return target.typical or (1.0,) * target.n_states
+
+
+def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """An impact in no time: impulse balance of the robot on its soles, and the law of the impulse.
+
+    z = y; legs; u0 (ydot) at contact; its change; impulsive sole wrenches [N s, N m s]; impulse I [N s].
+    p = normal (3); 1 for a given restitution, 0 for that of the contact law; that restitution; stiffness
+        [N/m], damping [N s/m] of the law; 1/mass of the target [1/kg]; torque limits (n); weight [N];
+        lever [m].
+    out = base rows, joint rows (over torque limit), separation against approach [m/s].
+    """
+    ny, n = c.ny, c.robot.n
+    y, u0, du = (ca.SX.sym(s, ny) for s in ("y", "u0", "du"))
+    legs, w, blow = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("I")
+    normal, rigid, given = ca.SX.sym("n", 3), ca.SX.sym("rigid"), ca.SX.sym("e")
+    stiffness, damping, inverse_mass = ca.SX.sym("k"), ca.SX.sym("d"), ca.SX.sym("im")
+    limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
+    rb = c.rb
+    q = c.configuration(y, legs)
+    inertia = ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])
+    row = ca.Function("row", [rb.q], [ca.densify(rb.jacobian(f"striker:{striker}")[:3, :])])(q)
+    push = ca.mtimes(row.T, normal)
+    change = c.velocity(y, legs, du)
+    balance = inertia(q, change) + push * blow - c.sole_wrench_map(legs, w)
+    lost = -ca.dot(
+        push, change
+    )  # speed that the impulse takes from the hand; I over it is the effective mass
+    approach = ca.dot(push, c.velocity(y, legs, u0))
+    stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
+    e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
+    out = {
+        "base": balance[: c.base] / (0.1 * base_scale(c, weight, lever)),
+        "joints": balance[c.base :] / (0.1 * limit),
+        "blow": blow * inverse_mass + lost - (1 + e) * approach,
+    }
+    p = [normal, rigid, given, stiffness, damping, inverse_mass, limit, weight, lever]
+    return make_block([y, legs, u0, du, w, blow], p, out, lanes=2)
+
+
+def two_mass_restitution(ratio: Any) -> Any:
+    """Speed of separation over that of approach of two masses with a spring, and a damper in compression.
+
+    ratio: the damping over the critical one, of the reduced mass: zeta = d / (2 sqrt(k mu)).
+    e = exp(-zeta arccos(zeta) / sqrt(1 - zeta^2)), continued through zeta = 1 by its series.
+    """
+    below, above = ca.fmin(ratio, 0.99), ca.fmax(ratio, 1.01)
+    x = 1 - ratio
+    near = 1 + x / 3 + 2 * x**2 / 15 + 2 * x**3 / 35
+    slope = ca.if_else(
+        ratio < 0.99,
+        ca.acos(below) / ca.sqrt(1 - below**2),
+        ca.if_else(ratio > 1.01, ca.acosh(above) / ca.sqrt(above**2 - 1), near),
+    )
+    return ca.exp(-ratio * slope)
+
+
+def join() -> BlockExpression:
+    """One coordinate's way through two phases as that through one.
+
+    z = T1, T2, d1, d2, d;  out = T1 d1 + T2 d2 - (T1 + T2) d.
+    """
+    T1, T2, d1, d2, d = z = [ca.SX.sym(s) for s in ("T1", "T2", "d1", "d2", "d")]
+    return make_block(list(z), [], {"travel": T1 * d1 + T2 * d2 - (T1 + T2) * d})

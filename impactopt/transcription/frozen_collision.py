@@ -1,0 +1,353 @@
+"""The contact with one target by a model with frozen dynamics: the SDC inside a program.
+
+H, J and the bias are those of one freeze, or of several on the way, and are constant between them (paper,
+steps 1b to 8b; `collision.frozen` has them in numbers, `collision.course` the freezes on the way). What is
+frozen is a point of the contact: coordinates, rates and legs, at which the blocks of a collision evaluate the
+rigid-body functions. Beside the robot's coordinates, the legs' rates and the hand's speed are integrated of
+their own, as frozen Jacobians move them: servo, penetration and force are of these.
+
+With one freeze it is at the state at contact, and the velocities that the bias and dJ/dt v depend on are
+those with which hand and target have met (`v_meet`), by the rows of an impact in which they stay together.
+With N there is one in the middle of each of N stretches of the contact's time. Phases share that time as in
+the program's ``shares``; scenarios have the expected target's stretches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from impactopt.collision.graph import target_yield
+from impactopt.solvers.program import Determined
+from impactopt.transcription.builder import Builder
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.contact import Contact
+from impactopt.transcription.elimination import Turn, determined
+from impactopt.transcription.guess import coasted, effective_mass
+from impactopt.transcription.impulse import InstantImpact
+from impactopt.transcription.layout import Affine, Array, Group
+from impactopt.transcription.limits import DIRECTIONS
+from impactopt.transcription.mesh import Shares, Stage, lagrange, place_of, stretch_of
+from impactopt.transcription.rows import Measure, Place, along, by_leg, rates
+
+
+@dataclass(frozen=True)
+class _Freeze:
+    """Where something is frozen: in which phase, at which place in it; coordinates, rates, legs."""
+
+    phase: int
+    place: float
+    y: Affine
+    u: Affine
+    legs: Affine
+
+
+class FrozenCollision(Collision):
+    """Variables and rows of the contact with one target. shares : of the hit; the rest as of `Collision`."""
+
+    def __init__(
+        self, b: Builder, contact: Contact, stages: Sequence[Stage], *, shares: Shares, **common: Any
+    ) -> None:
+        assert b.problem.frozen is not None
+        self.terms, self.shares, self.freezes = b.problem.frozen, shares, b.problem.freezes
+        super().__init__(b, contact, stages, **common)
+        c, n, legs = b.coordinates, len(stages), {"labels": b.coordinates.leg_labels}
+
+        def add(name: str, count: int, size: int, **options: Any) -> Group:
+            return b.layout.add(self._named + name, count, size, **options)
+
+        hand, joined = {"labels": ["hand"]}, self.joined.count
+        self.leg_rates = add("collision leg rates", n, b.nl, **legs)
+        self.lag = add("lag of the legs", n, b.nl, **legs)
+        self.speed = add("hand speed", n, 1, **hand)
+        self.way = add("hand travel", n, 1, **hand)
+        self.joined_way = add("hand travel in compression", joined, 1, **hand)
+        self.begins = [add(f"hand speed, stretch {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
+        self.frozen_at = [add(f"freeze {k}", 1, b.ny, labels=c.labels) for k in range(self.freezes)]
+        self.frozen_legs = [add(f"legs of freeze {k}", 1, b.nl, **legs) for k in range(self.freezes)]
+        carried = int(not self.terms.bias and b.nw > 0)
+        self.carried = add("sole wrench that carries", carried, b.nw, **b.limits.of_wrenches)
+        self._meeting: InstantImpact | None = None
+        if self.terms.jdot and not self.freezes:
+            gives_way = float(target_yield(b.problem.target, self.target))
+            mass = 1 / gives_way if gives_way > 0 else np.inf
+            self._meeting = InstantImpact(b, contact, mass=mass, named=f"{self._named}meeting: ")
+        self._stretches = [self._stretch(s) for s in stages]
+        self._legs_at: list[Affine] = []
+        self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
+
+    def _add_reference(self, count: int) -> None:
+        """At the begins of stretches, and then where they are frozen, if not at contact."""
+        count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
+        super()._add_reference(count)
+        name = f"{self._named}coasting leg accelerations"
+        self.bends = self._b.layout.add(name, count, self._b.nl, labels=labels)
+
+    # ------------------------------------------------------------------ where it is frozen
+    def _stretch(self, s: Stage) -> int:
+        if not self.freezes:
+            return 0
+        begin, end = self._ends(s)
+        return stretch_of(s.phase, begin, end, self.shares, self.freezes)
+
+    def _ends(self, s: Stage) -> tuple[float, float]:
+        """Places of begin and end of a stage's element, in the phase."""
+        return 0.0 if s.new_phase else self.stages[s.previous].place, self.stages[s.members[-1]].place
+
+    def _freeze(self, k: int) -> _Freeze:
+        state, u0 = self.contact.state, self.contact.u0[0]
+        if not self.freezes:
+            met = u0 if self._meeting is None else u0 + self._meeting.du[0]
+            return _Freeze(0, 0.0, state.y, met, state.legs)
+        phase, place = place_of((k + 0.5) / self.freezes, self.shares)
+        s = self._element_at(phase, place)
+        at = [self._ends(s)[0], *(self.stages[m].place for m in s.members)]
+        weights = lagrange(at, place)
+
+        def value(group: Group, start: Affine) -> Affine:
+            out = (start if s.previous < 0 else group[s.previous]) * weights[0]
+            for m, w in zip(s.members, weights[1:], strict=True):
+                out = out + group[m] * w
+            return out
+
+        self._legs_at.append(value(self.legs, state.legs))
+        return _Freeze(phase, place, self.frozen_at[k][0], value(self.u, u0), self.frozen_legs[k][0])
+
+    def _element_at(self, phase: int, place: float) -> Stage:
+        """A stage of the element that a place in a phase is in."""
+        return next(
+            s for s in self.stages if s.phase == phase and place <= self.stages[s.members[-1]].place + 1e-9
+        )
+
+    def _instants(self) -> list[tuple[int, float]]:
+        """Phases and places at which the reference is known: at the begins of stretches, and at freezes."""
+        firsts = [self.stages[self._stretches.index(k)].previous for k in range(len(self._frozen))]
+        begins = [(0, 0.0) if i < 0 else (self.stages[i].phase, self.stages[i].place) for i in firsts]
+        return [*begins, *((at.phase, at.place) for at in self._frozen[: self.freezes])]
+
+    def _travel_to(self, k: int) -> list[Affine]:
+        """Slots of the block ``moved``: to the freeze in the middle of a stretch."""
+        at = self._frozen[k]
+        s = self._element_at(at.phase, at.place)
+        T1, d1, _ = self._before(at.phase)
+        d = Affine.zeros(self._b.ny) if s.new_phase else self.d[s.previous]
+        places, begin = [self.stages[m].place for m in s.members], self._ends(s)[0]
+        # the polynomial through the element's rates is integrated exactly by as many of its values
+        x, w = np.polynomial.legendre.leggauss(len(places))
+        inner = [lagrange(places, begin + (at.place - begin) * (z + 1) / 2) for z in x]
+        for m, weight in zip(s.members, (at.place - begin) / 2 * (w @ np.array(inner)), strict=True):
+            d = d + self.u[m] * weight
+        return [self.contact.state.y, d1, T1, d, self.T[at.phase][0], at.u]
+
+    def _travel_before(self, k: int) -> list[Affine]:
+        """Slots of the block ``moved``: to the begin of a stretch."""
+        i = self._stretches.index(k)
+        y, s = self.contact.state.y, self.stages[i]
+        if s.previous < 0:
+            none, still = Affine.zeros(1), Affine.zeros(self._b.ny)
+            return [y, still, none, still, none, self.contact.u0[0]]
+        return [y, *self._travel(s.previous), self.u[s.previous]]
+
+    # ------------------------------------------------------------------ blocks
+    def instances(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        b, state = self._b, self.contact.state
+        out = super().instances()
+        moved = [self._travel_before(k) for k in range(len(self.begins))]
+        moved += [self._travel_to(k) for k in range(self.freezes)]
+        out["moved"] = moved, [b.problem.normal] * len(moved)
+        if self._meeting is not None:
+            out |= self._meeting.instances()
+        if self.carried.count:
+            slots = [state.y, state.legs, self.contact.u0[0], self.carried[0]]
+            out["carried"] = [slots], [b.limits.units]
+        return out
+
+    def _dynamics(self, i: int) -> list[Affine]:
+        """Slots of the block ``collision``: steps 3b to 6b at one instant, with what step 1b has stored."""
+        b, s, k = self._b, self.stages[i], self._stretches[i]
+        y, u0, at = self.contact.state.y, self.contact.u0[0], self._frozen[k]
+        hit = [self.legs[i], self.f[i], self.w[i]]
+        bends = self.bends[self.freezes + k] if self.terms.jdot else Affine.zeros(b.nl)
+        since = self._time(s.phase, s.place) - self._time(*self._instants()[k])
+        legs = [
+            *self._slots(self.leg_rates, i, self.coast_rates[0]),
+            *self._slots(self.lag, i, Affine.zeros(b.nl)),
+        ]
+        carried = [] if self.terms.bias else [self.carried[0] if self.carried.count else Affine.zeros(b.nw)]
+        own = [y, u0, self._feedforward(), *self._travel(i), *self._slots(self.u, i, u0), *hit]
+        reference = [self.coast_rates[k], bends]
+        return [*own, at.y, at.u, at.legs, *reference, *legs, since, self._hand_slope(i), *carried]
+
+    def _hand_slope(self, i: int) -> Affine:
+        """Of its speed along the normal, which is that of the robot at the begin of a stretch."""
+        s, k = self.stages[i], self._stretches[i]
+        first = s.previous < 0 or self._stretches[s.previous] != k
+        slope = self.speed[s.members[0]] * 0.0
+        for m, w in zip(s.members, s.weights, strict=True):
+            slope = slope + self.speed[m] * w
+        return slope + (self.begins[k][0] if first else self.speed[s.previous]) * s.start
+
+    def _of_hand(self, i: int) -> list[Affine]:
+        """Step 7b: of the accelerations of the contact point, and not of the robot's geometry."""
+        s = self.stages[i]
+        before = self._way(self.way, self.joined_way, s.phase)
+        return [before, self._before(s.phase)[0], self.way[i], self.T[s.phase][0], self.speed[i]]
+
+    def _reference(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
+        if not self._b.coordinates.legs:
+            return {}
+        start = [self.contact.state.y, self.contact.u0[0]]
+        own = zip(
+            self._instants(),
+            *(map(group.__getitem__, range(group.count)) for group in self._of_reference()),
+            strict=True,
+        )
+        slots = [[*start, self._before(phase)[0], self.T[phase][0], *legs] for (phase, _), *legs in own]
+        return {"coasting": (slots, [[place, float(phase > 0)] for phase, place in self._instants()])}
+
+    def _of_reference(self) -> tuple[Group, ...]:
+        return self.coast_legs, self.coast_rates, self.bends
+
+    def _feedforward(self) -> Affine:
+        if self.terms.feedforward:
+            return super()._feedforward()
+        return Affine.zeros(self._b.robot.n)
+
+    def _gains(self) -> tuple[Array, Array]:
+        kp, kd = super()._gains()
+        return (kp, kd) if self.terms.stiffness else (0 * kp, kd)
+
+    # ------------------------------------------------------------------ groups
+    def integrated(self) -> list[tuple[Group, Group]]:
+        return [*super().integrated(), (self.way, self.speed)]
+
+    def _ways(self) -> list[tuple[Group, Group]]:
+        return [*super()._ways(), (self.way, self.joined_way)]
+
+    def _at_stage(self) -> tuple[Group, ...]:
+        return (self.legs,)
+
+    def loose(self) -> list[Group]:
+        return [self.legs, self.f, self.w, self.leg_rates, self.lag, self.speed]
+
+    def states(self) -> tuple[Group, ...]:
+        return (*super().states(), self.leg_rates, self.lag)
+
+    def held_over(self) -> list[Group]:
+        met = [] if self._meeting is None else [self._meeting.du, self._meeting.w, self._meeting.blow]
+        own = [*self._of_reference(), self.joined_way, self.carried]
+        return [*super().held_over(), *own, *self.begins, *self.frozen_at, *self.frozen_legs, *met]
+
+    def determined(self) -> list[Determined]:
+        out = [determined(Turn.LIFTED, group.index(0)) for group in self.frozen_legs if group.size]
+        out += super().determined()
+        for k in range(self.coast_legs.count):
+            legs = [leg for g in self._of_reference() for leg in by_leg(g.index(k))]
+            out += [determined(Turn.STAGE_LEGS, leg, j) for j, leg in enumerate(legs)]
+        if self.carried.count:
+            out.append(determined(Turn.ELEMENT, self.carried.index(0)))
+        return [*([] if self._meeting is None else self._meeting.determined()), *out]
+
+    # ------------------------------------------------------------------ rows
+    def add_rows(self, at: dict[str, tuple[int, int]]) -> None:
+        """Those of the freezes come first, as they determine variables that all others have."""
+        if self._meeting is not None:
+            self._meeting.add_rows(at)
+        self._moved_rows(*at["moved"])
+        if "coasting" in at:
+            self._reference_rows(*at["coasting"])
+        if "carried" in at:
+            self._carried_rows(at["carried"][0])
+        super().add_rows({name: found for name, found in at.items() if name != "coasting"})
+
+    def _moved_rows(self, start: int, size: int) -> None:
+        b, part = self._b, self._b.parts("moved")
+        places = [(group, k, "speed") for k, group in enumerate(self.begins)]
+        places += [(group, len(self.begins) + k, "y") for k, group in enumerate(self.frozen_at)]
+        for group, instance, name in places:
+            outputs = start + instance * size + part[name]
+            measure = along(group.labels, "off") if name == "y" else Measure("m/s", 1.0, "off")
+            b.rows.add(
+                term="state to freeze at",
+                place=group.name,
+                components=group.labels,
+                outputs=outputs,
+                affine=-group[0],
+                lower=0,
+                upper=0,
+                measure=measure,
+            )
+            b.lifted.append((group, np.asarray(outputs, dtype=np.intp)))
+        for group, legs in zip(self.frozen_legs, self._legs_at, strict=True):
+            b.rows.add(
+                term="state to freeze at",
+                place=group.name,
+                components=group.labels,
+                affine=legs - group[0],
+                lower=0,
+                upper=0,
+                measure=along(group.labels, "off"),
+            )
+
+    def _reference_rows(self, start: int, size: int) -> None:
+        b, part = self._b, self._b.parts("coasting")
+        closure = [f"{leg.sole.name} sole {d}" for leg in b.coordinates.legs for d in DIRECTIONS]
+        for k in range(self.coast_legs.count):
+            term, place = "legs of the coasting reference", f"freeze {k}{self.suffix}"
+            outputs = start + k * size
+            b.equal(term, place, closure, outputs + part["closure"], along(closure, "off"))
+            labels = self.coast_rates.labels
+            b.equal(term, place, labels, outputs + part["rate"], rates(labels))
+            b.equal(term, place, labels, outputs + part["acceleration"], Measure("rad/s^2", 1.0, "off"))
+
+    def _carried_rows(self, start: int) -> None:
+        """They are what the soles bear at contact, and as much more each as makes them carry all."""
+        b, term, place = self._b, "weight that soles carry", f"contact{self.suffix}"
+        outputs = start + b.parts("carried")["base"]
+        b.equal(term, place, DIRECTIONS[: b.coordinates.base], outputs, b.limits.unbalanced)
+        more = self.carried[0] - self.contact.state.w
+        for k in range(1, len(b.coordinates.legs)):
+            b.rows.add(
+                term=term,
+                place=place,
+                components=self.carried.labels[6 * k : 6 * k + 6],
+                affine=more[6 * k : 6 * k + 6] - more[:6],
+                lower=0,
+                upper=0,
+                measure=b.limits.unbalanced[:6],
+            )
+
+    def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
+        super()._dynamics_rows(i, place, first)
+        b, part = self._b, self._b.parts("collision")
+        for labels, name in ((self.lag.labels, "legs"), (self.lag.labels, "lag"), (self.way.labels, "hand")):
+            b.equal("collision kinematics", place, labels, first["collision"] + part[name], rates(labels))
+
+    # ------------------------------------------------------------------ numbers
+    def guess_model(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """The hand is slowed down as the coordinates are, all alike: as the fastest of them."""
+        k = int(np.argmax(np.abs(rates)))
+        if rates[k] != 0:
+            speed = self._speed(y, rates, legs) / rates[k]
+            for mine, its in ((self.speed, self.u), (self.way, self.d), (self.joined_way, self.joined)):
+                mine.write(x, its.read(x)[:, k : k + 1] * speed)
+        if self._meeting is not None:
+            self._meeting.guess(x, y, rates, legs)
+        if not legs.size:
+            return
+        self.carried.write(x, self.contact.state.w.evaluate(x))
+        time = np.ravel([self._time(*at).evaluate(x) for at in self._instants()])
+        for k, (there, motion) in enumerate(coasted(self._b.coordinates, time, y, rates, legs)):
+            for group, value in zip(self._of_reference(), (there, *motion), strict=True):
+                x[group.index(k)] = value
+        self.leg_rates.write(x, self.coast_rates.read(x)[:1])
+        for group in self.frozen_legs:
+            group.write(x, legs)
+
+    def _speed(self, y: Array, rates: Array, legs: Array) -> float:
+        """Of the hand along the normal [m/s]."""
+        p = self._b.problem
+        return effective_mass(self._b.coordinates, p.striker, p.normal, y, legs, rates)[1]

@@ -1,0 +1,264 @@
+"""One name, one prediction: models of the collision inside plans, and the same models on their own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.small_plans import arm_problem, biped_problem, struck
+from typer.testing import CliRunner
+
+from impactopt import coasting_reference, load_problem, optimize_strike, solve
+from impactopt.cli.app import app
+from impactopt.codegen.compiler import find_compiler
+from impactopt.collision.rungs import FROZEN, frozen_model
+from impactopt.contact import FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
+from impactopt.errors import InputError
+from impactopt.planning.models import good_enough
+from impactopt.planning.solution import ModelError
+from impactopt.problem.problem import COLLISIONS, ImpactProblem
+from impactopt.problem.scenario import Scenario
+from impactopt.solvers.sqp import solve_sqp
+from impactopt.transcription.mesh import contact_elements, guessed_shares, place_of
+from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.strike import StrikeTranscription
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning"),
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
+]
+
+Array = NDArray[np.float64]
+# fine enough that collocation does not count: what is left is the model
+FINE = ((0.02, 0.06, 0.12, 0.2, 0.3, 0.3), (0.25, 0.25, 0.25, 0.25))
+# and of a robot whose light wrist's servo is fast
+FINER = ((0.004, 0.012, 0.024, 0.06, 0.15, 0.25, 0.25, 0.25), (0.25, 0.25, 0.25, 0.25))
+IMPULSE, ZMP = 1e-4, 0.1  # relative; [mm]
+
+
+def planned(problem: ImpactProblem) -> tuple[StrikeTranscription, PlannedStrike]:
+    """The strike of a problem, and its program."""
+    t = struck(problem)
+    result = solve_sqp(t.program, strike_iterate(t))
+    assert result.status.usable
+    shares = t.hit.drifted(result.x)
+    if shares is not None:
+        t = StrikeTranscription(
+            problem, t.coordinates, t.functions, contact_elements(problem, shares), shares
+        )
+        result = solve_sqp(t.program, strike_iterate(t))
+        assert result.status.usable and t.hit.drifted(result.x) is None
+    return t, t.decode(result.x)
+
+
+def alone(strike: PlannedStrike, *, step: float = 1e-3) -> Any:
+    """The collision of the model of that name, from the strike's state at contact."""
+    p = strike.problem
+    names = ("robot", "striker", "normal", "law", "target", "stance")
+    model = frozen_model(p.collision, p.freezes, **{name: getattr(p, name) for name in names})
+    model = dataclasses.replace(model, step=step)
+    until = 2 * max(strike.compression + strike.restitution, 1e-3)
+    bend = coasting_reference(p.coordinates, strike.posture, strike.velocity, until=until)
+    known = {name: x for name, x in bend.items() if name in model.settings}
+    return model.collide(strike.posture, strike.velocity, strike.torque, **known)
+
+
+def zmp_apart(strike: PlannedStrike, found: Any) -> Array:
+    """[mm] at the plan's collocation points that the other contact has too."""
+    hit = strike.collision
+    there = hit.time[1:] < found.time[-1]
+    ground = np.stack([np.interp(hit.time[1:], found.time, w) for w in found.ground_wrench.T], axis=1)
+    own, other = (np.stack([-w[:, 4], w[:, 3]]) / w[:, 2] for w in (hit.ground[there], ground[there]))
+    return np.asarray(1e3 * np.linalg.norm(own - other, axis=0))
+
+
+SPRING, KELVIN = SpringDamper(stiffness=1e4, damping=300.0), KelvinVoigt(stiffness=2e4, damping=30.0)
+BALL = FreeMass(mass=3.0)
+MET = {
+    "spring-damper": (SPRING, BALL),
+    "Kelvin-Voigt": (KELVIN, BALL),
+    "Hunt-Crossley": (HuntCrossley(stiffness=3e5, dissipation=0.3), BALL),
+    "Hertz": (HertzDamped(stiffness=2e5, damping=100.0), BALL),
+    "wall": (SPRING, RigidWall()),
+}
+CASES = [(name, "sdc", 0) for name in MET]
+CASES += [
+    ("spring-damper", model, n)
+    for model, n in (("virtual-mass", 0), ("sdc-paper", 0), ("sdc", 1), ("sdc", 4))
+]
+CASES += [("Kelvin-Voigt", "sdc-paper", 0), ("Hunt-Crossley", "sdc", 3)]
+
+
+@pytest.mark.parametrize(("met", "model", "freezes"), CASES)
+def test_a_plan_and_its_model_agree(met: str, model: str, freezes: int) -> None:
+    """On a small arm, for all laws and targets."""
+    law, target = MET[met]
+    changes: dict[str, Any] = {"law": law, "target": target, "collision": model, "freezes": freezes}
+    if not target.n_states:  # a push at a wall need not end
+        changes["contact_duration"] = (0.0, 0.02)
+    problem = dataclasses.replace(arm_problem(), collision_elements=FINE, **changes)
+    _, strike = planned(problem)
+    found = alone(strike)
+    assert strike.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+    if model != "virtual-mass":
+        assert strike.compression + strike.restitution == pytest.approx(found.duration, rel=1e-3)
+        if not target.n_states:
+            return
+        # and no other model does
+        other = "sdc" if model == "sdc-paper" or freezes else "sdc-paper"
+        changed = dataclasses.replace(problem, collision=other, freezes=0)
+        off = alone(dataclasses.replace(strike, problem=changed)).impulse / strike.impulse - 1
+        assert abs(off) > 5 * IMPULSE
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "freezes"),
+    [
+        ("arm_planar", "sdc", 0),
+        ("arm_planar", "sdc", 4),
+        ("chop_arm", "sdc", 0),
+        ("arm7", "sdc-paper", 0),
+    ],
+)
+def test_nails_and_boards_too(name: str, model: str, freezes: int) -> None:
+    problem = dataclasses.replace(
+        load_problem(name), collision=model, freezes=freezes, collision_elements=FINE
+    )
+    solution = optimize_strike(problem)
+    assert solution.status.usable
+    found = alone(solution.strike)
+    assert solution.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+
+
+def test_scenarios_are_frozen_too() -> None:
+    """Each meets its own target, from the same state at contact."""
+    heavy = Scenario(name="heavy", mass=2.0)
+    problem = dataclasses.replace(arm_problem(), collision="sdc", collision_elements=FINE, scenarios=(heavy,))
+    _, strike = planned(problem)
+    (other,) = strike.scenarios
+    assert strike.impulse == pytest.approx(alone(strike).impulse, rel=IMPULSE)
+    target = FreeMass(**heavy.numbers(problem.law, problem.target)[1])
+    met = dataclasses.replace(problem, target=target, scenarios=())
+    found = alone(dataclasses.replace(strike, problem=met))
+    assert other.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+    assert abs(other.impulse / strike.impulse - 1) > 0.05
+
+
+def test_weight_and_legs_by_the_papers_terms() -> None:
+    """The small biped's ZMP: its wrenches have the weight that the model leaves out."""
+    problem = dataclasses.replace(biped_problem(), collision="sdc-paper", collision_elements=FINER)
+    _, strike = planned(problem)
+    found = alone(strike, step=2e-5)
+    assert strike.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+    assert zmp_apart(strike, found).max() < ZMP
+
+
+def test_a_humanoids_zmp() -> None:
+    """TALOS, frozen at contact: a leg's servo follows a reference that bends."""
+    problem = dataclasses.replace(load_problem("punch"), collision="sdc", collision_elements=FINER)
+    solution = optimize_strike(problem)
+    assert solution.status.usable
+    found = alone(solution.strike, step=1e-4)
+    assert solution.impulse == pytest.approx(found.impulse, rel=IMPULSE)
+    assert zmp_apart(solution.strike, found).max() < ZMP
+    assert solution.model_error is not None and abs(solution.model_error.impulse_pct) > 0.5
+
+
+# ---------------------------------------------------------------- the cheapest that is good enough
+RUNS = {"solve": solve, "strike": optimize_strike}
+
+
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_auto_takes_what_is_good_enough(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = dataclasses.replace(load_problem("arm_planar"), collision="auto")
+    cheap = run(problem)
+    error = cheap.model_error
+    assert cheap.problem.collision == "sdc" and cheap.status.usable
+    assert 0.05 < abs(error.impulse_pct) <= problem.auto_impulse_pct
+    # what it says is off is what a plan with all in it says
+    dear = run(dataclasses.replace(problem, collision="full"))
+    assert dear.model_error is None
+    summary = cheap.summary()
+    assert (summary["collision_model"], summary["model_error_pct"]) == ("sdc", error.impulse_pct)
+    assert (dear.summary()["collision_model"], dear.summary()["model_error_pct"]) == ("full", None)
+    strict = dataclasses.replace(problem, auto_impulse_pct=0.05)
+    monkeypatch.setattr("impactopt.planning.models._skips_first", lambda *_: False)
+    climbed = run(strict)
+    assert climbed.problem.collision == "full" and climbed.model_error is None
+    assert climbed.impulse == pytest.approx(dear.impulse, rel=1e-5)
+    first, last = climbed.attempts
+    assert last.kept and not first.kept and last.iterations < 0.7 * dear.result.iterations
+
+
+def test_auto_skips_what_cannot_do() -> None:
+    said: list[str] = []
+    problem = dataclasses.replace(load_problem("arm_planar"), collision="auto", auto_impulse_pct=1e-4)
+    found = optimize_strike(problem, report=said.append)
+    assert found.problem.collision == "full" and len(found.attempts) == 1
+    assert any("full at once" in text for text in said)
+
+
+def test_what_auto_is_content_with() -> None:
+    problem = dataclasses.replace(arm_problem(), collision="auto", auto_impulse_pct=0.5, auto_zmp_mm=2.0)
+    for impulse, zmp, good in ((0.4, None, True), (-0.6, 0.0, False), (0.1, 1.9, True), (0.1, 2.1, False)):
+        assert good_enough(problem, ModelError(impulse_pct=impulse, zmp_mm=zmp)) is good
+
+
+# ---------------------------------------------------------------- words, files and meshes
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"collision": "dynamics"}, "unknown collision 'dynamics'.*full, auto"),
+        ({"freezes": 2}, "freezes are for collision=\"sdc\"; with 'full' leave them out"),
+        ({"collision": "sdc", "freezes": -1}, "freezes"),
+        ({"collision": "sdc", "freezes": 1.5}, "freezes"),
+        ({"collision": "sdc", "freezes": 65}, "freezes"),
+        ({"auto_impulse_pct": 0.0}, "auto_impulse_pct must be a number > 0"),
+        ({"auto_zmp_mm": np.nan}, "auto_zmp_mm"),
+    ],
+)
+def test_bad_models_are_named(changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        dataclasses.replace(arm_problem(), **changes)
+
+
+def test_one_word_list() -> None:
+    """A name means the same in a plan, in `impactopt collide` and in a sweep."""
+    assert set(FROZEN) <= set(COLLISIONS)
+    with pytest.raises(InputError, match="did you mean 'sdc-paper'"):
+        frozen_model("sdc paper")
+    alone = CliRunner().invoke(app, ["collide", "--help"]).output
+    assert all(name in alone for name in (*FROZEN, "full"))
+
+
+def test_a_file_says_it_and_a_result_too() -> None:
+    runner, extra = CliRunner(), ["--json", "-q", "--starts", "1"]
+    given = ["--set", 'collision.model="sdc"', "--set", "collision.freezes=2"]
+    done = runner.invoke(app, ["strike", "arm_planar", *given, *extra])
+    assert done.exit_code == 0, done.output
+    summary = json.loads(done.stdout)
+    assert (summary["collision_model"], summary["freezes"]) == ("sdc", 2)
+    assert 0 < abs(summary["model_error_pct"]) < 0.5
+    shown = runner.invoke(app, ["strike", "arm_planar", *given, "-q", "--starts", "1"])
+    text = " ".join(shown.stdout.replace("│", " ").split())
+    assert "model of the collision sdc, 2 freezes on the way" in text and "model error, impulse" in text
+
+
+def test_stretches_begin_with_elements() -> None:
+    problem = dataclasses.replace(arm_problem(), collision="sdc", freezes=5)
+    shares = guessed_shares(problem)
+    assert sum(shares) == pytest.approx(1) and min(shares) > 0.2
+    ends = [np.cumsum(lengths) for lengths in contact_elements(problem, shares)]
+    assert all(phase[-1] == pytest.approx(1) for phase in ends)
+    for k in range(1, 5):
+        phase, place = place_of(k / 5, shares)
+        near = [*ends[phase], 0.0]
+        assert min(abs(place - end) for end in near) * shares[phase] < 0.1 / 5 + 1e-9
+    # a boundary of stretches that is next to a phase's end gives way to it
+    lengths = contact_elements(problem, (0.399, 0.601))
+    assert min(h for phase in lengths for h in phase) > 0.02

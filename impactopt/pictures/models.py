@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from impactopt.pictures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, Picture, styled
 
@@ -39,6 +40,10 @@ def models_picture(rows: Sequence[Row]) -> Picture:
             face = "none" if r["stands"] is False else mark[0]
             error = max(abs(r["error_pct"]), LEAST)
             axes.plot(r["seconds"], error, mark[1], color=mark[0], markerfacecolor=face, markersize=6)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
         axes.set_title(problem, loc="left")
         axes.set_xlabel("solve [s]")
     panels[0].set_ylabel("impulse: plan against replay [%]")

@@ -28,6 +28,7 @@ _NEAR = 1e-2  # violation below which the objective may lead
 _TRIED, _SHORTER, _LEAST = 0.1, 0.2, 1e-4  # part of a step; of the radius after a refused one; its least
 _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a radius
 _ROUNDING = 1e-11
+_PATIENCE = 40  # iterations without less violation
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
 
@@ -82,7 +83,7 @@ class ReducedRun(Run):
         return status
 
     def _iterate(self) -> Status:
-        note = "start"
+        note, least, since = "start", np.inf, self.report.iterations
         while True:
             try:
                 self._reduction.load(self.point)
@@ -96,6 +97,10 @@ class ReducedRun(Run):
                 return Status.INTERRUPTED
             if self.report.iterations > self.options.max_iterations:
                 return Status.ITERATION_LIMIT
+            if self.point.violation < 0.9 * least or not self._excess():
+                least, since = self.point.violation, self.report.iterations
+            elif self.report.iterations > since + _PATIENCE:
+                return Status.FAILED
             found = self._advance(self.report.iterations)
             if isinstance(found, Status):
                 return found

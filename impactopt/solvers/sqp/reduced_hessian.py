@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,8 +14,10 @@ from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.point import Point, TimedProgram
 from impactopt.solvers.sqp.reduction import Reduction
 
-_FLOOR = 1e-3  # least eigenvalue
-_ACTIVE = 10.0  # weight of active rows in making the Hessian convex: it changes no step that keeps them
+_FLOOR = 1e-5  # least eigenvalue
+# weights of active rows that are tried in making the Hessian convex: they change no step that keeps the rows
+_ACTIVE = (0.0, 10.0, 1e2, 1e3, 1e4)
+_FIRST = 1e-2  # curvature that BFGS begins with
 _STEEP = 0.1  # curvature where only the violation counts
 
 
@@ -63,10 +66,8 @@ class ExactModel:
         # far from a solution multipliers may be anything
         H = self._program.hessian(point.x, 1.0, y)
         of_start = T.T @ H
-        B = of_start @ T + _ACTIVE * (active.T @ active)
-        values, vectors = la.eigh(0.5 * (B + B.T), check_finite=False)
-        B = (vectors * np.maximum(values, _FLOOR)) @ vectors.T
-        return ReducedModel(B, point.gradient, T, of_start)
+        B = of_start @ T
+        return ReducedModel(_convex(0.5 * (B + B.T), active), point.gradient, T, of_start)
 
     def forget(self) -> None:
         return None
@@ -80,7 +81,7 @@ class BFGSModel:
         self.forget()
 
     def forget(self) -> None:
-        self._B = 10 * _FLOOR * np.eye(self._reduction.free.size)
+        self._B = _FIRST * np.eye(self._reduction.free.size)
         self._last: tuple[Point, np.ndarray] | None = None
 
     def at(self, point: Point, y: Vector, active: np.ndarray, objective: bool) -> ReducedModel:
@@ -116,6 +117,18 @@ class BFGSModel:
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
+
+
+def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """B with the least weight of active rows that makes it convex; where none does, eigenvalues are lifted."""
+    rows, floor = active.T @ active, _FLOOR * np.eye(len(B))
+    for weight in _ACTIVE if len(active) else _ACTIVE[:1]:
+        made = B + weight * rows
+        with contextlib.suppress(la.LinAlgError):
+            la.cholesky(made - floor, check_finite=False)
+            return np.asarray(made)
+    values, vectors = la.eigh(B + _ACTIVE[1] * rows, check_finite=False)
+    return np.asarray((vectors * np.maximum(values, _FLOOR)) @ vectors.T)
 
 
 def _steep(point: Point, T: np.ndarray) -> ReducedModel:

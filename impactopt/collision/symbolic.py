@@ -111,13 +111,14 @@ class SymbolicModel(SteppedModel):
         outputs: tuple[str, ...] = ("zmp", "torque"),
         *,
         parameters: tuple[str, ...] = (),
+        by: tuple[str, ...] = ("q", "v"),
         every: int = 1,
     ) -> Any:
-        """A compiled ca.Function with the inputs of `function`, to outputs and their Jacobians by q and v.
+        """A compiled ca.Function with the inputs of `function`, to outputs and their Jacobians.
 
         Of each output, in turn: its value, `<output>_by_q` and `<output>_by_v` (number of its entries, nv),
         dense; rows are the entries column by column, instant after instant; q's Jacobian is in the basis of
-        v, as `pin.integrate` moves q. Instants stay where they are in time, but for that of separation, and
+        v, as `pin.integrate` moves q. `by` may have "feedforward", too. Instants stay where they are in time, but for that of separation, and
         those after it, which repeat it: they move with it.
 
         Only with implicit steps and a single freeze, and neither of what the target's `results` say nor of
@@ -129,7 +130,8 @@ class SymbolicModel(SteppedModel):
         whole = self._with_parameters(self._jacobian(tuple(outputs), every), parameters)
         inputs = [ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()]
         found = dict(zip(whole.name_out(), whole.call(inputs), strict=True))
-        kept = {name: x for name, x in found.items() if not name.endswith("_by_feedforward")}
+        others = tuple(f"_by_{name}" for name in ("q", "v", "feedforward") if name not in by)
+        kept = {name: x for name, x in found.items() if not others or not name.endswith(others)}
         return ca.Function(whole.name(), inputs, [*kept.values()], whole.name_in(), [*kept])
 
     def _jacobian(self, outputs: tuple[str, ...], every: int) -> Any:

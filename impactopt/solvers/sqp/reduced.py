@@ -28,6 +28,9 @@ _NEAR = 1e-2  # violation below which the objective may lead
 _TRIED, _SHORTER, _LEAST = 0.1, 0.2, 1e-4  # part of a step; of the radius after a refused one; its least
 _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a radius
 _ROUNDING = 1e-11
+# radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
+# solutions of the violation alone differ, so where one way ends in such a point the next is tried
+_ATTEMPTS = (0.5, False), (1.5, False), (0.5, True), (1.5, True)
 _PATIENCE = 40  # iterations without less violation
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
@@ -56,12 +59,12 @@ class ReducedRun(Run):
     def __init__(self, task: Task, determined: Sequence[Determined]):
         super().__init__(task)
         self._determined, self._filter = determined, list[Pair]()
-        self._radius, self._price, self._raised = self.options.radius / 2, self.options.price, 0
+        self._radius = self._widest = self.options.radius
+        self._price, self._raised = self.options.price, 0
         self._start: float | None = None  # of a phase in which only the violation counts: where it began
 
     def iterate(self) -> Status:
-        """From the start; and if that comes to a point of least violation, once more, with shorter steps towards
-        the equalities, as another way may lead elsewhere."""
+        """From the start, in one way after the other until one of them leads to a solution."""
         self.point = self.program.point(self.point.x)
         if not self.point.differentiable:
             return Status.FAILED
@@ -72,10 +75,11 @@ class ReducedRun(Run):
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
         status = Status.INFEASIBLE
-        for careful in (False, True):
+        for wide, careful in _ATTEMPTS:
             self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []
             self._qp.start_from(y, z)
-            self._qp.careful, self._price, self._raised = careful, self.options.price, self.report.iterations
+            self._qp.careful, self._widest = careful, wide * self.options.radius
+            self._price, self._raised = self.options.price, self.report.iterations
             self._begin_anew()
             status = self._iterate()
             if status not in (Status.INFEASIBLE, Status.FAILED):
@@ -196,7 +200,7 @@ class ReducedRun(Run):
                 self._filter = []
                 self._begin_anew()
         if taken.length == 1.0:
-            self._radius = min(2.0 * self._radius, self.options.radius / 2)
+            self._radius = min(2.0 * self._radius, self._widest)
         elif taken.length < _TRIED:
             self._radius = max(0.5 * self._radius, 1e-3)
         rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
@@ -211,13 +215,13 @@ class ReducedRun(Run):
             return Status.INFEASIBLE
         self._start = self.point.violation
         self._filter.append(Pair(self.point.violation, self.point.objective))
-        self._radius, self._price = self.options.radius / 2, self.options.price
+        self._radius, self._price = self._widest, self.options.price
         return None
 
     def _begin_anew(self) -> None:
         self._start = None
         self._model.forget()
-        self._radius = self.options.radius / 2
+        self._radius = self._widest
 
     # ------------------------------------------------------------------ multipliers
     def _take_multipliers(self, solved: Solved) -> None:

@@ -166,6 +166,7 @@ def _solve(
     problem: Annotated[
         str | None, typer.Option("--problem", metavar="NAME", help="One problem, or its file (default: all).")
     ] = None,
+    kind: Annotated[str, typer.Option(metavar="KIND", help="motion, or strike: the blow alone.")] = "motion",
     starts: Annotated[int, typer.Option(min=1, help="Starts: the plain one, and perturbed ones.")] = 3,
     time_limit: Annotated[float, typer.Option(min=0.1, help="Of one solve [s].")] = 60.0,
     solvers: Annotated[

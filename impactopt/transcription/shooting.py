@@ -28,7 +28,7 @@ from impactopt.transcription.rows import Index
 INSTANTS = 12  # after contact, at which rows hold
 FORCE = 100.0  # [N] unit of the peak force among the outputs
 _BEND = 1.0  # [rad/s^2] of differences by the reference's bend, in which the collision is all but linear
-_HORIZONS = (2e-3, 5e-3, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)  # [s]: few, as one is compiled in
+_HORIZONS = (2e-3, 5e-3, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.4)  # [s]: few, as one is compiled in
 
 
 class _Called:

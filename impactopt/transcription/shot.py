@@ -25,7 +25,8 @@ from impactopt.transcription.plan import PlannedCollision, PlannedScenario, tota
 from impactopt.transcription.rows import Index, Measure, percent
 from impactopt.transcription.shooting import FORCE, INSTANTS, Shooting, horizon_of, shot_block
 
-_SLOWER = 1.6  # a robot's contact against that of a point mass in its place, at most
+# a robot's contact against that of a point mass of 1 m/s in its place, at most
+_SLOWER, _DRIVEN = 1.6, 4.0
 _ENDED = 0.98  # of the horizon
 
 
@@ -44,9 +45,10 @@ class Shot:
         ends = np.arange(len(p.target.phases), dtype=np.intp), np.ones(len(p.target.phases))
         natural = float(blow(law, target, mass, 1.0, *ends).durations.sum())
         cone, self._least = self._cone()
-        self.shooting = Shooting(
-            p, b.coordinates, law, target, horizon=horizon_of(_SLOWER * natural), cone=cone
-        )
+        # a target that is driven takes the longer the harder it is hit
+        slower = _SLOWER * natural if p.target.turns else _DRIVEN * natural
+        horizon = horizon_of(min(slower, 2 * p.contact_duration[1]))
+        self.shooting = Shooting(p, b.coordinates, law, target, horizon=horizon, cone=cone)
         self.w = b.layout.add(f"sole wrenches in collision{self.suffix}", 0, b.nw)
 
     def _cone(self) -> tuple[Array, Array]:

@@ -118,8 +118,9 @@ class SymbolicModel(SteppedModel):
 
         Of each output, in turn: its value, `<output>_by_q` and `<output>_by_v` (number of its entries, nv),
         dense; rows are the entries column by column, instant after instant; q's Jacobian is in the basis of
-        v, as `pin.integrate` moves q. `by` may have "feedforward", too. Instants stay where they are in time, but for that of separation, and
-        those after it, which repeat it: they move with it.
+        v, as `pin.integrate` moves q. `by` may have "feedforward", too. Instants stay
+        where they are in time, but for that of separation, and those after it, which repeat it: they move
+        with it.
 
         Only with implicit steps and a single freeze, and neither of what the target's `results` say nor of
         configuration and velocity: else InputError. For more than a few collisions, a horizon not much longer

@@ -82,9 +82,9 @@ def optimize_strike(
     strike is a bound on the motion's. There are local optima, so different postures can differ by a factor.
 
     method : "collocation", the whole equation of motion while the contact lasts, as in a motion; or
-        "shooting", what the SDC predicts, with H, J and bias frozen at contact: a program of few variables, by
-        quasi-Newton steps. Of a hammer's blow both say the same within 1 %; of a push of 60 ms impulses differ by
-        some percent, and torques by more.
+        "shooting", what the SDC predicts, with H, J and bias frozen at contact: a program of few variables,
+        by quasi-Newton steps. Of a hammer's blow both say the same within 1 %; of a push of 60 ms impulses
+        differ by some percent, and torques by more.
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`. By shooting the solver is
         the SQP with a QP solver: DAQP if it is installed, else OSQP, unless `options` name one.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
@@ -93,11 +93,14 @@ def optimize_strike(
 
     Raises
     ------
-    InputError : an unknown method, solver or option; a problem that the method has no slopes of, a start of the wrong length, several of a given start, a problem
-        with objectives of a whole motion only.
+    InputError : an unknown method, solver or option; a problem that the method has no slopes
+        of, a start of the wrong length, several of a given start, a problem with objectives of a whole
+        motion only.
     """
     if method not in METHODS:
-        raise InputError(f"unknown method {method!r}{did_you_mean(method, METHODS)}: give {' or '.join(METHODS)}")
+        raise InputError(
+            f"unknown method {method!r}{did_you_mean(method, METHODS)}: give {' or '.join(METHODS)}"
+        )
     if method == "shooting":
         options = _of_shooting(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)

@@ -25,7 +25,7 @@ from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
-from impactopt.transcription.shot import Shot, Shots
+from impactopt.transcription.shot import Shot
 from impactopt.transcription.structured import StructuredProgram
 
 Program = TypeVar("Program", bound="ContactProgram")
@@ -54,7 +54,7 @@ class ContactProgram(ABC):
     apart_rows : rows between bodies.
     """
 
-    def __init__(self, builder: Builder, hit: Hit | Shots) -> None:
+    def __init__(self, builder: Builder, hit: Hit) -> None:
         self.builder, self.hit = builder, hit
         self.problem, self.coordinates, self.robot = builder.problem, builder.coordinates, builder.robot
         self.functions, self.y0, self.legs0 = builder.functions, builder.y0, builder.legs0
@@ -95,7 +95,7 @@ class ContactProgram(ABC):
         self.builder.equal(term, place, components, outputs, measure)
 
     @property
-    def expected(self) -> Collision | InstantImpact | Shot:
+    def expected(self) -> Collision | InstantImpact:
         """The collision with the expected target."""
         return self.hit.expected
 
@@ -136,18 +136,19 @@ class ContactProgram(ABC):
 
     def target_energy(self) -> Affine:
         """[J] in the target at separation, as a variable."""
-        if isinstance(self.expected, Shot):
-            return self.expected.target_energy()
+        hit: Any = self.expected
+        if isinstance(hit, Shot):
+            return hit.target_energy()
         numbers = np.array(list(self.problem.target.parameters.values()))
         at = self.add_block("energy", [[self.expected.target_state]], numbers)
         return self.lift("target energy", np.array([at]))[0]
 
     def peak_force(self) -> Affine:
         """The largest contact force [N], of one that lasts, as a variable."""
-        if isinstance(self.expected, Shot):
-            return self.expected.peak_force()
-        assert isinstance(self.expected, Collision)
-        forces = self.expected.f
+        hit: Any = self.expected
+        if isinstance(hit, Shot):
+            return hit.peak_force()
+        forces = hit.f
         at = self.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
         return self.lift("peak force", np.array([at]))[0] * PEAK_SCALE
 

@@ -65,8 +65,8 @@ class State(NamedTuple):
 
 
 class Shooting:
-    """The collision with one target as a function of z = y, ydot (ny each), legs (nl), feed-forward over limit
-    (n).
+    """The collision with one target as a function of z = y, ydot (ny each), legs (nl), feed-forward over
+    limit (n).
 
     horizon [s] : no less than the contact lasts.  cone (facets, 6 a sole) : rows of the soles' wrenches.
 
@@ -113,12 +113,21 @@ class Shooting:
         self.parts = {name: np.arange(a, b) for name, a, b in zip(sizes, ends, ends[1:], strict=False)}
         self.n_in, self.n_out = 2 * self.ny + self.nl + self.n, int(ends[-1])
         soles = ("sole_wrench",) if c.legs else ()
-        self._carried = ("impulse", "duration", "energy", "peak_force", "time", "demand", "joint_velocity", *soles)
+        self._carried = (
+            "impulse",
+            "duration",
+            "energy",
+            "peak_force",
+            "time",
+            "demand",
+            "joint_velocity",
+            *soles,
+        )
 
     # ------------------------------------------------------------------ compiled
     @cached_property
     def _value(self) -> _Called:
-        rest = ("force", "target_speed", "hand_speed")
+        rest: tuple[str, ...] = ("force", "target_speed", "hand_speed")
         rest += ("target_result",) if self.model.target.results else ()
         return _Called(self.model.function((*self._carried, *rest), parameters=("reference",), by=()))
 
@@ -134,7 +143,9 @@ class Shooting:
             (leg.sole.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)), *map(tuple, leg.order))
             for leg in c.legs
         )
-        found = cached(f"{self.robot.name}-coasting", (model_hash(self.robot.model), held), lambda: [_coasting(c)])
+        found = cached(
+            f"{self.robot.name}-coasting", (model_hash(self.robot.model), held), lambda: [_coasting(c)]
+        )
         return _Called(found["coasting_state"])
 
     def state(self, y: Array, rates: Array, legs: Array) -> State:
@@ -160,7 +171,9 @@ class Shooting:
         state = self.state(*self._split(z)[:3])
         found = self._value(**self._inputs(z, state))
         columns = INSTANTS + 1
-        return {k: (v.reshape(columns, -1).copy() if v.size > columns else v.copy()) for k, v in found.items()}
+        return {
+            k: (v.reshape(columns, -1).copy() if v.size > columns else v.copy()) for k, v in found.items()
+        }
 
     def value(self, z: Array) -> Array:
         """(n_out,)."""
@@ -185,7 +198,7 @@ class Shooting:
         return out, rates, moved
 
     def _of_joints(self, joints: Array, state: State) -> Array:
-        """Rates of coordinates (ny, ...) of joint velocities (n, ...), with the soles' Jacobian of contact."""
+        """Rates of coordinates (ny, ...) of joint velocities (n, ...), with the soles' Jacobian."""
         c = self.coordinates
         out = np.empty((self.ny, *joints.shape[1:]))
         out[c.base :] = joints[c.independent]
@@ -215,7 +228,11 @@ class Shooting:
         ways[nv:, : 2 * ny + nl] = state.slopes
 
         def by_z(name: str, first: int = 0) -> Array:
-            parts = (self._jacobian.matrix(f"{name}_by_q"), self._jacobian.matrix(f"{name}_by_v"), by_bend[name])
+            parts = (
+                self._jacobian.matrix(f"{name}_by_q"),
+                self._jacobian.matrix(f"{name}_by_v"),
+                by_bend[name],
+            )
             made = np.hstack([part[first:] for part in parts]) @ ways
             made[:, 2 * ny + nl :] += self._jacobian.matrix(f"{name}_by_feedforward")[first:] * limit
             return np.asarray(made)

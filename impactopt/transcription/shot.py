@@ -33,7 +33,9 @@ _ENDED = 0.98  # of the horizon
 class Shot:
     """The contact with one target. Attributes as of `Collision`, so far as a strike asks for them."""
 
-    def __init__(self, b: Builder, contact: Contact, mass: float, number: int, scenario: Scenario | None = None):
+    def __init__(
+        self, b: Builder, contact: Contact, mass: float, number: int, scenario: Scenario | None = None
+    ):
         self._b, self.contact, self.number, self.scenario = b, contact, number, scenario
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
         self.law, self.target = b.problem.law.parameters, b.problem.target.parameters
@@ -57,8 +59,12 @@ class Shot:
         margin = self.scenario.cone_margin if self.scenario else cone.collision_margin
         minimum = 0.0 if self.scenario else cone.minimum_force
         rows, least = [np.zeros((0, b.nw))], [np.zeros(0)]
-        for k, leg in enumerate(b.coordinates.legs if margin is not None else ()):
-            own = np.vstack([contact_wrench_cone(leg.sole.polygon, cone.friction, margin=margin), np.eye(6)[2]])
+        for k, leg in enumerate(b.coordinates.legs):
+            if margin is None:
+                continue
+            own = np.vstack(
+                [contact_wrench_cone(leg.sole.polygon, cone.friction, margin=margin), np.eye(6)[2]]
+            )
             wide = np.zeros((len(own), b.nw))
             wide[:, 6 * k : 6 * k + 6] = own / b.limits.weight
             rows.append(wide)
@@ -82,7 +88,9 @@ class Shot:
         self._rate = b.lift(f"{name}rate after contact", self.outputs("rate"), place=place, labels=c.labels)
         self._legs = None
         if c.legs:
-            self._legs = b.lift(f"{name}legs after contact", self.outputs("legs"), place=place, **limits.of_legs)
+            self._legs = b.lift(
+                f"{name}legs after contact", self.outputs("legs"), place=place, **limits.of_legs
+            )
         instants = [f"instant {k + 1}" for k in range(INSTANTS)]
         b.rows.add(
             term=f"{limits.torque.name} in collision",
@@ -138,7 +146,7 @@ class Shot:
         return compression, float(hit.time[-1]) - compression
 
     def decode(self, x: Array) -> tuple[PlannedCollision, float, float]:
-        """The collision that solver variables (n,) stand for; compression [s]; hand speed at contact [m/s]."""
+        """The collision that solver variables (n,) stand for; compression [s]; hand speed [m/s]."""
         b, c = self._b, self._b.coordinates
         z = stack(
             [self.contact.state.y, self.contact.u0[0], self.contact.state.legs, self.contact.feedforward[0]]

@@ -159,5 +159,5 @@ class ShootingStrike(StrikeTranscription):
     second derivatives are not known: for quasi-Newton methods.
     """
 
-    def _make_hit(self, b: Builder, contact: Contact) -> Shots:
+    def _make_hit(self, b: Builder, contact: Contact) -> Any:
         return Shots(b, contact)

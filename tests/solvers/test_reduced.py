@@ -33,7 +33,12 @@ def chain(bound: float = 3.0) -> Chain:
     return Chain(
         4,
         lambda a, b, c, d: -c + (d - 1) ** 2 + 0.1 * a**2,
-        lambda a, b, c, d: [(0, b - ca.sin(a), 0), (0, c - b**2 - a, 0), (0, a * d - 1, 0), (-INF, c + d, bound)],
+        lambda a, b, c, d: [
+            (0, b - ca.sin(a), 0),
+            (0, c - b**2 - a, 0),
+            (0, a * d - 1, 0),
+            (-INF, c + d, bound),
+        ],
         lower=-3,
         upper=3,
     )

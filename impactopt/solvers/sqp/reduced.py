@@ -138,7 +138,9 @@ class ReducedRun(Run):
         begin, limit = self.report.elapsed(), self.options.time_limit
         left = None if limit is None else limit - begin
         try:
-            return self._qp.solve(self.point, model, g, radius=self._radius, price=self._price, time_limit=left)
+            return self._qp.solve(
+                self.point, model, g, radius=self._radius, price=self._price, time_limit=left
+            )
         finally:
             self.report.seconds_qp += self.report.elapsed() - begin
 
@@ -170,7 +172,9 @@ class ReducedRun(Run):
             relief = before.violation - solved.linear_violation
             enough = relief > 1e-10 * before.violation and h <= before.violation - _ARMIJO * length * relief
             return False if enough else None
-        if h > self._most or any(h > 0.999 * p.violation and f > p.objective - 1e-4 * h for p in self._filter):
+        if h > self._most or any(
+            h > 0.999 * p.violation and f > p.objective - 1e-4 * h for p in self._filter
+        ):
             return None
         slope = float(before.gradient @ solved.d)
         noise = _ROUNDING * (1.0 + abs(before.objective))
@@ -193,7 +197,9 @@ class ReducedRun(Run):
             self._take_multipliers(taken.solved)
         else:
             self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
-            beats = all(h <= 0.999 * p.violation or taken.point.objective <= p.objective for p in self._filter)
+            beats = all(
+                h <= 0.999 * p.violation or taken.point.objective <= p.objective for p in self._filter
+            )
             if h <= max(_MET * self._start, self.options.violation_tolerance) and beats:
                 self._begin_anew()
             elif taken.point.max_violation <= self.options.violation_tolerance:

@@ -1,4 +1,4 @@
-"""Convex quadratic models in the directions that a reduction leaves: exact and made convex, or damped BFGS."""
+"""Convex quadratic models in the directions that a reduction leaves: exact, made convex, or BFGS."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from impactopt.solvers.sqp.reduction import Reduction
 _FLOOR = 1e-5  # least eigenvalue
 # weights of active rows that are tried in making the Hessian convex: they change no step that keeps the rows
 _ACTIVE = (0.0, 10.0, 1e2, 1e3, 1e4)
+_LEARNED = 1e-3  # least eigenvalue of what BFGS has learned
 _FIRST = 1e-2  # curvature that BFGS begins with
 _STEEP = 0.1  # curvature where only the violation counts
 
@@ -44,8 +45,8 @@ class ModelRule(Protocol):
     """Makes the model at a point."""
 
     def at(self, point: Point, y: Vector, active: np.ndarray, objective: bool) -> ReducedModel:
-        """Of the Lagrangian with multipliers y (m,); active (a, r): unit rows that hold; objective: whether it
-        counts, or the violation alone."""
+        """Of the Lagrangian with multipliers y (m,); active (a, r): unit rows that hold; objective: whether
+        it counts, or the violation alone."""
         ...
 
     def forget(self) -> None:
@@ -74,7 +75,7 @@ class ExactModel:
 
 
 class BFGSModel:
-    """Powell's damped update of the reduced Hessian in the free variables (Nocedal, Wright 2006, sec. 18.3)."""
+    """Powell's damped update of the reduced Hessian in the free variables (Nocedal, Wright 2006, 18.3)."""
 
     def __init__(self, reduction: Reduction):
         self._reduction = reduction
@@ -97,11 +98,11 @@ class BFGSModel:
         of_start[:, reduction.free] = free.T @ self._B
         B = of_start @ reduction.T
         values, vectors = la.eigh(0.5 * (B + B.T), check_finite=False)
-        B = (vectors * np.maximum(values, _FLOOR)) @ vectors.T
+        B = (vectors * np.maximum(values, _LEARNED)) @ vectors.T
         return ReducedModel(B, point.gradient, reduction.T, of_start)
 
     def _update(self, point: Point, y: Vector) -> None:
-        """With rows' multipliers that are the same at both points; equalities have none in these variables."""
+        """With rows' multipliers that are the same at both points; equalities have none here."""
         assert self._last is not None
         before, basis = self._last
         reduction = self._reduction
@@ -120,7 +121,7 @@ class BFGSModel:
 
 
 def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """B with the least weight of active rows that makes it convex; where none does, eigenvalues are lifted."""
+    """B with the least weight of active rows that makes it convex; else eigenvalues are lifted."""
     rows, floor = active.T @ active, _FLOOR * np.eye(len(B))
     for weight in _ACTIVE if len(active) else _ACTIVE[:1]:
         made = B + weight * rows

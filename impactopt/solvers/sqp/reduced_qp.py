@@ -25,8 +25,8 @@ _LARGEST, _CAREFUL = 1e4, 0.8
 
 @dataclass(frozen=True)
 class Solved:
-    """A step d (n,); multipliers y (m,) and z (n,) of all but the equalities; what the linearized rows are off
-    by; rows of the QP, and those elastic; iterations of its solver."""
+    """A step d (n,); multipliers y (m,) and z (n,) of all but the equalities; what the linearized rows are
+    off by; rows of the QP, and those elastic; iterations of its solver."""
 
     d: Vector
     y: Vector
@@ -92,7 +92,9 @@ class ReducedQP:
         guess = np.zeros(T.shape[1])
         for _ in range(_ROUNDS):
             which = np.flatnonzero(working)
-            qp = _elastic(model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which])
+            qp = _elastic(
+                model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which]
+            )
             room = np.zeros(qp.n - guess.size)
             start = np.concatenate([guess, room]), unit[which], np.zeros(qp.n)
             found = self._solver.solve(qp, start=start, time_limit=time_limit)

@@ -1,4 +1,4 @@
-"""A program's linearization in few variables: what rows determine is eliminated, equalities that are left too.
+"""A program's linearization in few variables: what rows determine is eliminated, and equalities left.
 
 Rows that determine variables of their own (`Determined`) give x_D = x_D(x_F) to first order, as a shooting
 method has by integration; of the free variables x_F only those directions are left that keep the other
@@ -82,8 +82,8 @@ class Reduction:
         self.T = Z @ Q[:, rank:]
 
     def normal(self, g: Vector) -> Vector:
-        """The step (n,) that meets the linearized equalities, as well as they can be, whose values are g (m,);
-        the shortest of the free variables."""
+        """The step (n,) that meets the linearized equalities, as well as they can be, whose values are g
+        (m,); the shortest of the free variables."""
         d = np.zeros(self._n)
         if self.gone.size:
             d[self.variables] = -self._factors.solve(g[self.gone] - self._level[self.gone])

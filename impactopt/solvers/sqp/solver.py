@@ -54,11 +54,8 @@ def solve_sqp(
     task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z)
     interior = options.qp_solver == "interior"
     determined = getattr(program, "determined", ())
-    run: Run
-    if interior:
-        run = InteriorRun(task)
-    else:
-        run = ReducedRun(task, determined) if determined else Sl1QPRun(task)
+    reduced = ReducedRun(task, determined) if determined and not interior else None
+    run: Run = reduced or (InteriorRun if interior else Sl1QPRun)(task)
     # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
     with threadpool_limits(limits=1 if interior or determined else None, user_api="blas"):
         try:

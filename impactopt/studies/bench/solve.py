@@ -30,6 +30,7 @@ VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative
 NOISE = 0.1  # [rad] of the posture at contact in a perturbed start
 SPEEDS = (0.5, 1.5)  # [m/s] of the strike in a perturbed start
 QUICK = ("sqp:interior", "ipopt")
+KINDS = ("motion", "strike")
 KEYS = ("problem", "solver", "start", "time_limit")  # of an attempt
 
 COLUMNS = (
@@ -72,7 +73,8 @@ def run(
     """
     if kind not in KINDS:
         raise InputError(f"kind {kind!r}{did_you_mean(kind, KINDS)}: give {' or '.join(KINDS)}")
-    makes: dict[str, Make] = {path.stem: partial(KINDS[kind], path, seed) for path in _files(problem)}
+    made = strike_program if kind == "strike" else planning_program
+    makes: dict[str, Make] = {path.stem: partial(made, path, seed) for path in _files(problem)}
     chosen = _chosen(solvers or (QUICK if quick else tuple(SOLVERS)))
     number = 1 if quick else starts
     kept = Kept(attempts, KEYS, resume=resume)
@@ -125,9 +127,6 @@ def _drawn(seed: int, start: int) -> dict[str, Any]:
 def _told(problem: str, kind: str) -> str:
     """What the file of attempts calls a problem's motion, or its strike."""
     return problem if kind == "motion" else f"{problem}, {kind}"
-
-
-KINDS = {"motion": planning_program, "strike": strike_program}
 
 
 def summary(problem: str, attempts: Mapping[str, Sequence[Attempt]]) -> list[dict[str, Any]]:

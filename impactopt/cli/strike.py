@@ -33,6 +33,9 @@ def strike(
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="Directory for the numbers."),
     ] = None,
+    method: Annotated[
+        str, typer.Option(metavar="METHOD", help="Of the contact: collocation, or shooting (by the SDC).")
+    ] = "collocation",
     starts: Starts = 4,
     seed: Seed = 0,
     solver: SolverName = None,
@@ -66,6 +69,7 @@ def strike(
             progress.say("building the program (compiles for a minute or two the first time)")
             solution = optimize_strike(
                 problem,
+                method=method,
                 starts=starts,
                 seed=seed,
                 report=progress.say,

@@ -118,15 +118,16 @@ class SymbolicModel(SteppedModel):
         outputs: tuple[str, ...] = ("zmp", "torque"),
         *,
         parameters: tuple[str, ...] = (),
+        by: tuple[str, ...] = ("q", "v"),
         every: int = 1,
     ) -> Any:
-        """A compiled ca.Function with the inputs of `function`, to outputs and their Jacobians by q and v.
+        """A compiled ca.Function with the inputs of `function`, to outputs and their Jacobians.
 
         For each output there are its value, `<output>_by_q` and `<output>_by_v` (number of entries, nv),
-        dense. Rows are the entries column by column, one instant after the other. The Jacobian by q is in
-        the basis of v, as `pin.integrate` moves q. The instants of a history are fixed in time, except that
-        of separation, which moves with it, and those after it, which repeat it. A horizon that is not much
-        longer than the contact keeps the Jacobians small.
+        dense; `by` may have "feedforward", too. Rows are the entries column by column, one instant after the
+        other. The Jacobian by q is in the basis of v, as `pin.integrate` moves q. The instants of a history
+        are fixed in time, except that of separation, which moves with it, and those after it, which repeat
+        it. A horizon that is not much longer than the contact keeps the Jacobians small.
 
         Raises
         ------
@@ -138,7 +139,8 @@ class SymbolicModel(SteppedModel):
         whole = self._with_parameters(self._jacobian(tuple(outputs), every), parameters)
         inputs = [ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()]
         found = dict(zip(whole.name_out(), whole.call(inputs), strict=True))
-        kept = {name: x for name, x in found.items() if not name.endswith("_by_feedforward")}
+        others = tuple(f"_by_{name}" for name in ("q", "v", "feedforward") if name not in by)
+        kept = {name: x for name, x in found.items() if not others or not name.endswith(others)}
         return ca.Function(whole.name(), inputs, [*kept.values()], whole.name_in(), [*kept])
 
     def _jacobian(self, outputs: tuple[str, ...], every: int) -> Any:

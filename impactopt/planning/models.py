@@ -36,12 +36,13 @@ _HORIZON = 0.2  # [s] at least
 _SHARE, _GUESSED = 0.5, 1.0  # of the fastest blow, or [m/s] where there is none: how the first rung is chosen
 
 
-def model_error(t: ContactProgram, x: Array) -> ModelError | None:
+def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
     """How far the model of a program's collision is from full dynamics, for solver variables (n,).
 
+    problem : whose model it is, if not the program's problem's.
     None where nothing is frozen; for an impact with a given restitution; and where a contact has no end.
     """
-    problem, c = t.problem, t.coordinates
+    problem, c = problem or t.problem, t.coordinates
     if problem.collision in ("full", "auto", "rigid"):
         return None
     y, legs = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from impactopt.problem.objectives import Objective
+from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
 from impactopt.transcription.apart import ApartRow, Held, add_apart_rows
@@ -24,6 +25,7 @@ from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
+from impactopt.transcription.shot import Shot
 from impactopt.transcription.structured import StructuredProgram
 
 Program = TypeVar("Program", bound="ContactProgram")
@@ -131,6 +133,24 @@ class ContactProgram(ABC):
     def deepest_penetration(self) -> Affine:
         """[m], of a contact that lasts: at the end of compression, as a variable."""
         return self.lift("deepest penetration", self.hit.deepest)[0] * DEPTH_SCALE
+
+    def target_energy(self) -> Affine:
+        """[J] in the target at separation, as a variable."""
+        hit: Any = self.expected
+        if isinstance(hit, Shot):
+            return hit.target_energy()
+        numbers = np.array(list(self.problem.target.parameters.values()))
+        at = self.add_block("energy", [[self.expected.target_state]], numbers)
+        return self.lift("target energy", np.array([at]))[0]
+
+    def peak_force(self) -> Affine:
+        """The largest contact force [N], of one that lasts, as a variable."""
+        hit: Any = self.expected
+        if isinstance(hit, Shot):
+            return hit.peak_force()
+        forces = hit.f
+        at = self.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
+        return self.lift("peak force", np.array([at]))[0] * PEAK_SCALE
 
     def squares(self, group: Group) -> Quantity:
         """The sum of the squares of a group's variables, in physical units."""

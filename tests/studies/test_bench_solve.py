@@ -279,3 +279,17 @@ def test_infeasible_programs_are_told_by_our_solvers() -> None:
     program, x0 = infeasible()
     for solver in ("sqp:interior", "ipopt"):
         assert SOLVERS[solver].run(program, x0, 10.0).status is Status.INFEASIBLE
+
+
+def test_strikes_have_rows_of_their_own(tmp_path: Path) -> None:
+    file = tmp_path / "solve.jsonl"
+    found = solve.run(
+        quiet, problem="arm_planar", kind="strike", starts=1, solvers=("sqp:osqp",), attempts=file
+    ).numbers
+    (row,) = found["rows"]
+    assert list(row) == KEYS
+    assert (row["problem"], row["qp"], row["success"]) == ("arm_planar", "osqp", 1.0)
+    assert found["kind"] == "strike"
+    assert json.loads(file.read_text())["problem"] == "arm_planar, strike"
+    with pytest.raises(InputError, match="did you mean 'strike'"):
+        solve.run(quiet, kind="stroke", attempts=file)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
-import numpy as np
 
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.objectives.base import WEIGHT, Objective
@@ -32,9 +31,7 @@ class PeakForce(Objective):
         return {"peak": BlockRecipe(peak, of_stages=True)}
 
     def quantity(self, program: Any) -> Any:
-        forces = program.expected.f
-        at = program.add_block("peak", [[forces[i] for i in range(forces.count)]], np.zeros(0))
-        return program.lift("peak force", np.array([at]))[0] * TYPICAL
+        return program.peak_force()
 
 
 def peak(stages: int) -> BlockExpression:

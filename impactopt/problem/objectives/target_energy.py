@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import casadi as ca
-import numpy as np
 
 from impactopt.contact.targets.base import Target
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
@@ -28,9 +27,7 @@ class TargetEnergy(Objective):
         return {"energy": BlockRecipe(lambda: energy(problem.target), problem.target.formula())}
 
     def quantity(self, program: Any) -> Any:
-        numbers = np.array(list(program.problem.target.parameters.values()))
-        at = program.add_block("energy", [[program.expected.target_state]], numbers)
-        return program.lift("target energy", np.array([at]))[0]
+        return program.target_energy()
 
 
 def energy(target: Target) -> BlockExpression:

@@ -10,7 +10,8 @@ from impactopt.errors import check_array
 from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, check_program
 from impactopt.solvers.sqp.interior import InteriorRun
 from impactopt.solvers.sqp.options import SQPOptions
-from impactopt.solvers.sqp.run import Task
+from impactopt.solvers.sqp.reduced import ReducedRun
+from impactopt.solvers.sqp.run import Run, Task
 from impactopt.solvers.sqp.sl1qp import Sl1QPRun
 
 
@@ -52,9 +53,11 @@ def solve_sqp(
     options = options or SQPOptions()
     task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z)
     interior = options.qp_solver == "interior"
-    run = (InteriorRun if interior else Sl1QPRun)(task)
+    determined = getattr(program, "determined", ())
+    reduced = ReducedRun(task, determined) if determined and not interior else None
+    run: Run = reduced or (InteriorRun if interior else Sl1QPRun)(task)
     # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
-    with threadpool_limits(limits=1 if interior else None, user_api="blas"):
+    with threadpool_limits(limits=1 if interior or determined else None, user_api="blas"):
         try:
             status = run.iterate()
         except KeyboardInterrupt:

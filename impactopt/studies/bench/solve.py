@@ -23,13 +23,14 @@ from impactopt.studies.bench.kept import Kept
 from impactopt.studies.bench.solvers import SOLVERS
 from impactopt.studies.report import Report, Say, columns_table
 
-__all__ = ["ATTEMPTS", "planning_program", "run", "summary"]
+__all__ = ["ATTEMPTS", "KINDS", "planning_program", "run", "strike_program", "summary"]
 
 ATTEMPTS = Path("results/bench/solve.jsonl")
 VIOLATION, KKT, LOSS = 1e-6, 1e-4, 0.01  # at most, of a success; loss: relative to the best known objective
 NOISE = 0.1  # [rad] of the posture at contact in a perturbed start
 SPEEDS = (0.5, 1.5)  # [m/s] of the strike in a perturbed start
 QUICK = ("sqp:interior", "ipopt")
+KINDS = ("motion", "strike")
 KEYS = ("problem", "solver", "start", "time_limit")  # of an attempt
 
 COLUMNS = (
@@ -49,6 +50,7 @@ def run(
     say: Say,
     *,
     problem: str | None = None,
+    kind: str = "motion",
     starts: int = 3,
     time_limit: float = 60.0,
     seed: int = 0,
@@ -59,29 +61,33 @@ def run(
 ) -> Report:
     """One row a problem and solver.
 
-    problem : one of `problem_names()`, or a file; default: all.  starts : the plain first iterate,
+    problem : one of `problem_names()`, or a file; default: all.  kind : "motion", or the "strike" alone, of
+    collocated contact.  starts : the plain first iterate,
     and perturbed ones.  time_limit [s] : of one solve.  solvers : labels in `SOLVERS`; default: all.
     quick : one start, our default and IPOPT.  attempts : file that keeps every solve, a JSON object a line.
     resume : do not repeat solves that it has.
 
     Raises
     ------
-    InputError : an unknown problem or solver; the file cannot be written or read.
+    InputError : an unknown problem, kind or solver; the file cannot be written or read.
     """
-    makes: dict[str, Make] = {path.stem: partial(planning_program, path, seed) for path in _files(problem)}
+    if kind not in KINDS:
+        raise InputError(f"kind {kind!r}{did_you_mean(kind, KINDS)}: give {' or '.join(KINDS)}")
+    made = strike_program if kind == "strike" else planning_program
+    makes: dict[str, Make] = {path.stem: partial(made, path, seed) for path in _files(problem)}
     chosen = _chosen(solvers or (QUICK if quick else tuple(SOLVERS)))
     number = 1 if quick else starts
     kept = Kept(attempts, KEYS, resume=resume)
     rows = []
     for name, make in makes.items():
         found = {
-            label: [_one(say, kept, name, make, label, start, time_limit) for start in range(number)]
+            label: [_one(say, kept, _told(name, kind), make, label, k, time_limit) for k in range(number)]
             for label in chosen
         }
         rows += summary(name, found)
     shown = [{**row, "label": f"{row['solver']}:{row['qp']}".rstrip(":")} for row in rows]
     table = columns_table(f"starts: {number}, of at most {time_limit:g} s each", COLUMNS, shown)
-    settings = {"starts": number, "time_limit": time_limit, "seed": seed}
+    settings = {"kind": kind, "starts": number, "time_limit": time_limit, "seed": seed}
     return Report(name="solve", numbers={"rows": rows, **settings}, tables=(table,))
 
 
@@ -95,11 +101,32 @@ def planning_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgra
 
     problem = load_problem(file)
     transcription = Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+    return transcription.program, first_iterate(transcription, **_drawn(seed, start))
+
+
+def strike_program(file: Path, seed: int, start: int) -> tuple[NonlinearProgram, Vector]:
+    """As :func:`planning_program`, of the strike."""
+    from impactopt.files.problem_file import load_problem
+    from impactopt.transcription.start import strike_iterate
+    from impactopt.transcription.strike import StrikeTranscription
+    from impactopt.transcription.transcription import block_functions
+
+    problem = load_problem(file)
+    c = problem.coordinates
+    transcription = StrikeTranscription(problem, c, block_functions(problem, c))
+    return transcription.program, strike_iterate(transcription, **_drawn(seed, start))
+
+
+def _drawn(seed: int, start: int) -> dict[str, Any]:
     if start == 0:
-        return transcription.program, first_iterate(transcription)
+        return {}
     speed = float(np.random.default_rng([seed, start]).uniform(*SPEEDS))
-    drawn = 1000 * seed + start
-    return transcription.program, first_iterate(transcription, speed=speed, noise=NOISE, seed=drawn)
+    return {"speed": speed, "noise": NOISE, "seed": 1000 * seed + start}
+
+
+def _told(problem: str, kind: str) -> str:
+    """What the file of attempts calls a problem's motion, or its strike."""
+    return problem if kind == "motion" else f"{problem}, {kind}"
 
 
 def summary(problem: str, attempts: Mapping[str, Sequence[Attempt]]) -> list[dict[str, Any]]:

@@ -1,0 +1,266 @@
+"""Sequential quadratic programming in few variables: reduced QPs, solved to their end, and a filter.
+
+What rows determine is eliminated from every QP (`reduction`), the rows that a QP needs are added to it when
+they are missed, and what cannot be met is elastic. Its step is shortened until a filter takes it (Waechter
+and Biegler 2006, section 2.3, with a QP's step in the place of a barrier problem's); where none is taken, and
+rows are violated, only these count for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from impactopt.solvers.program import Determined, Status, Vector, complementarity, stationarity
+from impactopt.solvers.sqp.point import Point
+from impactopt.solvers.sqp.qp_solvers import make_qp_solver
+from impactopt.solvers.sqp.reduced_hessian import ReducedModel, make_model
+from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
+from impactopt.solvers.sqp.reduction import Reduction
+from impactopt.solvers.sqp.run import Run, Task
+
+_HALVINGS = 12  # of a step
+_ARMIJO = 1e-4
+_NEAR = 1e-2  # violation below which the objective may lead
+_TRIED, _SHORTER, _LEAST = 0.1, 0.2, 1e-4  # part of a step; of the radius after a refused one; its least
+_MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a radius
+_ROUNDING = 1e-11
+# radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
+# solutions of the violation alone differ, so where one way ends in such a point the next is tried
+_ATTEMPTS = (0.5, False), (1.5, False), (0.5, True), (1.5, True)
+_PATIENCE = 40  # iterations without less violation
+_DEARER = 3  # iterations after which rows that stay elastic cost twice as much
+
+
+class Pair(NamedTuple):
+    """A violation and an objective that points have to beat in one of the two."""
+
+    violation: float
+    objective: float
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A point that the search took: after which part of the step; whether for the objective's sake."""
+
+    point: Point
+    length: float
+    for_objective: bool
+    solved: Solved
+    label: str
+
+
+class ReducedRun(Run):
+    """One solve. Between iterations: the point, its multipliers, the filter, the radius of the QPs."""
+
+    def __init__(self, task: Task, determined: Sequence[Determined]):
+        super().__init__(task)
+        self._determined, self._filter = determined, list[Pair]()
+        self._radius = self._widest = self.options.radius
+        self._price, self._raised = self.options.price, 0
+        self._start: float | None = None  # of a phase in which only the violation counts: where it began
+
+    def iterate(self) -> Status:
+        """From the start, in one way after the other until one of them leads to a solution."""
+        self.point = self.program.point(self.point.x)
+        if not self.point.differentiable:
+            return Status.FAILED
+        start, y, z = self.point, self.y.copy(), self.z.copy()
+        self.program.weigh(start)
+        self._most = max(1.5 * start.violation, 1.0)
+        self._reduction = Reduction(self.program, start.jacobian, self._determined)
+        self._model = make_model(self.program, self.options, self._reduction)
+        self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
+        status = Status.INFEASIBLE
+        for wide, careful in _ATTEMPTS:
+            self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []
+            self._qp.start_from(y, z)
+            self._qp.careful, self._widest = careful, wide * self.options.radius
+            self._price, self._raised = self.options.price, self.report.iterations
+            self._begin_anew()
+            status = self._iterate()
+            if status not in (Status.INFEASIBLE, Status.FAILED):
+                break
+        return status
+
+    def _iterate(self) -> Status:
+        note, least, since = "start", np.inf, self.report.iterations
+        while True:
+            try:
+                self._reduction.load(self.point)
+            except np.linalg.LinAlgError:
+                return Status.FAILED
+            self._complete(self.point.gradient)
+            stop = self.report.iteration(self.point, self._kkt(), note)
+            if self._optimal(self.options.kkt_tolerance):
+                return Status.SOLVED
+            if stop:
+                return Status.INTERRUPTED
+            if self.report.iterations > self.options.max_iterations:
+                return Status.ITERATION_LIMIT
+            if self.point.violation < 0.9 * least or not self._excess():
+                least, since = self.point.violation, self.report.iterations
+            elif self.report.iterations > since + _PATIENCE:
+                return Status.FAILED
+            found = self._advance(self.report.iterations)
+            if isinstance(found, Status):
+                return found
+            note = found
+
+    # ------------------------------------------------------------------ one iteration
+    def _advance(self, k: int) -> str | Status:
+        """Go to the next point; or why there is none."""
+        while True:
+            if self._out_of_time():
+                return Status.TIME_LIMIT
+            model = self._model.at(self.point, self.y, self._qp.active(self.point), self._start is None)
+            solved = self._solve(model, self.point.g)
+            if solved is None:
+                self._radius *= _SHORTER
+            else:
+                self._take_multipliers(solved)
+                if self._optimal(self.options.kkt_tolerance):
+                    return Status.SOLVED
+                self._settle_price(k, solved)
+                taken = self._search(model, solved)
+                if taken is not None:
+                    return self._move(taken)
+                self._radius *= _SHORTER
+            if self._radius < _LEAST * self.options.radius:
+                end = self._give_way()
+                if end is not None:
+                    return end
+
+    def _solve(self, model: ReducedModel, g: Vector) -> Solved | None:
+        begin, limit = self.report.elapsed(), self.options.time_limit
+        left = None if limit is None else limit - begin
+        try:
+            return self._qp.solve(
+                self.point, model, g, radius=self._radius, price=self._price, time_limit=left
+            )
+        finally:
+            self.report.seconds_qp += self.report.elapsed() - begin
+
+    def _search(self, model: ReducedModel, solved: Solved) -> Taken | None:
+        """Shorten the step until it is taken; a full one is corrected for the rows' curvature first."""
+        length = 1.0
+        for attempt in range(_HALVINGS):
+            trial = self.program.point(self._inside(self.point.x + length * solved.d))
+            verdict = self._judge(trial, length, solved, model)
+            if verdict is not None:
+                return Taken(trial, length, verdict, solved, "")
+            if attempt == 0 and trial.finite and self.options.second_order_correction:
+                bent = trial.g - self.point.jacobian @ (trial.x - self.point.x)
+                again = self._solve(model, bent)
+                if again is not None:
+                    other = self.program.point(self._inside(self.point.x + again.d))
+                    verdict = self._judge(other, 1.0, solved, model)
+                    if verdict is not None:
+                        return Taken(other, 1.0, verdict, again, ", corrected")
+            length *= 0.5
+        return None
+
+    def _judge(self, trial: Point, length: float, solved: Solved, model: ReducedModel) -> bool | None:
+        """Whether a point is taken, and then whether for the objective's sake; None: it is not."""
+        if not trial.differentiable:
+            return None
+        h, f, before = trial.violation, trial.objective, self.point
+        if self._start is not None:
+            relief = before.violation - solved.linear_violation
+            enough = relief > 1e-10 * before.violation and h <= before.violation - _ARMIJO * length * relief
+            return False if enough else None
+        if h > self._most or any(
+            h > 0.999 * p.violation and f > p.objective - 1e-4 * h for p in self._filter
+        ):
+            return None
+        slope = float(before.gradient @ solved.d)
+        noise = _ROUNDING * (1.0 + abs(before.objective))
+        leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
+        if leads:
+            return True if f <= before.objective + _ARMIJO * length * slope + noise else None
+        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - 1e-5 * h
+        met = h <= self.options.violation_tolerance and f <= before.objective + noise
+        return False if less or met else None
+
+    def _move(self, taken: Taken) -> str:
+        """To a point that is taken."""
+        h, before = taken.point.violation, self.point
+        if not taken.for_objective and self._start is None:
+            pair = Pair(before.violation, before.objective)
+            kept = [p for p in self._filter if p.violation < pair.violation or p.objective < pair.objective]
+            self._filter = [*kept, pair]
+        self.point = taken.point
+        if self._start is None:
+            self._take_multipliers(taken.solved)
+        else:
+            self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
+            beats = all(
+                h <= 0.999 * p.violation or taken.point.objective <= p.objective for p in self._filter
+            )
+            if h <= max(_MET * self._start, self.options.violation_tolerance) and beats:
+                self._begin_anew()
+            elif taken.point.max_violation <= self.options.violation_tolerance:
+                self._filter = []
+                self._begin_anew()
+        if taken.length == 1.0:
+            self._radius = min(2.0 * self._radius, self._widest)
+        elif taken.length < _TRIED:
+            self._radius = max(0.5 * self._radius, 1e-3)
+        rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
+        words = f"step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
+        return words if self._start is None else f"{words}, violation only"
+
+    def _give_way(self) -> Status | None:
+        """Where no step is taken: only the violation counts from now on; or it is the end."""
+        if not self._excess():
+            return Status.ACCEPTABLE if self._optimal(self.options.acceptable_tolerance) else Status.FAILED
+        if self._start is not None:
+            return Status.INFEASIBLE
+        self._start = self.point.violation
+        self._filter.append(Pair(self.point.violation, self.point.objective))
+        self._radius, self._price = self._widest, self.options.price
+        return None
+
+    def _begin_anew(self) -> None:
+        self._start = None
+        self._model.forget()
+        self._radius = self._widest
+
+    # ------------------------------------------------------------------ multipliers
+    def _take_multipliers(self, solved: Solved) -> None:
+        self.y, self.z = solved.y.copy(), solved.z.copy()
+        self._complete(self.point.gradient)
+
+    def _complete(self, gradient: Vector) -> None:
+        """Multipliers of the equalities from those of the other rows and of the bounds."""
+        self.y[self._reduction.gone] = self.y[self._reduction.left] = 0.0
+        dual = gradient + self.point.jacobian.T @ self.y + self.z
+        self.y = self._reduction.add_multipliers(self.y, dual)
+
+    def _settle_price(self, k: int, solved: Solved) -> None:
+        """Rows that stay elastic, and cost all that they can, cost more."""
+        unequal = self._reduction.unequal
+        largest = float(np.max(np.abs(solved.y[unequal]) / self.program.weights[unequal], initial=0.0))
+        if self._excess() and self._price < 1.5 * largest and k >= self._raised + _DEARER:
+            self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
+
+    # ------------------------------------------------------------------ how good it is
+    def _optimal(self, tolerance: float) -> bool:
+        if self._excess() or self._start is not None or self._kkt() > tolerance:
+            return False
+        y = self.y.copy()
+        y[self._reduction.gone] = y[self._reduction.left] = 0.0
+        gap = complementarity(self.program, self.point.x, self.point.g, y, self.z)
+        return gap <= tolerance * max(1.0, float(np.abs(self.y).mean()) if self.y.size else 0.0)
+
+    def _kkt(self) -> float:
+        return stationarity(self.point.gradient, self.point.jacobian, self.y, self.z)
+
+    def _excess(self) -> bool:
+        return self.point.max_violation > self.options.violation_tolerance
+
+    def _inside(self, x: Vector) -> Vector:
+        return np.clip(x, self.program.x_lower, self.program.x_upper)

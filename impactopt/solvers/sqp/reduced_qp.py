@@ -1,0 +1,142 @@
+"""The QPs of the reduced SQP: a step that keeps all equalities, with the rows that it needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from impactopt.solvers.program import Vector, row_violations
+from impactopt.solvers.sqp.point import Point, TimedProgram
+from impactopt.solvers.sqp.qp import QPSolver, QuadraticProgram
+from impactopt.solvers.sqp.reduced_hessian import ReducedModel
+from impactopt.solvers.sqp.reduction import Reduction
+
+_NEAR = 0.02  # unit rows with less room than this are in the QP from the start
+_MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
+_SLACK_CURVATURE = 1e-4  # of the price
+_ACTIVE = 1e-4  # multiplier of a unit row that holds
+# parts of the radius that a step towards the equalities may be long: it is shortened with the rest, but where
+# only the violation counts
+_LARGEST, _CAREFUL = 1e4, 0.8
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A step d (n,); multipliers y (m,) and z (n,) of all but the equalities; what the linearized rows are
+    off by; rows of the QP, and those elastic; iterations of its solver."""
+
+    d: Vector
+    y: Vector
+    z: Vector
+    linear_violation: float
+    rows: int
+    elastic: int
+    iterations: int
+
+
+class ReducedQP:
+    """Solves them one after the other.
+
+    careful : whether no step is longer than the radius, those towards the equalities among them.
+    """
+
+    careful = False
+
+    def __init__(self, program: TimedProgram, reduction: Reduction, solver: QPSolver):
+        self._program, self._reduction, self._solver = program, reduction, solver
+        self.start_from(np.zeros(program.m), np.zeros(program.n))
+
+    def start_from(self, y: Vector, z: Vector) -> None:
+        """Take multipliers from elsewhere as the guess of the active set."""
+        reduction = self._reduction
+        self._unit = np.concatenate([y[reduction.unequal], z[reduction.bounded]])
+
+    def active(self, point: Point) -> np.ndarray:
+        """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
+        return self._rows(point, np.flatnonzero(np.abs(self._unit) > _ACTIVE))
+
+    def _rows(self, point: Point, which: np.ndarray) -> np.ndarray:
+        """Rows (k, r) of these numbers: of the rows that are no equalities, then of the bounds."""
+        reduction, T = self._reduction, self._reduction.T
+        count = reduction.unequal.size
+        rows = reduction.unequal[which[which < count]]
+        own = (point.jacobian.tocsr()[rows] @ T) / point.row_norms[rows][:, None]
+        return np.vstack([own, T[reduction.bounded[which[which >= count] - count]]])
+
+    def solve(
+        self,
+        point: Point,
+        model: ReducedModel,
+        g: Vector,
+        *,
+        radius: float,
+        price: float,
+        time_limit: float | None,
+    ) -> Solved | None:
+        """The step where rows are g (m,) and have the point's slopes; None if the QP solver fails."""
+        p, reduction, norms = self._program, self._reduction, point.row_norms
+        unequal, bounded, T = reduction.unequal, reduction.bounded, reduction.T
+        d0 = reduction.normal(g)
+        longest = (_CAREFUL if self.careful or not model.leads else _LARGEST) * radius
+        d0 *= min(1.0, longest / max(float(np.abs(d0).max(initial=0.0)), 1e-300))
+        after, scale = g + point.jacobian @ d0, norms[unequal]
+        x = point.x + d0
+        lower = np.concatenate([(p.g_lower - after)[unequal] / scale, (p.x_lower - x)[bounded]])
+        upper = np.concatenate([(p.g_upper - after)[unequal] / scale, (p.x_upper - x)[bounded]])
+        prices = price * np.concatenate([(p.weights * norms)[unequal], np.ones(bounded.size)])
+        working = (np.abs(self._unit) > 1e-9) | (np.minimum(-lower, upper) < _NEAR)
+        slope, unit, iterations = model.slope(d0), self._unit, 0
+        guess = np.zeros(T.shape[1])
+        for _ in range(_ROUNDS):
+            which = np.flatnonzero(working)
+            qp = _elastic(
+                model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which]
+            )
+            room = np.zeros(qp.n - guess.size)
+            start = np.concatenate([guess, room]), unit[which], np.zeros(qp.n)
+            found = self._solver.solve(qp, start=start, time_limit=time_limit)
+            iterations += found.iterations
+            if not found.usable:
+                return None
+            guess = found.x[: T.shape[1]]
+            step = T @ guess
+            unit = np.zeros(lower.size)
+            unit[which] = found.y
+            values = np.concatenate([(point.jacobian @ step)[unequal] / scale, step[bounded]])
+            missed = np.where(working, 0.0, np.maximum(lower - values, values - upper))
+            if missed.max(initial=0.0) <= _MISSED:
+                break
+            worst = np.argsort(-missed)[: max(_MORE, missed.size // 10)]
+            working[worst[missed[worst] > 0]] = True
+        self._unit = unit
+        d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
+        y[unequal], z[bounded] = unit[: unequal.size] / scale, unit[unequal.size :]
+        linear = float(p.weights @ row_violations(p, g + point.jacobian @ d))
+        return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations)
+
+
+def _elastic(
+    B: np.ndarray, c: Vector, A: np.ndarray, lower: Vector, upper: Vector, radius: float, prices: Vector
+) -> QuadraticProgram:
+    """The QP in (t, s), s >= 0 at a price: A t + s >= lower where t = 0 is below, A t - s <= upper above."""
+    below, above = np.flatnonzero(lower > 1e-9), np.flatnonzero(upper < -1e-9)
+    elastic = np.concatenate([below, above])
+    k, n = elastic.size, c.size
+    box = np.full(n, radius)
+    if k:
+        S = np.zeros((lower.size, k))
+        S[elastic, np.arange(k)] = np.where(np.arange(k) < below.size, 1.0, -1.0)
+        A, c = np.hstack([A, S]), np.concatenate([c, prices[elastic]])
+        B = la.block_diag(B, np.diag(_SLACK_CURVATURE * prices[elastic]))
+    return QuadraticProgram(
+        P=sp.csc_array(B),
+        q=c,
+        A=sp.csc_array(A),
+        lower=lower,
+        upper=upper,
+        x_lower=np.concatenate([-box, np.zeros(k)]),
+        x_upper=np.concatenate([box, np.full(k, np.inf)]),
+    )

@@ -206,7 +206,7 @@ def _settled(
     budget: Budget, t: StrikeTranscription, result: SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose freezes on the way come when they are to, by the time that its contact takes."""
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if t.hit.shares else 0):
         shares = t.hit.drifted(result.x) if result.status.usable and budget.left != 0 else None
         if shares is None:
             break

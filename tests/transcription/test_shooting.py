@@ -46,6 +46,8 @@ def test_it_predicts_what_the_sdc_does() -> None:
     problem = load_problem("arm_planar")
     found = optimize_strike(problem, method="shooting")
     assert found.status.usable
+    told = found.summary()
+    assert told["collision_model"] == "sdc" and abs(told["model_error_pct"]) < 1.0
     hit = found.strike
     sdc = SDC(
         robot=problem.robot,

@@ -94,8 +94,9 @@ def optimize_strike(
 
     method : "collocation", the whole equation of motion while the contact lasts, as in a motion; or
         "shooting", what the SDC predicts, with H, J and bias frozen at contact: a program of few variables,
-        by quasi-Newton steps. Of a hammer's blow both say the same within 1 %; of a push of 60 ms impulses
-        differ by some percent, and torques by more.
+        by quasi-Newton steps. On arms both give the same impulse within 1 %. In a push of 60 ms impulses
+        differ by some percent, and torques by more; `StrikeSolution.model_error` estimates it. The planned
+        force is known at a few instants, so its peak may be too low.
     solver, options, time_limit, report, callback : as of :func:`impactopt.solve`. By shooting the solver is
         the SQP with a QP solver: DAQP if it is installed, else OSQP, unless `options` name one.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,

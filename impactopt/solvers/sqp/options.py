@@ -42,6 +42,9 @@ class SQPOptions:
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
     barrier, barrier_warm : of "interior", first barrier parameter, of starts without and with multipliers.
     push : of "interior", how far the start is moved inside its bounds.
+
+    With QP solvers, levenberg, augmentation, curvature_floor and dense_limit are for programs that do not say
+    which variables their rows determine, such as textbook problems. Plans and strikes say so.
     """
 
     qp_solver: str = "interior"

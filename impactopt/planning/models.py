@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.collision.rungs import frozen_model
+from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
 from impactopt.planning.solution import ModelError, Solved
@@ -31,9 +31,10 @@ Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)
 # freezes of the SDC that stands for full dynamics
 _OFTEN, _MOST = 8, 64
-_LADDER = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
+_MODELS = ("sdc", "full")  # of "auto"; in a program a freeze on the way costs as much as full dynamics
 _HORIZON = 0.2  # [s] at least
-_SHARE, _GUESSED = 0.5, 1.0  # of the fastest blow, or [m/s] where there is none: how the first rung is chosen
+# of the fastest blow, or [m/s] where there is none: how the first model is chosen
+_SHARE, _GUESSED = 0.5, 1.0
 
 
 def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = None) -> ModelError | None:
@@ -100,17 +101,21 @@ def climbed(
     """
     began = time.perf_counter()
     say = report if report is not None else _silent
-    rungs = _LADDER[1:] if _skips_first(problem, say) else _LADDER
+    models = _MODELS[1:] if _skips_first(problem, say) else _MODELS
     done: AnySolution | None = None
-    for rung in rungs:
+    for model in models:
         left = None if time_limit is None else max(time_limit - (time.perf_counter() - began), 1e-3)
-        new = run(replace(problem, collision=rung), done, left)
+        new = run(replace(problem, collision=model), done, left)
         done = new if done is None else _both(done, new)
         error = done.model_error
-        if not done.status.usable or rung == rungs[-1] or (error is not None and good_enough(problem, error)):
+        if (
+            not done.status.usable
+            or model == models[-1]
+            or (error is not None and good_enough(problem, error))
+        ):
             break
         # none: a contact that does not end by one of the models, so the plan's says nothing
-        say(f"{rung}: {error or 'no estimate of its error'}, not what was asked for: on with full dynamics")
+        say(f"{model}: {error or 'no estimate of its error'}, not what was asked for: on with full dynamics")
     assert done is not None
     return done
 
@@ -125,11 +130,11 @@ def _silent(_: str) -> None:
 
 
 def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
-    """Whether the first rung is not good enough in the posture that a search starts at.
+    """Whether the first model is not good enough in the posture that a search starts at.
 
     Of a blow half as fast as the joints allow: a fast one moves the robot far while it lasts.
     """
-    first, c = replace(problem, collision=_LADDER[0]), problem.coordinates
+    first, c = replace(problem, collision=_MODELS[0]), problem.coordinates
     y, legs = c.split(problem.contact_posture)
     limit = problem.term(VelocityLimit).fraction * problem.robot.velocity_limit
     most = fastest(c, problem.striker, problem.normal, problem.contact_posture, limit)
@@ -145,7 +150,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     if error is not None and good_enough(problem, error):
         return False
     told = error or "no estimate of its error"
-    say(f"{_LADDER[0]} at {speed:.2g} m/s: {told}, not what was asked for: {_LADDER[1]} at once")
+    say(f"{_MODELS[0]} at {speed:.2g} m/s: {told}, not what was asked for: {_MODELS[1]} at once")
     return True
 
 

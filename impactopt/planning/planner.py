@@ -94,10 +94,10 @@ def solve(
         common: dict[str, Any] = {"solver": solver, "options": options, "between": between}
         common |= {"report": report, "callback": callback}
 
-        def run(rung: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
+        def run(chosen: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
             if other is not None:
-                return solve(rung, start=other, time_limit=left, **common)
-            return solve(rung, start=start, starts=starts, seed=seed, time_limit=left, **common)
+                return solve(chosen, start=other, time_limit=left, **common)
+            return solve(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
 
         return climbed(problem, run, time_limit=time_limit, report=report)
     given: str | Array | SolverResult

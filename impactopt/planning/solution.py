@@ -259,6 +259,10 @@ class Solution(Solved):
         finer = zip(self.contact_error.finer, planned, strict=True)
         return [replace(new, outcome=old.outcome) for new, old in finer]
 
+    def margins(self) -> dict[str, dict[str, float]]:
+        """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
+        return self.plan.margins(self.trajectory, self.collision)
+
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan
@@ -272,7 +276,7 @@ class Solution(Solved):
             "nodes_added": self.nodes.total,
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,
-            **plan.margins(self.trajectory, expected),
+            **self.margins(),
             **self.clearance(),
             "versions": versions(),
         }

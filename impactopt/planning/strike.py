@@ -127,10 +127,10 @@ def optimize_strike(
             "callback": callback,
         }
 
-        def run(rung: ImpactProblem, other: StrikeSolution | None, left: float | None) -> StrikeSolution:
+        def run(chosen: ImpactProblem, other: StrikeSolution | None, left: float | None) -> StrikeSolution:
             if other is not None:
-                return optimize_strike(rung, start=other, time_limit=left, **common)
-            return optimize_strike(rung, start=start, starts=starts, seed=seed, time_limit=left, **common)
+                return optimize_strike(chosen, start=other, time_limit=left, **common)
+            return optimize_strike(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
 
         return climbed(problem, run, time_limit=time_limit, report=report)
     began = time.perf_counter()
@@ -207,7 +207,7 @@ def _settled(
     budget: Budget, t: StrikeTranscription, result: SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose freezes on the way come when they are to, by the time that its contact takes."""
-    for _ in range(ROUNDS if t.hit.shares else 0):
+    for _ in range(ROUNDS):
         shares = t.hit.drifted(result.x) if result.status.usable and budget.left != 0 else None
         if shares is None:
             break

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 
 from impactopt.collision import CollisionModel
-from impactopt.collision.rungs import frozen_model
+from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.files.problem_file.mistakes import mistakes_of, report_mistakes
 from impactopt.files.problem_file.section import Section

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.targets import UNITS, Target
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError, did_you_mean
 from impactopt.kinematics.support import margin, zmp
 from impactopt.sweeps.states import States
@@ -115,7 +115,8 @@ def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
     ------
     InputError : a name that there is not.
     """
-    known = {**MEASURES, **{name: _result(k) for k, name in enumerate(_result_names(target))}}
+    results = {f"target_{name}": _result(k) for k, name in enumerate(target.result_names)}
+    known = {**MEASURES, **results}
     out = {}
     for name in names:
         if name not in known:
@@ -127,10 +128,6 @@ def chosen(names: Iterable[str], target: Target) -> dict[str, Measure]:
     if not out:
         raise InputError(f"outputs: name at least one of {', '.join(known)}")
     return out
-
-
-def _result_names(target: Target) -> list[str]:
-    return [f"target_{name}_{UNITS[name]}" if name in UNITS else f"target_{name}" for name in target.results]
 
 
 def _result(k: int) -> Measure:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from impactopt.collision import Collision, CollisionModel
 from impactopt.collision.symbolic import SymbolicModel
-from impactopt.contact.targets import UNITS
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain
 from impactopt.files.problem_file import ProblemFile, parse_problem_file
@@ -141,7 +140,7 @@ def collide_once(
     )
     there = {name: m for name, m in MEASURES.items() if all(found[o] is not None for o in m.outputs)}
     numbers = {name: float(measure.of(blow)[0]) for name, measure in there.items()}
-    target = {_with_unit(name): x for name, x in collision.target_result.items()}
+    target = model.target.with_units(collision.target_result.values())
     found = {**told, **numbers, "target": target, "joints": _joints(collision, robot, limit)}
     found |= {"caution": collision.caution} if collision.caution else {}
     return plain(found | ({} if record is None else _saved(file, section, record)))
@@ -172,10 +171,6 @@ def _joints(collision: Collision, robot: Robot, limit: Array) -> list[dict[str, 
     peaks = zip(robot.joint_names, np.abs(collision.demand).max(axis=0), limit, strict=True)
     rows = [{"joint": j, "torque_Nm": tau, "limit_Nm": most, "ratio": tau / most} for j, tau, most in peaks]
     return sorted(rows, key=lambda row: -row["ratio"])
-
-
-def _with_unit(name: str) -> str:
-    return f"{name}_{UNITS[name]}" if name in UNITS else name
 
 
 _OUTPUTS = tuple(dict.fromkeys(name for m in MEASURES.values() for name in m.outputs))

@@ -20,7 +20,7 @@ from impactopt.transcription.collocated import Collocated
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import blow, coasted, effective_mass
+from impactopt.transcription.guess import blow, coasted, effective_mass, natural_durations
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import Stage
@@ -72,8 +72,7 @@ class Collision(Collocated):
 
         law, target = type(p.law)(**self.law), type(p.target)(**self.target)
         # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        ends = np.arange(len(p.target.phases), dtype=np.intp), np.ones(len(p.target.phases))
-        self.natural = float(blow(law, target, mass, 1.0, *ends).durations[-1])
+        self.natural = float(natural_durations(law, target, mass)[-1])
         self.shortest, longest = shortest_phases(p, self.natural), p.contact_duration[1]
         self.T = [
             b.duration(f"{named}{name} duration", (least, longest), 0.01)

@@ -84,7 +84,7 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
     z = y0, u0 (ydot) at contact; feed-forward over torque limit (n); d1, T1, d, T: y = y0 + T1 d1 + T d;
         u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
       not frozen: legs and leg rates of the coasting reference.
-      frozen: y, ydot and legs of the freeze; rates of the reference's legs when its stretch began, their
+      frozen: y, ydot and legs of the freeze; rates of the reference's legs when its segment began, their
         acceleration, time [s] since; rates of the legs and their lag behind the reference, each with its
         slope; slope of the hand's speed; wrenches that carry the weight, where the model has no bias (nw).
     p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight

@@ -8,8 +8,8 @@ their own, as frozen Jacobians move them: servo, penetration and force are of th
 
 With one freeze it is at the state at contact, and the velocities that the bias and dJ/dt v depend on are
 those with which hand and target have met (`v_meet`), by the rows of an impact in which they stay together.
-With N there is one in the middle of each of N stretches of the contact's time. Phases share that time as in
-the program's ``shares``; scenarios have the expected target's stretches.
+With N there is one in the middle of each of N segments of the contact's time. Phases share that time as in
+the program's ``shares``; scenarios have the expected target's segments.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from impactopt.transcription.guess import coasted, effective_mass
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
-from impactopt.transcription.mesh import Shares, Stage, lagrange, place_of, stretch_of
+from impactopt.transcription.mesh import Shares, Stage, lagrange, place_of, segment_of
 from impactopt.transcription.rows import Measure, Place, along, by_leg, rates
 
 
@@ -52,7 +52,7 @@ class FrozenCollision(Collision):
         self, b: Builder, contact: Contact, stages: Sequence[Stage], *, shares: Shares, **common: Any
     ) -> None:
         assert b.problem.frozen is not None
-        self.terms, self.shares, self.freezes = b.problem.frozen, shares, b.problem.freezes
+        self.effects, self.shares, self.freezes = b.problem.frozen, shares, b.problem.freezes
         super().__init__(b, contact, stages, **common)
         c, n, legs = b.coordinates, len(stages), {"labels": b.coordinates.leg_labels}
 
@@ -65,33 +65,33 @@ class FrozenCollision(Collision):
         self.speed = add("hand speed", n, 1, **hand)
         self.way = add("hand travel", n, 1, **hand)
         self.joined_way = add("hand travel in compression", joined, 1, **hand)
-        self.begins = [add(f"hand speed, stretch {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
+        self.begins = [add(f"hand speed, segment {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
         self.frozen_at = [add(f"freeze {k}", 1, b.ny, labels=c.labels) for k in range(self.freezes)]
         self.frozen_legs = [add(f"legs of freeze {k}", 1, b.nl, **legs) for k in range(self.freezes)]
-        carried = int(not self.terms.bias and b.nw > 0)
+        carried = int(not self.effects.bias and b.nw > 0)
         self.carried = add("sole wrench that carries", carried, b.nw, **b.limits.of_wrenches)
         self._meeting: InstantImpact | None = None
-        if self.terms.jdot and not self.freezes:
+        if self.effects.jdot and not self.freezes:
             gives_way = float(target_yield(b.problem.target, self.target))
             mass = 1 / gives_way if gives_way > 0 else np.inf
             self._meeting = InstantImpact(b, contact, mass=mass, named=f"{self._named}meeting: ")
-        self._stretches = [self._stretch(s) for s in stages]
+        self._segments = [self._segment(s) for s in stages]
         self._legs_at: list[Affine] = []
         self._frozen = [self._freeze(k) for k in range(max(self.freezes, 1))]
 
     def _add_reference(self, count: int) -> None:
-        """At the begins of stretches, and then where they are frozen, if not at contact."""
+        """At the beginnings of segments, and then where they are frozen, if not at contact."""
         count, labels = max(2 * self.freezes, 1), self._b.coordinates.leg_labels
         super()._add_reference(count)
         name = f"{self._named}coasting leg accelerations"
         self.bends = self._b.layout.add(name, count, self._b.nl, labels=labels)
 
     # ------------------------------------------------------------------ where it is frozen
-    def _stretch(self, s: Stage) -> int:
+    def _segment(self, s: Stage) -> int:
         if not self.freezes:
             return 0
         begin, end = self._ends(s)
-        return stretch_of(s.phase, begin, end, self.shares, self.freezes)
+        return segment_of(s.phase, begin, end, self.shares, self.freezes)
 
     def _ends(self, s: Stage) -> tuple[float, float]:
         """Places of begin and end of a stage's element, in the phase."""
@@ -123,13 +123,13 @@ class FrozenCollision(Collision):
         )
 
     def _instants(self) -> list[tuple[int, float]]:
-        """Phases and places at which the reference is known: at the begins of stretches, and at freezes."""
-        firsts = [self.stages[self._stretches.index(k)].previous for k in range(len(self._frozen))]
+        """Phases and places at which the reference is known: where segments begin, and at freezes."""
+        firsts = [self.stages[self._segments.index(k)].previous for k in range(len(self._frozen))]
         begins = [(0, 0.0) if i < 0 else (self.stages[i].phase, self.stages[i].place) for i in firsts]
         return [*begins, *((at.phase, at.place) for at in self._frozen[: self.freezes])]
 
     def _travel_to(self, k: int) -> list[Affine]:
-        """Slots of the block ``moved``: to the freeze in the middle of a stretch."""
+        """Slots of the block ``moved``: to the freeze in the middle of a segment."""
         at = self._frozen[k]
         s = self._element_at(at.phase, at.place)
         T1, d1, _ = self._before(at.phase)
@@ -143,8 +143,8 @@ class FrozenCollision(Collision):
         return [self.contact.state.y, d1, T1, d, self.T[at.phase][0], at.u]
 
     def _travel_before(self, k: int) -> list[Affine]:
-        """Slots of the block ``moved``: to the begin of a stretch."""
-        i = self._stretches.index(k)
+        """Slots of the block ``moved``: to the beginning of a segment."""
+        i = self._segments.index(k)
         y, s = self.contact.state.y, self.stages[i]
         if s.previous < 0:
             none, still = Affine.zeros(1), Affine.zeros(self._b.ny)
@@ -167,24 +167,24 @@ class FrozenCollision(Collision):
 
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``: steps 3b to 6b at one instant, with what step 1b has stored."""
-        b, s, k = self._b, self.stages[i], self._stretches[i]
+        b, s, k = self._b, self.stages[i], self._segments[i]
         y, u0, at = self.contact.state.y, self.contact.u0[0], self._frozen[k]
         hit = [self.legs[i], self.f[i], self.w[i]]
-        bends = self.bends[self.freezes + k] if self.terms.jdot else Affine.zeros(b.nl)
+        bends = self.bends[self.freezes + k] if self.effects.jdot else Affine.zeros(b.nl)
         since = self._time(s.phase, s.place) - self._time(*self._instants()[k])
         legs = [
             *self._slots(self.leg_rates, i, self.coast_rates[0]),
             *self._slots(self.lag, i, Affine.zeros(b.nl)),
         ]
-        carried = [] if self.terms.bias else [self.carried[0] if self.carried.count else Affine.zeros(b.nw)]
+        carried = [] if self.effects.bias else [self.carried[0] if self.carried.count else Affine.zeros(b.nw)]
         own = [y, u0, self._feedforward(), *self._travel(i), *self._slots(self.u, i, u0), *hit]
         reference = [self.coast_rates[k], bends]
         return [*own, at.y, at.u, at.legs, *reference, *legs, since, self._hand_slope(i), *carried]
 
     def _hand_slope(self, i: int) -> Affine:
-        """Of its speed along the normal, which is that of the robot at the begin of a stretch."""
-        s, k = self.stages[i], self._stretches[i]
-        first = s.previous < 0 or self._stretches[s.previous] != k
+        """Of its speed along the normal, which is that of the robot at the beginning of a segment."""
+        s, k = self.stages[i], self._segments[i]
+        first = s.previous < 0 or self._segments[s.previous] != k
         slope = self.speed[s.members[0]] * 0.0
         for m, w in zip(s.members, s.weights, strict=True):
             slope = slope + self.speed[m] * w
@@ -212,13 +212,13 @@ class FrozenCollision(Collision):
         return self.coast_legs, self.coast_rates, self.bends
 
     def _feedforward(self) -> Affine:
-        if self.terms.feedforward:
+        if self.effects.feedforward:
             return super()._feedforward()
         return Affine.zeros(self._b.robot.n)
 
     def _gains(self) -> tuple[Array, Array]:
         kp, kd = super()._gains()
-        return (kp, kd) if self.terms.stiffness else (0 * kp, kd)
+        return (kp, kd) if self.effects.stiffness else (0 * kp, kd)
 
     # ------------------------------------------------------------------ groups
     def integrated(self) -> list[tuple[Group, Group]]:

@@ -20,6 +20,7 @@ from impactopt.contact.targets import FreeMass, Nail, Target
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
+from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.layout import Array
 
 LONGEST = 0.2  # [s] a contact that has not ended by then is cut off
@@ -59,6 +60,13 @@ def effective_mass(
     v = c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
     mass = 1 / float(normal @ body.inverse_mass() @ normal)
     return mass, max(float(normal @ body.hand @ v), 0.1)
+
+
+def mass_at_contact(problem: ImpactProblem) -> float:
+    """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+    c = problem.coordinates
+    y, legs = c.split(problem.contact_posture)
+    return effective_mass(c, problem.striker, problem.normal, y, legs, np.zeros(c.ny))[0]
 
 
 def coasted(
@@ -168,6 +176,12 @@ def blow(
         state=state,
         travel=since(travel),
     )
+
+
+def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
+    """How long each phase of the blow of a point mass [kg] of 1 m/s lasts [s]."""
+    phases = len(target.phases)
+    return blow(law, target, mass, 1.0, np.arange(phases, dtype=np.intp), np.ones(phases)).durations
 
 
 def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:

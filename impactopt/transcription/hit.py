@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,19 +12,18 @@ from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact import Contact
-from impactopt.transcription.elimination import Turn, determined
+from impactopt.transcription.contacts import Contacts
 from impactopt.transcription.frozen_collision import FrozenCollision
-from impactopt.transcription.guess import effective_mass
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Array
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
-from impactopt.transcription.rows import Index, percent
+from impactopt.transcription.rows import Index
 
 DRIFT = 2e-3  # of the contact's time: how far a freeze may be from where it is asked for
 
 
-class Hit:
+class Hit(Contacts):
     """Takes what all collisions start from; hands them back.
 
     elements : lengths of each phase's; none: those that the problem asks for.
@@ -34,8 +33,6 @@ class Hit:
 
     Attributes
     ----------
-    contact : what all collisions start from.
-    expected, scenarios : the collisions; all of them, the expected one first, are `collisions`.
     elements, stages : of every collision's phases, and their collocation points.
     shares : of the phases, where something is frozen on the way.
     guarded : the elements are given, and finer, because a plan was wrong on others: it may have pulled within
@@ -45,7 +42,8 @@ class Hit:
     def __init__(
         self, b: Builder, contact: Contact, elements: Elements = (), shares: Shares = (), *, after: bool
     ) -> None:
-        p, self._b, self.contact = b.problem, b, contact
+        super().__init__(b, contact)
+        p = b.problem
         self.guarded = bool(elements)
         self.shares = shares or (guessed_shares(p) if p.freezes else ())
         self.elements = elements or contact_elements(p, self.shares)
@@ -53,7 +51,6 @@ class Hit:
         self.scenarios: list[Collision] = []
         self.expected: Collision | InstantImpact
         if p.lasts:
-            hit = [s for s in p.scenarios if not s.missing]
             common: dict[str, Any] = {"mass": self.mass, "guarded": self.guarded}
             labels = {"labels": b.coordinates.labels}
             kind: Callable[..., Collision] = Collision
@@ -61,35 +58,14 @@ class Hit:
                 kind = partial(FrozenCollision, shares=self.shares)
             self.scenarios = [
                 kind(b, contact, self.stages, number=k, scenario=s, after=labels, **common)
-                for k, s in enumerate(hit, start=1)
+                for k, s in enumerate(self.hit, start=1)
             ]
             own = b.limits.of_y if after else None
             self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
         else:
             self.expected = InstantImpact(b, contact)
-        self.collisions = [self.expected, *self.scenarios]
-
-    @cached_property
-    def mass(self) -> float:
-        """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
-        c, p = self._b.coordinates, self._b.problem
-        y, legs = c.split(p.contact_posture)
-        return effective_mass(c, p.striker, p.normal, y, legs, np.zeros(c.ny))[0]
 
     # ------------------------------------------------------------------ rows
-    def add_feedforward_rows(self, torque: Index) -> None:
-        """The feed-forward is the torque at the node at contact, whose outputs are given."""
-        self._b.rows.add(
-            term="feed-forward that makes the robot coast",
-            place="contact",
-            components=self._b.robot.joint_names,
-            outputs=torque,
-            affine=-self.contact.feedforward[0],
-            lower=0,
-            upper=0,
-            measure=percent("of the joint's limit off"),
-        )
-
     def add_rows(self) -> None:
         """One block for all collisions, each with its rows."""
         b = self._b
@@ -126,20 +102,15 @@ class Hit:
 
     def determined(self) -> list[Determined]:
         """Of all collisions, and the feed-forward."""
-        own = determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))
-        return [*(each for c in self.collisions for each in c.determined()), own]
+        return [*(each for c in self.collisions for each in c.determined()), *super().determined()]
 
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Write what a contact starts from with these coordinates and rates (ny,) and legs (nl,)."""
-        self.contact.u0.write(x, rates)
+        super().guess(x, y, rates, legs)
         for collision in self.collisions:
             collision.guess(x, y, rates, legs)
 
     def drifted(self, x: Array) -> Shares | None:
-        """The phases' shares of the contact's time in solver variables (n,), where freezes on the way went by
-        others; None where they did not.
-        """
         if not self.shares or not isinstance(self.expected, Collision):
             return None
         times = np.concatenate([T.read(x)[0] for T in self.expected.T])
@@ -147,10 +118,6 @@ class Hit:
         if np.abs(found - self.shares).max() <= DRIFT:
             return None
         return tuple(float(share) for share in found)
-
-    def impulse(self, x: Array) -> float:
-        """To the expected target [N s], for solver variables (n,)."""
-        return float(self.expected.impulse.evaluate(x)[0])
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
         """What plans and strikes say of the contact, for solver variables (n,) and the blocks' outputs."""

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from impactopt.contact.targets import Target
 from impactopt.kinematics.splines import Radau
 from impactopt.problem.problem import ImpactProblem
-from impactopt.transcription.guess import blow, effective_mass
+from impactopt.transcription.guess import mass_at_contact, natural_durations
 
 Array = NDArray[np.float64]
 Elements = tuple[tuple[float, ...], ...]  # lengths of each phase's, as fractions of it
 Shares = tuple[
     float, ...
 ]  # of the contact's time that each phase lasts; where something is frozen on the way
-SNAP = 0.1  # of a stretch between freezes: an element is not shorter
+SNAP = 0.1  # of a segment between freezes: an element is not shorter
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
     """Those that a problem asks for, of each phase of its contact; halved if its target has events.
 
     Where an event may come at once, the phase before it is one element. Where something is frozen on the
-    way, stretches begin with elements; ``shares`` : if the phases' are not those of a point mass.
+    way, segments begin with elements; ``shares`` : if the phases' are not those of a point mass.
     """
     target, (first, last) = problem.target, problem.collision_elements
     if target.guards:
@@ -102,11 +102,8 @@ def contact_elements(problem: ImpactProblem, shares: Shares = ()) -> Elements:
 
 def guessed_shares(problem: ImpactProblem) -> Shares:
     """Of the contact's time that each phase lasts, as a point mass meets the target."""
-    c, phases = problem.coordinates, len(problem.target.phases)
-    y, legs = c.split(problem.contact_posture)
-    mass = effective_mass(c, problem.striker, problem.normal, y, legs, np.zeros(c.ny))[0]
-    found = blow(problem.law, problem.target, mass, 1.0, np.arange(phases, dtype=np.intp), np.ones(phases))
-    return tuple(float(share) for share in found.durations / found.durations.sum())
+    durations = natural_durations(problem.law, problem.target, mass_at_contact(problem))
+    return tuple(float(share) for share in durations / durations.sum())
 
 
 def place_of(fraction: float, shares: Shares) -> tuple[int, float]:
@@ -116,8 +113,8 @@ def place_of(fraction: float, shares: Shares) -> tuple[int, float]:
     return phase, float((fraction - ends[phase]) / shares[phase] + 1)
 
 
-def stretch_of(phase: int, begin: float, end: float, shares: Shares, freezes: int) -> int:
-    """Which of the stretches between freezes an element is of, that begins and ends at these places."""
+def segment_of(phase: int, begin: float, end: float, shares: Shares, freezes: int) -> int:
+    """Which of the segments between freezes an element is of, that begins and ends at these places."""
     before = float(np.cumsum([0.0, *shares])[phase])
     middle = before + shares[phase] * (begin + end) / 2
     return min(int(middle * freezes), freezes - 1)

@@ -10,16 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.contact.targets import Target
-from impactopt.contact.targets.base import UNITS
 from impactopt.errors import InputError
 from impactopt.kinematics.wrench_cone import contact_wrench_cone
 from impactopt.problem.scenario import Scenario
-from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import Contact
-from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import blow, effective_mass
+from impactopt.transcription.contacts import Contacts
+from impactopt.transcription.guess import natural_durations
 from impactopt.transcription.layout import Affine, Array, stack
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario, total_ground_wrench
 from impactopt.transcription.rows import Index, Measure, percent
@@ -44,8 +41,7 @@ class Shot:
         self.torque_fraction = scenario.torque if scenario else b.limits.torque.collision
         p = b.problem
         law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        ends = np.arange(len(p.target.phases), dtype=np.intp), np.ones(len(p.target.phases))
-        natural = float(blow(law, target, mass, 1.0, *ends).durations.sum())
+        natural = float(natural_durations(law, target, mass).sum())
         cone, self._least = self._cone()
         # a target that is driven takes the longer the harder it is hit
         slower = _SLOWER * natural if p.target.turns else _DRIVEN * natural
@@ -71,16 +67,21 @@ class Shot:
             least.append(np.append(np.zeros(len(own) - 1), minimum / b.limits.weight))
         return np.vstack(rows), np.concatenate(least)
 
+    @property
+    def _z(self) -> Affine:
+        """What the shooting is a function of."""
+        state = self.contact.state
+        return stack([state.y, self.contact.u0[0], state.legs, self.contact.feedforward[0]])
+
     def outputs(self, part: str) -> Index:
         """Numbers of the outputs of this part, once rows are there."""
         return np.asarray(self._at + self.shooting.parts[part])
 
     def add_rows(self) -> None:
         """The block, variables that equal its outputs, rows of torque, wrenches and duration."""
-        b, c, state, limits = self._b, self._b.coordinates, self.contact.state, self._b.limits
+        b, c, limits = self._b, self._b.coordinates, self._b.limits
         self._at = sum(block.count * block.n_out for block in b.blocks)
-        z = [state.y, self.contact.u0[0], state.legs, self.contact.feedforward[0]]
-        b.blocks.append(shot_block(self.shooting, stack(z)))
+        b.blocks.append(shot_block(self.shooting, self._z))
         name = self.scenario.name + ": " if self.scenario else ""
         place = f"contact{self.suffix}"
         self._impulse = b.lift(f"{name}impulse", self.outputs("impulse"), place=place)
@@ -148,11 +149,8 @@ class Shot:
     def decode(self, x: Array) -> tuple[PlannedCollision, float, float]:
         """The collision that solver variables (n,) stand for; compression [s]; hand speed [m/s]."""
         b, c = self._b, self._b.coordinates
-        z = stack(
-            [self.contact.state.y, self.contact.u0[0], self.contact.state.legs, self.contact.feedforward[0]]
-        ).evaluate(x)
-        found = self.shooting.collide(z)
-        time, target = found["time"], b.problem.target
+        found = self.shooting.collide(self._z.evaluate(x))
+        time = found["time"]
         last = int(np.argmax(time >= time[-1] - 1e-12))
         kept = slice(0, last + 1)
         closing = (found["hand_speed"] - found["target_speed"])[kept]
@@ -171,26 +169,17 @@ class Shot:
             torque=found["demand"][kept],
             sole_wrench=wrench,
             ground=total_ground_wrench(c, wrench) if c.legs else np.zeros((0, 6)),
-            outcome=_named(target, results),
+            outcome=b.problem.target.with_units(results),
         )
         return hit, compression, float(found["hand_speed"][0])
 
 
-def _named(target: Target, results: Array) -> dict[str, float]:
-    """A target's results by name and unit, as `Target.outcome` has them."""
-    names = [f"{name}_{UNITS[name]}" if name in UNITS else name for name in target.results]
-    return {name: float(value) + 0.0 for name, value in zip(names, results, strict=True)}
-
-
-class Shots:
-    """The contact with all targets, by shooting: what `Hit` is to a collocated one, but without elements."""
-
-    elements: tuple[tuple[float, ...], ...] = ()
-    shares: tuple[float, ...] = ()
-    guarded = False
+class Shots(Contacts):
+    """The contact with all targets, by shooting: what `Hit` is to a collocated one."""
 
     def __init__(self, b: Builder, contact: Contact):
-        p, self._b, self.contact = b.problem, b, contact
+        super().__init__(b, contact)
+        p = b.problem
         if p.target.guards and p.target.turns:
             raise InputError(
                 f'method "shooting": whether a {p.target.word} breaks has no slope; take "collocation"'
@@ -201,47 +190,18 @@ class Shots:
                 'method "shooting" predicts what the SDC does, frozen at contact: collision is '
                 f'{p.collision!r}{frozen}; take "sdc" without freezes, or method "collocation"'
             )
-        y, legs = b.coordinates.split(p.contact_posture)
-        self.mass = effective_mass(b.coordinates, p.striker, p.normal, y, legs, np.zeros(b.ny))[0]
-        hit = [s for s in p.scenarios if not s.missing]
         self.expected = Shot(b, contact, self.mass, 0)
-        self.scenarios = [Shot(b, contact, self.mass, k, s) for k, s in enumerate(hit, start=1)]
-        self.collisions = [self.expected, *self.scenarios]
-
-    def add_feedforward_rows(self, torque: Index) -> None:
-        """As of `Hit`."""
-        self._b.rows.add(
-            term="feed-forward that makes the robot coast",
-            place="contact",
-            components=self._b.robot.joint_names,
-            outputs=torque,
-            affine=-self.contact.feedforward[0],
-            lower=0,
-            upper=0,
-            measure=percent("of the joint's limit off"),
-        )
+        self.scenarios = [Shot(b, contact, self.mass, k, s) for k, s in enumerate(self.hit, start=1)]
 
     def add_rows(self) -> None:
         """Of all collisions."""
         for shot in self.collisions:
             shot.add_rows()
 
-    def determined(self) -> list[Determined]:
-        """The feed-forward; all else is lifted."""
-        return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
-
-    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
-        """Write the rates that the contact starts with; the rest is determined."""
-        self.contact.u0.write(x, rates)
-
     @property
     def deepest(self) -> Index:
         """There is no such output."""
         raise InputError('method "shooting" has no slope of the deepest penetration; take "collocation"')
-
-    def impulse(self, x: Array) -> float:
-        """To the expected target [N s], for solver variables (n,)."""
-        return float(self.expected.impulse.evaluate(x)[0])
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
         """As of `Hit`."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.fake_solution import FakeSolution, MissingSolution, still_problem, still_solution
+from support.fake_solution import PROBLEM_FILE, FakeSolution, MissingSolution, still_problem, still_solution
 from typer.testing import CliRunner
 
 import impactopt
@@ -25,18 +25,8 @@ from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import IterationRecord, Status, Violation
 
-GOOD = """\
-[problem]
-name = "stand [still]"
-robot = "talos"
-striker = "right_hand"
-point_m = [0.6, -0.25, 1.1]
-normal = [1.0, 0.0, 0.0]
-[target]
-mass_kg = 5.0
-[contact]
-stiffness_N_m = 1e4
-damping_N_s_m = 300.0
+GOOD = f"""\
+{PROBLEM_FILE.replace("still", "[still]")}
 [solver]
 name = "ipopt"
 time_limit_s = 40

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from impactopt import coasting_reference, load_problem, optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.codegen.compiler import find_compiler
-from impactopt.collision.rungs import FROZEN, frozen_model
+from impactopt.collision.frozen_models import FROZEN, frozen_model
 from impactopt.contact import FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.planning.models import good_enough
@@ -249,7 +249,7 @@ def test_a_file_says_it_and_a_result_too() -> None:
     assert "model of the collision sdc, 2 freezes on the way" in text and "model error, impulse" in text
 
 
-def test_stretches_begin_with_elements() -> None:
+def test_segments_begin_with_elements() -> None:
     problem = dataclasses.replace(arm_problem(), collision="sdc", freezes=5)
     shares = guessed_shares(problem)
     assert sum(shares) == pytest.approx(1) and min(shares) > 0.2
@@ -259,6 +259,6 @@ def test_stretches_begin_with_elements() -> None:
         phase, place = place_of(k / 5, shares)
         near = [*ends[phase], 0.0]
         assert min(abs(place - end) for end in near) * shares[phase] < 0.1 / 5 + 1e-9
-    # a boundary of stretches that is next to a phase's end gives way to it
+    # a boundary of segments that is next to a phase's end gives way to it
     lengths = contact_elements(problem, (0.399, 0.601))
     assert min(h for phase in lengths for h in phase) > 0.02

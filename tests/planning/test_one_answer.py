@@ -314,7 +314,7 @@ def test_a_result_has_one_answer(name: str, kind: str, tmp_path: Path, punch: So
         {"impulse_Ns": 2e-3, "zmp_margin_m": 2e-3, "sole_force_N": 0.02, "torque_ratio": 0.02},
         weight,
     )
-    # rungs that leave out the servo's stiffness, feed-forward and more say that it is theirs
+    # models that leave out the servo's stiffness, feed-forward and more say that it is theirs
     # (the paper's steps are too long for the arms' contacts, and refused)
     for model in ("virtual-mass", *(["sdc-paper"] if robot.floating else [])):
         assert "believe the plan" in answer(model)["believe"]

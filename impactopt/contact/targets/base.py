@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -122,9 +123,17 @@ class Target(Described, ABC):
 
     def outcome(self, state: Any, parameters: Parameters | None = None) -> dict[str, float]:
         """`result` as numbers by name and unit, as reports have them: `speed_m_s`, `depth_m`, `broken`."""
-        values = self.result([float(x) for x in state], parameters)
-        names = [f"{name}_{UNITS[name]}" if name in UNITS else name for name in self.results]
-        return {name: float(value) + 0.0 for name, value in zip(names, values, strict=True)}  # no minus zero
+        return self.with_units(self.result([float(x) for x in state], parameters))
+
+    def with_units(self, values: Iterable[Any]) -> dict[str, float]:
+        """Values of `results`, in their order, by name and unit."""
+        named = zip(self.result_names, values, strict=True)
+        return {name: float(value) + 0.0 for name, value in named}  # no minus zero
+
+    @property
+    def result_names(self) -> list[str]:
+        """`results`, each with its unit."""
+        return [f"{name}_{UNITS[name]}" if name in UNITS else name for name in self.results]
 
     def formula(self) -> tuple[str, ...]:
         """The target as text in symbols of its own: what a compiled model of it depends on."""

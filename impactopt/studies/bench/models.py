@@ -95,7 +95,7 @@ def _row(problem: ImpactProblem, say: Say) -> dict[str, Any]:
         found["model_error_pct"] = solution.model_error.impulse_pct
     if not solution.status.usable:
         return {**found, "reason": solution.result.message}
-    planned = solution.plan.margins(solution.trajectory).get("zmp_margin_m", {})
+    planned = solution.margins().get("zmp_margin_m", {})
     return {**found, "zmp_margin_planned_mm": _in_mm(planned), **_replayed(solution)}
 
 

@@ -1,0 +1,83 @@
+"""What a program asks of the contact with all targets, by whichever method it is predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+from impactopt.problem.scenario import Scenario
+from impactopt.solvers.program import Determined
+from impactopt.transcription.builder import Builder
+from impactopt.transcription.contact import Contact
+from impactopt.transcription.elimination import Turn, determined
+from impactopt.transcription.guess import mass_at_contact
+from impactopt.transcription.layout import Array
+from impactopt.transcription.mesh import Elements, Shares
+from impactopt.transcription.rows import Index, percent
+
+
+class Contacts:
+    """The collision with the expected target, and one for each scenario that hits one.
+
+    Attributes
+    ----------
+    contact : what all collisions start from.
+    expected, scenarios : the collisions; who completes this makes them. All of them, the expected one first,
+        are `collisions`.
+    elements, shares, guarded : of a collocated contact, see `Hit`; others have none.
+    """
+
+    expected: Any
+    scenarios: Sequence[Any]
+    elements: Elements = ()
+    shares: Shares = ()
+    guarded = False
+
+    def __init__(self, b: Builder, contact: Contact) -> None:
+        self._b, self.contact = b, contact
+
+    @property
+    def collisions(self) -> list[Any]:
+        return [self.expected, *self.scenarios]
+
+    @property
+    def hit(self) -> list[Scenario]:
+        """Scenarios with a target."""
+        return [s for s in self._b.problem.scenarios if not s.missing]
+
+    @cached_property
+    def mass(self) -> float:
+        """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
+        return mass_at_contact(self._b.problem)
+
+    def add_feedforward_rows(self, torque: Index) -> None:
+        """The feed-forward is the torque at the node at contact, whose outputs are given."""
+        self._b.rows.add(
+            term="feed-forward that makes the robot coast",
+            place="contact",
+            components=self._b.robot.joint_names,
+            outputs=torque,
+            affine=-self.contact.feedforward[0],
+            lower=0,
+            upper=0,
+            measure=percent("of the joint's limit off"),
+        )
+
+    def determined(self) -> list[Determined]:
+        """The feed-forward."""
+        return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
+
+    def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
+        """Write what a contact starts from with these coordinates and rates (ny,) and legs (nl,)."""
+        self.contact.u0.write(x, rates)
+
+    def drifted(self, x: Array) -> Shares | None:
+        """The phases' shares of the contact's time in solver variables (n,), where freezes on the way went by
+        others; None where they did not.
+        """
+        return None
+
+    def impulse(self, x: Array) -> float:
+        """To the expected target [N s], for solver variables (n,)."""
+        return float(self.expected.impulse.evaluate(x)[0])

@@ -66,6 +66,7 @@ def test_engines_share_no_code_with_the_planner() -> None:
     shared = [PACKAGE / "simulation" / f"{name}.py" for name in (*names, *robots)]
     for file in [*engines, *shared]:
         assert rooms_imported(file) <= ENGINE, file
+        assert not [name for name in imports(file) if "rigid_body" in name], file
 
 
 def test_no_file_is_longer_than_400_lines() -> None:

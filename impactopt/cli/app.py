@@ -253,7 +253,7 @@ def _write(record: Record, directory: Path, progress: SolveConsole) -> list[Path
 
     written = [*keep_record(record, directory)]
     progress.say("drawing pictures")
-    from impactopt.pictures import save_pictures
+    from impactopt.report.pictures import save_pictures
 
     return written + save_pictures(record, written[0].parent)
 

@@ -84,7 +84,7 @@ def sweep(
         if result.failed == result.done:
             raise typer.Exit(NOT_SOLVED)
         if chosen.figure is not None:
-            from impactopt.pictures.sweep import save_sweep_picture
+            from impactopt.report.pictures.sweep import save_sweep_picture
 
             picture = save_sweep_picture(chosen, result.table)
             if not (as_json or quiet):

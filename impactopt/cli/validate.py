@@ -110,7 +110,7 @@ def validate(
             progress.say(f"{result} is read; replaying it in {engine.value}")
             done = replay(planned, engine=engine.value, perturbation=world, **options)
             if directory is not None:
-                from impactopt.pictures import save_pictures
+                from impactopt.report.pictures import save_pictures
 
                 text = f"{json.dumps(done.report, indent=2)}\n".encode()
                 written.append(directory / "replay.json")
@@ -119,7 +119,7 @@ def validate(
                 written += save_pictures(done.record, directory, ["replay"])
             if animation is not None:
                 progress.say("drawing the motion")
-                from impactopt.pictures.animation import save_animation
+                from impactopt.report.pictures.animation import save_animation
 
                 written.append(save_animation(done, animation))
         if as_json:

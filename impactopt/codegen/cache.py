@@ -54,7 +54,7 @@ Report = Callable[[str], None]
 
 # Rooms whose sources can shape a graph: a change in one of them builds all functions anew, elsewhere none.
 _IN_GRAPHS = frozenset(
-    ("codegen", "collision", "contact", "kinematics", "problem", "rigid_body", "robots", "transcription")
+    ("codegen", "collision", "contact", "kinematics", "problem", "robots", "transcription")
 )
 
 

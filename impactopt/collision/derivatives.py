@@ -30,7 +30,7 @@ from impactopt.collision.native.source import least_size
 from impactopt.collision.outputs import HISTORIES, SCALARS
 from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 
 __all__ = ["differentiable"]
 

@@ -31,7 +31,7 @@ from typing import Any
 import casadi as ca
 
 from impactopt.kinematics.stance import Stance
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
 __all__ = ["FrozenDynamics"]

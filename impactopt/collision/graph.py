@@ -17,7 +17,7 @@ from impactopt.collision.outputs import HISTORIES, Outputs, frozen_for
 from impactopt.collision.runge_kutta import rk4_step
 from impactopt.collision.stepped import SteppedModel, number_of_steps
 from impactopt.contact import Target
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 
 __all__ = [
     "MOST_STEPS",

@@ -16,7 +16,7 @@ from impactopt.codegen.cache import cached
 from impactopt.codegen.hashing import model_hash
 from impactopt.collision.frozen import _inverse_of_cholesky
 from impactopt.kinematics.stance import Stance
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 
 __all__ = ["striking_functions"]

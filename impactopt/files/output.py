@@ -68,8 +68,8 @@ class Record:
     problem : text of the problem file, "" if there was none.
     arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
         corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
-        by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan with a brake,
-        `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*`
+        by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort
+        motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*`
         (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation`
         on free soles, without velocities and torques), `solver_*` (`SolverResult`), `history_*` (its
         iterations).
@@ -117,7 +117,7 @@ def record_of(
     summary = _summary(solution, simulation, replay)
     if "note" not in summary:
         parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}
-        if plan.brake is not None:
+        if plan.abort is not None:
             parts["missed"] = solution.missed_trajectory
     if simulation is not None:
         parts["simulated"] = simulation

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole
 
 Array = NDArray[np.float64]

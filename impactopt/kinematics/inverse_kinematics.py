@@ -14,7 +14,7 @@ TURNING, WISH = 100, 0.1  # steps that also turn the hand, and how much that is 
 ASIDE, ABOUT = 0.1, 0.3  # [rad] how far postures are drawn from the guess: the first one that turns; others
 
 
-def reach(
+def inverse_kinematics(
     coordinates: StanceCoordinates,
     striker: str,
     point: Array,

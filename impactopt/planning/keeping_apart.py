@@ -212,7 +212,7 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     plan, bodies = t.decode(x), margins.bodies
     spots, found, deepest = spots_of(t, x), dict[tuple[int, Pair], float](), -np.inf
     worst = dict[tuple[tuple[int, ...], Pair], tuple[float, float, bool]]()
-    for missed in (False, True) if plan.brake is not None else (False,):
+    for missed in (False, True) if plan.abort is not None else (False,):
         motion = plan.motion(STEP, missed=missed)
         at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
         within = max(margins.own.margin, margins.world.margin) + bodies.slack
@@ -270,7 +270,7 @@ def _nodes_at(t: Transcription, plan: Plan, between: Iterable[tuple[float, bool]
     places: tuple[set[float], set[float]] = set(t.nodes.swing), set(t.nodes.follow)
     for time, missed in between:
         for phase, more in ((0, places[0]), (AFTER, places[1])):
-            curve, begin, nodes, _ = plan.way(phase, missed=missed)
+            curve, begin, nodes, _ = plan.segment(phase, missed=missed)
             place = (time - begin) / curve.duration
             if 0.0 < place < 1.0:
                 k = int(np.clip(np.searchsorted(nodes, place), 1, len(nodes) - 1))

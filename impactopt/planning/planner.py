@@ -60,7 +60,7 @@ def solve(
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
-    between: bool = True,
+    refine: bool = True,
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
 ) -> Solution:
@@ -75,7 +75,7 @@ def solve(
     starts : number of starts. The first one is plain, the others have perturbed postures and other speeds,
         drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all.
     options : the solver's own.  time_limit [s] : of all starts together, without compiling functions.
-    between : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
+    refine : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
         between two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``).
         The contact gets finer elements while theirs make an error of more than half a per cent of the impulse
         (``Solution.elements``, ``Solution.contact_error``).
@@ -91,7 +91,7 @@ def solve(
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=not isinstance(start, str))
     if problem.collision == "auto":
-        common: dict[str, Any] = {"solver": solver, "options": options, "between": between}
+        common: dict[str, Any] = {"solver": solver, "options": options, "refine": refine}
         common |= {"report": report, "callback": callback}
 
         def run(chosen: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
@@ -130,10 +130,10 @@ def solve(
     refining = _Refining(budget, margins, apart, report)
     # limbs that are in each other say nothing of what a start is worth: each is led to its end before they
     # compare
-    each = refining.solve if margins is not None and between else refining.first
+    each = refining.solve if margins is not None and refine else refining.first
     of_start = _starts(t, given, starts, seed, partial(clear_strike, budget, margins))
     t, fields = solve_from(t, of_start, budget, began, each)
-    if margins is None and between and fields["result"].status.usable:
+    if margins is None and refine and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
     result = fields["result"] = with_reason(t, fields["result"])
     return Solution(

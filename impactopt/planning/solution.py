@@ -180,7 +180,7 @@ class Solution(Solved):
         """
         from impactopt.simulation import simulate
 
-        if engine == "mujoco" and self.plan.brake is not None:
+        if engine == "mujoco" and self.plan.abort is not None:
             options.setdefault("missed", self.missed_trajectory)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
 
@@ -230,7 +230,7 @@ class Solution(Solved):
     def _clearance(self) -> tuple[float, str, list[dict[str, Any]]]:
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
-        for missed in (False, True) if self.plan.brake is not None else (False,):
+        for missed in (False, True) if self.plan.abort is not None else (False,):
             motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
             at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
             found = bodies.survey(motion.time, at)

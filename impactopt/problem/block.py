@@ -21,7 +21,7 @@ class BlockExpression:
     """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``.
 
     through : numbers that ``out`` is written with, and what they are of (z, p).  lanes : of
-        `impactopt.transcription.lanes.in_lanes`, about as many as there are instances.
+        `impactopt.transcription.simd.in_lanes`, about as many as there are instances.
     """
 
     z: Any

@@ -28,7 +28,7 @@ from impactopt.errors import (
     shortened,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import BothSoles, Stance
 from impactopt.problem.checks import (
     COLLISIONS,
@@ -268,9 +268,9 @@ class ImpactProblem:
         return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
 
     @property
-    def brake_after(self) -> float | None:
+    def abort_after(self) -> float | None:
         """When the motion is aborted if nothing is hit, after the planned contact [s]; None: never."""
-        return next((s.brake_after for s in self.scenarios if s.brake_after is not None), None)
+        return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
         """The term of a kind: the problem's own, or the default."""
@@ -312,8 +312,8 @@ class ImpactProblem:
         if (hand := self.extra(HandOrientation)) is not None:
             direction = self.normal if hand.direction is None else np.array(hand.direction)
             with suppress(InputError):
-                return reach(*given, facing=(np.array(hand.axis), direction))
-        return reach(*given)
+                return inverse_kinematics(*given, facing=(np.array(hand.axis), direction))
+        return inverse_kinematics(*given)
 
     @property
     def self_collision(self) -> SelfCollision:

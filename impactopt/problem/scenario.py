@@ -18,7 +18,7 @@ class Scenario(Described):
     Objectives are those of the blow on the expected target. In a scenario the collision's rows (torque,
     wrench cones) and the balance after it hold too, with margins of their own, under the same reference and
     servo. If there is nothing to hit, no impulse slows the robot down: the margin of balance is then taken at
-    contact. With `brake_after` the robot goes on to an abort motion, which brings it to rest and is planned
+    contact. With `abort_after` the robot goes on to an abort motion, which brings it to rest and is planned
     with the swing; without, it follows the follow-through of the blow.
     """
 
@@ -27,7 +27,7 @@ class Scenario(Described):
     stiffness: float = field(default=1.0, metadata=about("contact stiffness over the expected one", above=0))
     damping: float = field(default=1.0, metadata=about("contact damping over the expected one", least=0))
     missing: bool = field(default=False, metadata=about("true: there is nothing to hit"))
-    brake_after: float | None = field(
+    abort_after: float | None = field(
         default=None,
         metadata=about(
             "time after the planned contact at which the motion is aborted, to a planned stop",
@@ -64,17 +64,17 @@ class Scenario(Described):
             if value is None and f.default is None:
                 continue
             number = check_array(f"{where}: {f.name}", value, (), most=MOST)
-            if f.name != "brake_after" and not told.allows(float(number)):
+            if f.name != "abort_after" and not told.allows(float(number)):
                 raise InputError(f"{where}: {f.name} is {value:g}; give a number {told.range}")
         changed = [f.name for f in fields(self)[1:] if getattr(self, f.name) != f.default]
-        unused = [name for name in changed if name not in ("missing", "brake_after", "capture_margin")]
+        unused = [name for name in changed if name not in ("missing", "abort_after", "capture_margin")]
         if self.missing and unused:
             raise InputError(
                 f"{where}: with a target that is missing there is no collision; drop {unused[0]}"
             )
-        if self.brake_after is not None and not (self.missing and self.brake_after > 0):
+        if self.abort_after is not None and not (self.missing and self.abort_after > 0):
             raise InputError(
-                f"{where}: brake_after is a time > 0 s, for a missing target; drop it, or give missing=True"
+                f"{where}: abort_after is a time > 0 s, for a missing target; drop it, or give missing=True"
             )
 
     def numbers(self, law: ContactLaw, target: Target) -> tuple[dict[str, float], dict[str, float]]:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from impactopt.errors import InputError, check_array
-from impactopt.solvers.ipopt_functions import BufferFunction, Functions, Pattern, Progress
+from impactopt.solvers.ipopt_functions import BufferFunction, Functions, IterationCallback, Pattern
 from impactopt.solvers.program import (
     Callback,
     NonlinearProgram,
@@ -107,7 +107,7 @@ def solve_ipopt(
         program, tolerance, deadline=start + time_limit if time_limit is not None else np.inf
     )
     functions.start(x0)
-    progress = Progress(functions, callback, start)
+    progress = IterationCallback(functions, callback, start)
     solver, _alive = _build(functions, progress, x0, settings)
     initial = {
         "x0": x0,
@@ -131,7 +131,11 @@ def solve_ipopt(
 
 
 def _result(
-    functions: Functions, progress: Progress, answer: Mapping[str, Any] | None, outcome: str, start: float
+    functions: Functions,
+    progress: IterationCallback,
+    answer: Mapping[str, Any] | None,
+    outcome: str,
+    start: float,
 ) -> SolverResult:
     program, best = functions.program, functions.best
     status = _STATUS.get(outcome, Status.FAILED)
@@ -176,7 +180,7 @@ def _result(
 
 
 def _build(
-    functions: Functions, progress: Progress, x0: Vector, settings: Mapping[str, Any]
+    functions: Functions, progress: IterationCallback, x0: Vector, settings: Mapping[str, Any]
 ) -> tuple[Any, list[Any]]:
     """The nlpsol object, and what has to stay alive as long as it does."""
     program = functions.program

@@ -138,7 +138,7 @@ class Functions:
             self.best.consider(self._x, float(self._known["objective"]), self._known["constraints"])
 
 
-class Progress:
+class IterationCallback:
     """IPOPT's iteration callback: keeps the history and tells the caller."""
 
     def __init__(self, functions: Functions, callback: Callback | None, start: float):
@@ -177,7 +177,7 @@ class BufferFunction(ca.Callback):
         ca.Callback.__init__(self)
         self._inputs, self._outputs = list(inputs.items()), list(outputs.items())
         self._functions = functions
-        self._progress = functions[0] if isinstance(functions[0], Progress) else None
+        self._progress = functions[0] if isinstance(functions[0], IterationCallback) else None
         self._owner: Functions = self._progress._functions if self._progress else functions[0].__self__
         self.construct(name, {})
 

@@ -17,7 +17,7 @@ from impactopt.report.plain_errors import plain_errors
 from impactopt.studies.report import Say
 
 if TYPE_CHECKING:
-    from impactopt.pictures.style import Picture
+    from impactopt.report.pictures.style import Picture
 
 # file name without .png: what makes it, and of what
 FIGURES: dict[str, tuple[str, str]] = {
@@ -105,8 +105,8 @@ def _plot(problem: str, say: Say) -> Maker:
     """Pictures of a problem's plan beside its replays."""
     from impactopt.files.output import record_of
     from impactopt.files.problem_file import load_problem
-    from impactopt.pictures import PICTURES, overview
     from impactopt.planning.planner import solve
+    from impactopt.report.pictures import PICTURES, overview
 
     solution = solve(load_problem(problem), report=say)
     say("replaying the plan, on held and on free soles")
@@ -131,7 +131,7 @@ def _bench(name: str, say: Say) -> Maker:
 
 def _sweep(name: str, say: Say) -> Maker:
     """Of a sweep that comes with the package."""
-    from impactopt.pictures.sweep import drawn_table
+    from impactopt.report.pictures.sweep import drawn_table
     from impactopt.sweeps import read_sweep_file, sweep
 
     chosen = read_sweep_file(name)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from impactopt.pictures.style import Picture
+    from impactopt.report.pictures.style import Picture
 
 __all__ = ["Report", "Say", "cell", "columns_table", "machine", "make_table", "save_report", "timed"]
 

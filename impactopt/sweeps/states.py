@@ -17,7 +17,7 @@ from impactopt.collision.striking import striking_functions
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.stance import Stance
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
@@ -111,7 +111,7 @@ class ContactStates:
         robot, q = self.robot, self.start
         coordinates = StanceCoordinates(robot, self.stance.soles(robot), q)
         try:
-            q = reach(coordinates, self.striker, np.array(point), q)
+            q = inverse_kinematics(coordinates, self.striker, np.array(point), q)
         except InputError:
             return "the point is out of reach"
         return Posture(q=q, polygon=support_polygon(robot, coordinates))

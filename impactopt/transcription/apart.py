@@ -23,9 +23,9 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.transcription.blocks import BlockExpression, make_block
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.lanes import in_lanes
 from impactopt.transcription.layout import Affine, Array, stack
 from impactopt.transcription.rows import Place, Row, millimetres
+from impactopt.transcription.simd import in_lanes
 from impactopt.transcription.structured import derivative_functions
 
 LENGTHS = (4, 8, 12, 16, 20)  # of chains, in joints

@@ -60,7 +60,7 @@ def sizes(c: StanceCoordinates, target: Target, block: str, *, frozen: bool = Fa
             "separation": 1,
             "speed": 1,
             "event": int(bool(target.guards)),
-            "lasting": int(bool(target.guards)),
+            "invariant": int(bool(target.guards)),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
         "join": {"travel": 1},

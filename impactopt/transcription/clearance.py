@@ -7,8 +7,8 @@ import pinocchio as pin
 
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.rows import Place, millimetres
-from impactopt.transcription.way import Way
 
 # the striking point stays this far behind the target [m], and less only at this speed [m/s] towards it
 # or away from it: what hovers at the plane would touch it between the nodes
@@ -16,13 +16,13 @@ CLEARANCE, HASTE = 0.02, 0.04
 TOO_NEAR = millimetres("too near")
 
 
-def add_clearance(b: Builder, swing: Way, follow: Way) -> None:
+def add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase) -> None:
     """Rows at the nodes of the swing, and at those of the follow-through if the target stays."""
     p, before, after = b.problem, swing.nodes[:-1], follow.nodes
-    ways = [swing.at(s)[0] for s in before]
+    motions = [swing.at(s)[0] for s in before]
     if p.target.stays:
-        ways += [follow.at(s)[0] for s in after]
-    first = b.add_block("approach", [[y] for y in ways], p.normal)
+        motions += [follow.at(s)[0] for s in after]
+    first = b.add_block("approach", [[y] for y in motions], p.normal)
     ahead = float(np.mean(p.swing.duration))
     plane = Affine.constant(float(p.normal @ p.point))
     spots = [(first + i, swing.place_at(s), (1 - s) * ahead) for i, s in enumerate(before)]

@@ -23,7 +23,7 @@ from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.guess import blow, coasted, effective_mass, natural_durations
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
-from impactopt.transcription.mesh import Stage
+from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.nodes import add_cone_rows
 from impactopt.transcription.phases import pulls_apart, shortest_phases, switches
 from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
@@ -45,7 +45,7 @@ class Collision(Collocated):
         self,
         b: Builder,
         contact: Contact,
-        stages: Sequence[Stage],
+        stages: Sequence[CollocationPoint],
         *,
         number: int,
         mass: float,
@@ -208,24 +208,25 @@ class Collision(Collocated):
     def determined(self) -> list[Determined]:
         """Of each stage, leg by leg; and element by element what its rows determine.
 
-        An element's travel comes first, by linear rows; last come the ways as one, if there are three phases.
+        An element's travel comes first, by linear rows; last, if there are three phases, the integrals of the
+        first two as one.
         """
         out: list[Determined] = []
         for i in range(len(self.stages)):
             legs = [leg for g in self._at_stage() for leg in by_leg(g.index(i))]
             out += [determined(Turn.STAGE_LEGS, leg, k) for k, leg in enumerate(legs)]
-        ways, states = zip(*self.integrated(), strict=True)
+        integrals, states = zip(*self.integrated(), strict=True)
         groups = (*states, self.w, self.f, *self.states())
         last = self.end[-1]
         step = 0
         for members in sorted({s.members for s in self.stages}):
             # the last force is given
             part = [g.index(i) for i in members for g in groups if g is not self.f or i != last]
-            out += [determined(Turn.ELEMENT, way.index(i), step) for i in members for way in ways]
+            out += [determined(Turn.ELEMENT, one.index(i), step) for i in members for one in integrals]
             out.append(determined(Turn.ELEMENT, np.concatenate(part), step + 1))
             step += 2
         if self.joined.count:
-            whole = np.concatenate([joined.index(0) for _, joined in self._ways()])
+            whole = np.concatenate([joined.index(0) for _, joined in self._integrals()])
             out.append(determined(Turn.ELEMENT, whole, step))
         if self.scenario is not None:
             out.append(determined(Turn.AFTER, self.after.index(0)))
@@ -236,14 +237,14 @@ class Collision(Collocated):
         """``at``: of each block, the index of the first output of this collision and the outputs a stage."""
         for i, s in enumerate(self.stages):
             place = self._place(s)
-            for way, rate in self.integrated():
-                self._integral_rows(i, place, way, rate)
+            for integral, rate in self.integrated():
+                self._integral_rows(i, place, integral, rate)
             first = {name: start + i * size for name, (start, size) in at.items()}
             self._dynamics_rows(i, place, first)
         (start, size), order = at["force"], percent("off")
         part, where, target = self._b.parts("force"), self.suffix.lstrip(", "), self._b.problem.target
         if target.guards:  # first, as they determine variables of their own
-            names = [label for way, _ in self._ways() for label in way.labels]
+            names = [label for one, _ in self._integrals() for label in one.labels]
             outputs = at["join"][0] + np.arange(len(names))
             self._b.equal("travel in compression", where, names, outputs, along(names, "off"))
         ends = [(name, "target", k, "event", order) for k, name in enumerate(target.guards)]
@@ -311,7 +312,7 @@ class Collision(Collocated):
                 term=target.guards[min(k, len(target.guards) - 1)],
                 place=place,
                 components=["target"],
-                outputs=first + part["lasting"],
+                outputs=first + part["invariant"],
                 lower=0,
                 measure=percent("out of turn"),
             )
@@ -320,8 +321,8 @@ class Collision(Collocated):
         """Slots of the block ``link``: this state after contact to a ``start`` (y, d y/ds, duration [s])."""
         last = len(self.end) - 1
         time, travel, _ = self._before(last)
-        ways = travel, self.d[self.end[last]]
-        return self.contact.link(start, (time, self.T[last][0]), ways, self.u[self.end[last]])
+        moved = travel, self.d[self.end[last]]
+        return self.contact.link(start, (time, self.T[last][0]), moved, self.u[self.end[last]])
 
     @property
     def state_after(self) -> list[Affine]:
@@ -348,18 +349,18 @@ class Collision(Collocated):
             group.write(x, value)
         before = np.concatenate([[0.0], np.cumsum(times)])
         per_time = (1 / found.durations[phase])[:, None]
-        d = found.way[:, None] * per_time * rates
+        d = found.moved[:, None] * per_time * rates
         self.u.write(x, found.speed[:, None] * rates)
         self.d.write(x, d)
         self.state.write(x, found.state)
-        self.xt.write(x, found.travel[:, None] * per_time)
+        self.xt.write(x, found.moved[:, None] * per_time)
         self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
         self.p.write(x, found.impulse[:, None])
         if p.target.guards:
             share = times[:2, None] / before[2]
             self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
             self.joined_x.write(x, (share * self.xt.read(x)[self.end[:2]]).sum(axis=0))
-        self.after.write(x, y + float(found.way[self.end].sum()) * rates)
+        self.after.write(x, y + float(found.moved[self.end].sum()) * rates)
         self.guess_model(x, y, rates, legs)
         if c.legs:
             self.legs.write(x, legs)

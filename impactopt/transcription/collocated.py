@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Group
-from impactopt.transcription.mesh import Stage
+from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.rows import Place, rates
 
 
@@ -21,7 +21,7 @@ class Collocated:
     """
 
     _b: Builder
-    stages: Sequence[Stage]
+    stages: Sequence[CollocationPoint]
     end: list[int]
     T: list[Group]
     u: Group
@@ -36,28 +36,32 @@ class Collocated:
         time = Affine.zeros(1)
         for T in self.T[:phase]:
             time = time + T[0]
-        return time, self._way(self.d, self.joined, phase), self._way(self.xt, self.joined_x, phase)
+        return time, self._so_far(self.d, self.joined, phase), self._so_far(self.xt, self.joined_x, phase)
 
-    def _way(self, way: Group, joined: Group, phase: int) -> Affine:
-        """What a way has come to in the phases before one, over their time."""
+    def _so_far(self, integral: Group, joined: Group, phase: int) -> Affine:
+        """What an integral has come to in the phases before one, over their time."""
         if phase == 0:
-            return Affine.zeros(way.size)
-        return way[self.end[0]] if phase == 1 else joined[0]
+            return Affine.zeros(integral.size)
+        return integral[self.end[0]] if phase == 1 else joined[0]
 
     def _time(self, phase: int, place: float) -> Affine:
         """[s] since contact."""
         return self._before(phase)[0] + self.T[phase][0] * place
 
-    def _ways(self) -> list[tuple[Group, Group]]:
+    def _integrals(self) -> list[tuple[Group, Group]]:
         """Integrals over the phase so far, each with its group of the first two phases of three as one."""
         return [(self.d, self.joined), (self.xt, self.joined_x)]
 
     def _join(self) -> list[list[Affine]]:
-        """Slots of the block ``join``: ways in the first two phases of three as one."""
+        """Slots of the block ``join``: integrals in the first two phases of three as one."""
         first, second = self.end[:2]
         times = self.T[0][0], self.T[1][0]
-        parts = [(way[first], way[second], joined[0]) for way, joined in self._ways()]
-        return [[*times, *(way[k : k + 1] for way in ways)] for ways in parts for k in range(ways[0].size)]
+        parts = [(integral[first], integral[second], joined[0]) for integral, joined in self._integrals()]
+        return [
+            [*times, *(integral[k : k + 1] for integral in integrals)]
+            for integrals in parts
+            for k in range(integrals[0].size)
+        ]
 
     def _slots(self, group: Group, i: int, start: Affine, *, anew: bool = False) -> tuple[Affine, Affine]:
         """Value and d/ds of a collocated group at stage i; ``start``: at contact; ``anew``: of each phase."""
@@ -69,24 +73,24 @@ class Collocated:
         before = start if begins else group[s.previous]
         return group[i], slope + before * s.start
 
-    def _place(self, s: Stage) -> Place:
+    def _place(self, s: CollocationPoint) -> Place:
         time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
         suffix = self.suffix.replace("{", "{{").replace("}", "}}")
         return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
 
-    def _integral_rows(self, i: int, place: Place, ways: Group, rate: Group) -> None:
-        """A way is the integral of its rate in the phase so far."""
-        s, labels = self.stages[i], ways.labels
-        way = ways[i]
+    def _integral_rows(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
+        """A group of integrals over the phase so far, of a group of rates."""
+        s, labels = self.stages[i], integrals.labels
+        integral = integrals[i]
         for m, w in zip(s.members, s.quadrature, strict=True):
-            way = way - rate[m] * w
+            integral = integral - rate[m] * w
         if not s.new_phase:
-            way = way - ways[s.previous]
+            integral = integral - integrals[s.previous]
         self._b.rows.add(
             term="collision kinematics",
             place=place,
             components=labels,
-            affine=way,
+            affine=integral,
             lower=0,
             upper=0,
             measure=rates(labels),

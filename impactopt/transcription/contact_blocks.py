@@ -192,7 +192,7 @@ def force(
     numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
     pieces = [target.smooth(state, f, k, numbers) for k in phases or (0,)]
     speed, moves = ca.SX(pieces[0][0]), ca.vertcat(ca.SX(0, 1), *pieces[0][1])
-    event = lasting = ca.SX(0, 1)
+    event = invariant = ca.SX(0, 1)
 
     def of_phase(parts: list[list[Any]]) -> Any:
         return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
@@ -202,7 +202,7 @@ def force(
         event = of_phase(
             [[target.guard(state, f, T - shortest, k, numbers)] for k in range(len(target.guards))]
         )
-        lasting = of_phase([target.invariant(state, f, k, numbers) for k in phases])
+        invariant = of_phase([target.invariant(state, f, k, numbers) for k in phases])
     penetration, rate = way - gone, approach - speed
     compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
     out = {
@@ -215,7 +215,7 @@ def force(
         "separation": ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE,
         "speed": speed,
         "event": event,
-        "lasting": lasting,
+        "invariant": invariant,
     }
     z = [*([y0] if frozen is None else []), d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
     start = y0 if frozen is None else 0.0

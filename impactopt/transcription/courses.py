@@ -10,9 +10,9 @@ import numpy as np
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.plan import complete_reference
 from impactopt.transcription.rows import Place
-from impactopt.transcription.way import Way
 
 
 class TorqueCourse(NamedTuple):
@@ -29,18 +29,18 @@ class TorqueCourse(NamedTuple):
 
 
 def torque_courses(
-    b: Builder, swing: Way, follows: Sequence[Way], torques: Sequence[Affine]
+    b: Builder, swing: MotionPhase, follows: Sequence[MotionPhase], torques: Sequence[Affine]
 ) -> list[TorqueCourse]:
-    """Of the swing from its start on, where the torque is given, and of each way to rest.
+    """Of the swing from its start on, where the torque is given, and of each motion to rest.
 
-    torques : over limit, at the nodes of all of these, one way after the other.
+    torques : over limit, at the nodes of all of these, one motion after the other.
     """
     start, first = Affine.constant(_start_torque(b)), len(swing.nodes)
     nodes = np.append(0.0, swing.nodes)
     out = [TorqueCourse(nodes, [start, *torques[:first]], swing.T[0], swing.place_at)]
-    for way in follows:
-        last = first + len(way.nodes)
-        out.append(TorqueCourse(way.nodes, list(torques[first:last]), way.T[0], way.place_at))
+    for motion in follows:
+        last = first + len(motion.nodes)
+        out.append(TorqueCourse(motion.nodes, list(torques[first:last]), motion.T[0], motion.place_at))
         first = last
     return out
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.layout import Array
-from impactopt.transcription.mesh import Stage, lagrange
+from impactopt.transcription.mesh import CollocationPoint, lagrange
 
 
 def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None:
@@ -25,24 +25,30 @@ def carry_contact(new: Collision, old: Collision, into: Array, x: Array) -> None
     loose = _weights(new.stages, old.stages, known=False)[:, :-1]
     for mine, its in zip(new.loose(), old.loose(), strict=True):
         mine.write(into, loose @ its.read(x))
-    for way, rate in new.integrated():
+    for integral, rate in new.integrated():
         u = rate.read(into)
         d = np.zeros_like(u)
         for i, s in enumerate(new.stages):  # by their rows, which are linear
             d[i] = s.quadrature @ u[list(s.members)] + (0.0 if s.new_phase else d[s.previous])
-        way.write(into, d)
+        integral.write(into, d)
     for mine, its in zip(new.held_over(), old.held_over(), strict=True):
         mine.write(into, its.read(x))
 
 
-def same_places(new: Sequence[Stage], old: Sequence[Stage]) -> list[tuple[int, int]]:
+def same_places(new: Sequence[CollocationPoint], old: Sequence[CollocationPoint]) -> list[tuple[int, int]]:
     """Indices of stages that are at one place in one phase."""
     known = {(s.phase, round(s.place, 9)): k for k, s in enumerate(old)}
     pairs = ((i, known.get((s.phase, round(s.place, 9)))) for i, s in enumerate(new))
     return [(i, k) for i, k in pairs if k is not None]
 
 
-def _weights(new: Sequence[Stage], old: Sequence[Stage], *, anew: bool = False, known: bool = True) -> Array:
+def _weights(
+    new: Sequence[CollocationPoint],
+    old: Sequence[CollocationPoint],
+    *,
+    anew: bool = False,
+    known: bool = True,
+) -> Array:
     """Weights (new, old + 1) of the old stages' values, and of that at contact, in those at the new ones.
 
     anew : of what begins at zero in each phase.  known : whether the value at contact is.

@@ -14,11 +14,11 @@ from impactopt.transcription.contact import Contact
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.mesh import with_middles
+from impactopt.transcription.motion_phase import MotionPhase, at_node
 from impactopt.transcription.rows import Place
-from impactopt.transcription.way import Way, at_node
 
 
-class FollowThrough(Way):
+class FollowThrough(MotionPhase):
     """A clamped cubic spline to rest; it hands back where it starts.
 
     more : nodes beside the ends and middles of its intervals.
@@ -63,13 +63,13 @@ class FollowThrough(Way):
         self.T.write(x, curve.duration)
 
 
-class Brake(FollowThrough):
+class AbortMotion(FollowThrough):
     """The way to rest of a robot that has hit nothing, and coasts for ``after`` [s] from contact on until it
     knows. It has one node more, where coasting ends, under a sole wrench of its own.
     """
 
     def __init__(self, b: Builder, more: tuple[float, ...] = (), *, after: float) -> None:
-        super().__init__(b, more, kind="brake", name="brake")
+        super().__init__(b, more, kind="abort", name="abort")
         self.after = after
         self.coast_w = b.layout.add("coasting sole wrench", 1, b.nw, **b.limits.of_wrenches)
 

@@ -30,7 +30,7 @@ from impactopt.transcription.guess import coasted, effective_mass
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
-from impactopt.transcription.mesh import Shares, Stage, lagrange, place_of, segment_of
+from impactopt.transcription.mesh import CollocationPoint, Shares, lagrange, place_of, segment_of
 from impactopt.transcription.rows import Measure, Place, along, by_leg, rates
 
 
@@ -49,7 +49,13 @@ class FrozenCollision(Collision):
     """Variables and rows of the contact with one target. shares : of the hit; the rest as of `Collision`."""
 
     def __init__(
-        self, b: Builder, contact: Contact, stages: Sequence[Stage], *, shares: Shares, **common: Any
+        self,
+        b: Builder,
+        contact: Contact,
+        stages: Sequence[CollocationPoint],
+        *,
+        shares: Shares,
+        **common: Any,
     ) -> None:
         assert b.problem.frozen is not None
         self.effects, self.shares, self.freezes = b.problem.frozen, shares, b.problem.freezes
@@ -63,8 +69,8 @@ class FrozenCollision(Collision):
         self.leg_rates = add("collision leg rates", n, b.nl, **legs)
         self.lag = add("lag of the legs", n, b.nl, **legs)
         self.speed = add("hand speed", n, 1, **hand)
-        self.way = add("hand travel", n, 1, **hand)
-        self.joined_way = add("hand travel in compression", joined, 1, **hand)
+        self.travel = add("hand travel", n, 1, **hand)
+        self.joined_travel = add("hand travel in compression", joined, 1, **hand)
         self.begins = [add(f"hand speed, segment {k}", 1, 1, **hand) for k in range(max(self.freezes, 1))]
         self.frozen_at = [add(f"freeze {k}", 1, b.ny, labels=c.labels) for k in range(self.freezes)]
         self.frozen_legs = [add(f"legs of freeze {k}", 1, b.nl, **legs) for k in range(self.freezes)]
@@ -87,13 +93,13 @@ class FrozenCollision(Collision):
         self.bends = self._b.layout.add(name, count, self._b.nl, labels=labels)
 
     # ------------------------------------------------------------------ where it is frozen
-    def _segment(self, s: Stage) -> int:
+    def _segment(self, s: CollocationPoint) -> int:
         if not self.freezes:
             return 0
         begin, end = self._ends(s)
         return segment_of(s.phase, begin, end, self.shares, self.freezes)
 
-    def _ends(self, s: Stage) -> tuple[float, float]:
+    def _ends(self, s: CollocationPoint) -> tuple[float, float]:
         """Places of begin and end of a stage's element, in the phase."""
         return 0.0 if s.new_phase else self.stages[s.previous].place, self.stages[s.members[-1]].place
 
@@ -116,7 +122,7 @@ class FrozenCollision(Collision):
         self._legs_at.append(value(self.legs, state.legs))
         return _Freeze(phase, place, self.frozen_at[k][0], value(self.u, u0), self.frozen_legs[k][0])
 
-    def _element_at(self, phase: int, place: float) -> Stage:
+    def _element_at(self, phase: int, place: float) -> CollocationPoint:
         """A stage of the element that a place in a phase is in."""
         return next(
             s for s in self.stages if s.phase == phase and place <= self.stages[s.members[-1]].place + 1e-9
@@ -193,8 +199,8 @@ class FrozenCollision(Collision):
     def _of_hand(self, i: int) -> list[Affine]:
         """Step 7b: of the accelerations of the contact point, and not of the robot's geometry."""
         s = self.stages[i]
-        before = self._way(self.way, self.joined_way, s.phase)
-        return [before, self._before(s.phase)[0], self.way[i], self.T[s.phase][0], self.speed[i]]
+        before = self._so_far(self.travel, self.joined_travel, s.phase)
+        return [before, self._before(s.phase)[0], self.travel[i], self.T[s.phase][0], self.speed[i]]
 
     def _reference(self) -> dict[str, tuple[list[list[Affine]], list[Any]]]:
         if not self._b.coordinates.legs:
@@ -222,10 +228,10 @@ class FrozenCollision(Collision):
 
     # ------------------------------------------------------------------ groups
     def integrated(self) -> list[tuple[Group, Group]]:
-        return [*super().integrated(), (self.way, self.speed)]
+        return [*super().integrated(), (self.travel, self.speed)]
 
-    def _ways(self) -> list[tuple[Group, Group]]:
-        return [*super()._ways(), (self.way, self.joined_way)]
+    def _integrals(self) -> list[tuple[Group, Group]]:
+        return [*super()._integrals(), (self.travel, self.joined_travel)]
 
     def _at_stage(self) -> tuple[Group, ...]:
         return (self.legs,)
@@ -238,7 +244,7 @@ class FrozenCollision(Collision):
 
     def held_over(self) -> list[Group]:
         met = [] if self._meeting is None else [self._meeting.du, self._meeting.w, self._meeting.blow]
-        own = [*self._of_reference(), self.joined_way, self.carried]
+        own = [*self._of_reference(), self.joined_travel, self.carried]
         return [*super().held_over(), *own, *self.begins, *self.frozen_at, *self.frozen_legs, *met]
 
     def determined(self) -> list[Determined]:
@@ -323,7 +329,11 @@ class FrozenCollision(Collision):
     def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         super()._dynamics_rows(i, place, first)
         b, part = self._b, self._b.parts("collision")
-        for labels, name in ((self.lag.labels, "legs"), (self.lag.labels, "lag"), (self.way.labels, "hand")):
+        for labels, name in (
+            (self.lag.labels, "legs"),
+            (self.lag.labels, "lag"),
+            (self.travel.labels, "hand"),
+        ):
             b.equal("collision kinematics", place, labels, first["collision"] + part[name], rates(labels))
 
     # ------------------------------------------------------------------ numbers
@@ -332,7 +342,7 @@ class FrozenCollision(Collision):
         k = int(np.argmax(np.abs(rates)))
         if rates[k] != 0:
             speed = self._speed(y, rates, legs) / rates[k]
-            for mine, its in ((self.speed, self.u), (self.way, self.d), (self.joined_way, self.joined)):
+            for mine, its in ((self.speed, self.u), (self.travel, self.d), (self.joined_travel, self.joined)):
                 mine.write(x, its.read(x)[:, k : k + 1] * speed)
         if self._meeting is not None:
             self._meeting.guess(x, y, rates, legs)

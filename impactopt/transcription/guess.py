@@ -38,13 +38,13 @@ PUSH, PUSHED, LEFT, SOFT = np.array([0.015, 0.02]), 0.8, 0.6, 0.02
 class Blow:
     """A contact at k collocation points. ``durations`` [s] of its phases; the others at the points:
 
-    speed (k,) of the point mass over that at contact, way (k,) [s]: its integral in the phase so far; force
-    (k,) [N]; impulse (k,) [N s]; state (k, n), travel (k,) [m] of the target in the phase.
+    speed (k,) of the point mass over that at contact, moved (k,) [s]: its integral in the phase so far;
+    force (k,) [N]; impulse (k,) [N s]; state (k, n), travel (k,) [m] of the target in the phase.
     """
 
     durations: Array
     speed: Array
-    way: Array
+    moved: Array
     force: Array
     impulse: Array
     state: Array
@@ -80,21 +80,21 @@ def coasted(
         yield legs, (v[c.base + c.dependent], a[c.base + c.dependent])
 
 
-def _ways(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array) -> tuple[Array, Array]:
+def _motions(c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array) -> tuple[Array, Array]:
     """Rates of all joints (nv, ny), and the striker's speed (ny,) along the normal, for rates ydot of 1."""
     model, data = c.model, c.model.createData()
     still = np.zeros(c.ny)
-    ways = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
+    motions = np.column_stack([c.complete_motion(y, e, still, legs)[1] for e in np.eye(c.ny)])
     pin.computeJointJacobians(model, data, c.join(y, legs))
     frame = model.getFrameId(f"striker:{striker}")
     jacobian = np.array(pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED))[:3]
-    return ways, normal @ jacobian @ ways
+    return motions, normal @ jacobian @ motions
 
 
 def fastest(c: StanceCoordinates, striker: str, normal: Array, posture: Array, limit: Array) -> float:
     """How fast [m/s] the striker is along the normal in a posture (nq,), at most; ``limit`` (n,) [rad/s]."""
-    ways, row = _ways(c, striker, normal, *c.split(posture))
-    joints = ways[c.base :]
+    motions, row = _motions(c, striker, normal, *c.split(posture))
+    joints = motions[c.base :]
     bounds = np.concatenate([limit, limit])
     found = linprog(-row, A_ub=np.vstack([joints, -joints]), b_ub=bounds, bounds=(None, None))
     return float(-found.fun) if found.status == 0 else np.inf
@@ -170,7 +170,7 @@ def blow(
     return Blow(
         durations=np.diff(ends),
         speed=np.interp(times, time, v) / v[0],
-        way=since(x) / v[0],
+        moved=since(x) / v[0],
         force=np.interp(times, time, force),
         impulse=mass * (v[0] - np.interp(times, time, v)),
         state=state,
@@ -199,7 +199,7 @@ def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
     return Blow(
         durations=PUSH,
         speed=1 - (1 - LEFT) * fraction,
-        way=place * PUSH[phase] - (1 - LEFT) * ramp,
+        moved=place * PUSH[phase] - (1 - LEFT) * ramp,
         force=force,
         impulse=force * elapsed,
         state=PUSHED * fraction[:, None],

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from impactopt.transcription.batched import BatchedFunction, Block
 from impactopt.transcription.layout import Array
 from impactopt.transcription.rows import Index
-from impactopt.transcription.runs import Runs, count_up, union, with_transposed
+from impactopt.transcription.scatter_add import Runs, count_up, union, with_transposed
 
 
 class JacobianMap:

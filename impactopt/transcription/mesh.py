@@ -22,7 +22,7 @@ SNAP = 0.1  # of a segment between freezes: an element is not shorter
 
 
 @dataclass(frozen=True)
-class Stage:
+class CollocationPoint:
     """One collocation point of the collision."""
 
     phase: int
@@ -42,10 +42,10 @@ class Stage:
 
 def collision_mesh(
     elements: Sequence[tuple[float, ...]], radau: Radau, names: tuple[str, ...] = Target.phases
-) -> list[Stage]:
+) -> list[CollocationPoint]:
     """Stages of the contact's phases; ``elements``: their lengths, as fractions of a phase."""
     inverse = np.linalg.inv(radau.a)
-    stages: list[Stage] = []
+    stages: list[CollocationPoint] = []
     for phase, name in enumerate(names):
         s = 0.0
         for e, h in enumerate(elements[phase]):
@@ -53,7 +53,7 @@ def collision_mesh(
             members = tuple(range(first, first + len(radau.c)))
             for i, c in enumerate(radau.c):
                 stages.append(
-                    Stage(
+                    CollocationPoint(
                         phase,
                         name,
                         s + c * h,
@@ -132,7 +132,7 @@ def halved(elements: Elements) -> Elements:
     return tuple(tuple(h / 2 for h in lengths for _ in range(2)) for lengths in elements)
 
 
-def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> list[Stage]:
+def contact_mesh(problem: ImpactProblem, elements: Elements | None = None) -> list[CollocationPoint]:
     """Stages of the contact of a problem; ``elements``: if not those that it asks for."""
     radau = Radau.of_stages(problem.collision_stages)
     return collision_mesh(elements or contact_elements(problem), radau, problem.target.phases)

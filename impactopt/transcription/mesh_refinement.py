@@ -45,7 +45,7 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     start = plan.coordinates.split(plan.problem.start_posture)[1]
     swing, legs = _middles_outside(plan, 0, start)
     follow = _middles_outside(plan, 2, legs)[0]
-    if plan.brake is not None:
+    if plan.abort is not None:
         follow += _middles_outside(plan, 2, legs, missed=True)[0]
     return MoreNodes(
         tuple(sorted({*known.swing, *swing})),
@@ -58,7 +58,7 @@ def _middles_outside(
 ) -> tuple[list[float], Array]:
     """Middles between nodes at which the plan is out of its limits, and the legs at the last of them."""
     p, c = plan.problem, plan.coordinates
-    curve, begin, nodes, _ = plan.way(phase, missed=missed)
+    curve, begin, nodes, _ = plan.segment(phase, missed=missed)
     places = (nodes[1:] + nodes[:-1]) / 2
     y, yd, ydd, wrench = plan.independent(phase, begin + places * curve.duration, missed=missed)
     q, _, _, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)

@@ -18,7 +18,7 @@ from impactopt.errors import InputError
 from impactopt.problem.objectives import Objective
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, Group, Layout, stack
-from impactopt.transcription.way import Way
+from impactopt.transcription.motion_phase import MotionPhase
 
 
 @dataclass(frozen=True)
@@ -82,26 +82,28 @@ def wrench_prices(b: Builder, groups: list[tuple[Group, int]]) -> Array:
     return diagonal
 
 
-def motion_prices(b: Builder, ways: Sequence[Way], to_rest: Sequence[Way], wrenches: list[Group]) -> Prices:
-    """Of the accelerations of ways, of sole wrenches, and of ending away from the start posture.
+def motion_prices(
+    b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase], wrenches: list[Group]
+) -> Prices:
+    """Of the accelerations of motions, of sole wrenches, and of ending away from the start posture.
 
-    to_rest : those of the ways that end at rest.  wrenches : the means of these groups.
+    to_rest : those of the motions that end at rest.  wrenches : the means of these groups.
     """
     p, n = b.problem, b.layout.n
     linear, diagonal, constant = np.zeros(n), np.zeros(n), 0.0
     accelerations: list[Affine] = []
-    for way in ways:
-        typical = float(np.mean(way.phase.duration))
-        for s, length in zip(way.nodes, np.gradient(way.nodes), strict=True):
+    for motion in motions:
+        typical = float(np.mean(motion.phase.duration))
+        for s, length in zip(motion.nodes, np.gradient(motion.nodes), strict=True):
             weight = p.smoothness * typical * length
-            accelerations.append(way.at(s)[2] * (np.sqrt(2 * weight) / typical**2))
+            accelerations.append(motion.at(s)[2] * (np.sqrt(2 * weight) / typical**2))
     weighted = stack(accelerations)
     m = weighted.matrix(n)
     linear += m.T @ weighted.const
     constant += float(weighted.const @ weighted.const) / 2
     diagonal += wrench_prices(b, [(group, group.count) for group in wrenches])
-    for way in to_rest:  # price (y_end - y_start)^2: rest near the start posture
-        end = way.c.index(-1)
+    for motion in to_rest:  # price (y_end - y_start)^2: rest near the start posture
+        end = motion.c.index(-1)
         diagonal[end] += 2 * p.return_price
         linear[end] -= 2 * p.return_price * b.y0
         constant += p.return_price * float(b.y0 @ b.y0)

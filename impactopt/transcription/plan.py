@@ -113,7 +113,7 @@ class Plan:
     there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
     through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
     [N s] to the target. scenarios: what is predicted of other targets, in the problem's order; a missing one
-    is not hit, so it is not among them. brake, brake_wrench: the abort motion, as follow, for a blow that
+    is not hit, so it is not among them. abort, abort_wrench: the abort motion, as follow, for a blow that
     hits nothing; None if the problem does not ask for it.
     """
 
@@ -130,8 +130,8 @@ class Plan:
     hand_speed: float
     impulse: float
     scenarios: tuple[PlannedScenario, ...] = ()
-    brake: CubicSpline | None = None
-    brake_wrench: Array | None = None
+    abort: CubicSpline | None = None
+    abort_wrench: Array | None = None
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -176,14 +176,14 @@ class Plan:
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
-        curve, start, nodes, wrench = self.way(phase, missed=missed)
+        curve, start, nodes, wrench = self.segment(phase, missed=missed)
         local = np.clip(ts - start, 0.0, curve.duration)
         y, yd, ydd = curve.sample(local)
         at = nodes * curve.duration
         w = np.stack([np.interp(local, at, k) for k in wrench.T], axis=1) if nw else np.zeros((len(ts), 0))
         return y, yd, ydd, w
 
-    def way(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
+    def segment(self, phase: int, *, missed: bool = False) -> tuple[CubicSpline, float, Array, Array]:
         """Spline, start [s], nodes and sole wrenches there of the swing (phase 0) or the follow-through (2);
         ``missed``: of the abort motion.
         """
@@ -191,13 +191,13 @@ class Plan:
             return self.swing, 0.0, self.swing_nodes, self.swing_wrench
         if not missed:
             return self.follow, self.contact_end, self.follow_nodes, self.follow_wrench
-        after = self.problem.brake_after
-        if self.brake is None or self.brake_wrench is None or after is None:
+        after = self.problem.abort_after
+        if self.abort is None or self.abort_wrench is None or after is None:
             raise InputError(
                 "this plan has no motion for a blow that meets nothing: solve the problem with a scenario "
-                "Scenario(name=..., missing=True, brake_after=0.025)"
+                "Scenario(name=..., missing=True, abort_after=0.025)"
             )
-        return self.brake, self.contact_start + after, self.follow_nodes, self.brake_wrench
+        return self.abort, self.contact_start + after, self.follow_nodes, self.abort_wrench
 
     def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
@@ -209,7 +209,7 @@ class Plan:
         The instants of contact and of its end are there twice: the reference jumps from the coasting one to
         the predicted state.
         """
-        last, t1, _, _ = self.way(2, missed=missed)
+        last, t1, _, _ = self.segment(2, missed=missed)
         t0, rest = self.contact_start, t1 + last.duration
         end = rest + hold
         legs = self.coordinates.split(self.problem.start_posture)[1]
@@ -251,7 +251,7 @@ class Plan:
         ------
         InputError : the legs do not reach.
         """
-        last, t1, _, _ = self.way(2, missed=missed)
+        last, t1, _, _ = self.segment(2, missed=missed)
         t0, end = self.contact_start, t1 + last.duration
         within = np.linspace(t0, t1, max(2, round((t1 - t0) / step) + 1))
         during = self._closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
@@ -279,7 +279,7 @@ class Plan:
 
     def through_contact(self, s: Array, *, missed: bool = False) -> Array:
         """Independent coordinates (k, ny) at fractions s (k,) of the contact."""
-        t0, (_, t1, _, _) = self.contact_start, self.way(2, missed=missed)
+        t0, (_, t1, _, _) = self.contact_start, self.segment(2, missed=missed)
         (y0,), (u0,), _, _ = self.independent(0, np.array([t0]), missed=missed)
         (y1,), (u1,), _, _ = self.independent(2, np.array([t1]), missed=missed)
         span, way, at = t1 - t0, y1 - y0, s[:, None]

@@ -135,7 +135,7 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
     places = {}
     if isinstance(t, Transcription) and isinstance(old, Transcription):
         places = {"swing": (old.swing_nodes, t.swing_nodes)}
-        places |= dict.fromkeys(("follow", "brake"), (old.follow_nodes, t.follow_nodes))
+        places |= dict.fromkeys(("follow", "abort"), (old.follow_nodes, t.follow_nodes))
     new, bounds = np.clip(np.zeros(t.layout.n), t.layout.lower, t.layout.upper), np.zeros(t.layout.n)
     for name, group in t.layout.groups.items():
         known = old.layout.groups.get(name)
@@ -224,8 +224,8 @@ def _motion(t: Transcription, curve: CubicSpline, back: CubicSpline) -> Array:
         if c.legs:
             group.write(x, np.array(all_legs))
             wrench.write(x, np.array(all_w))
-    if t.brake is not None and c.legs:
-        t.brake.coast_w.write(x, t.swing.w.read(x)[-1:])
+    if t.abort is not None and c.legs:
+        t.abort.coast_w.write(x, t.swing.w.read(x)[-1:])
     t.swing.T.write(x, curve.duration)
     return x
 

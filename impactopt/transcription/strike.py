@@ -22,6 +22,7 @@ from impactopt.transcription.contact import Contact, ContactState, add_coasting
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.mesh import Elements, Shares
+from impactopt.transcription.motion_phase import at_node
 from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, wrench_prices
 from impactopt.transcription.plan import total_ground_wrench
@@ -29,7 +30,6 @@ from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rows import Measure, Place, along, by_leg
 from impactopt.transcription.shot import Shots
 from impactopt.transcription.touch import add_touch_rows
-from impactopt.transcription.way import at_node
 
 
 class StrikeTranscription(ContactProgram):

@@ -9,10 +9,10 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import ContactState
 from impactopt.transcription.layout import Affine
 from impactopt.transcription.mesh import with_middles
-from impactopt.transcription.way import Way
+from impactopt.transcription.motion_phase import MotionPhase
 
 
-class Swing(Way):
+class Swing(MotionPhase):
     """A cubic spline from rest that ends without acceleration; it hands back the state at contact.
 
     more : nodes beside the ends and middles of its intervals.

@@ -30,9 +30,8 @@ from impactopt.transcription.contact_blocks import typical_state
 from impactopt.transcription.courses import TorqueCourse, torque_courses
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.extra_blocks import ExtraBlock, extra_blocks, own_blocks
-from impactopt.transcription.follow import Brake, FollowThrough
+from impactopt.transcription.follow import AbortMotion, FollowThrough
 from impactopt.transcription.hit import Hit
-from impactopt.transcription.lanes import in_lanes
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
@@ -40,6 +39,7 @@ from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, motion_prices
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.rows import Index, Place, along, degrees, percent, rates
+from impactopt.transcription.simd import in_lanes
 from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.swing import Swing
 from impactopt.transcription.touch import add_touch_rows
@@ -95,7 +95,7 @@ class Transcription(ContactProgram):
 
     Attributes
     ----------
-    swing, follow, brake : the ways; the last one for a blow that meets nothing, if a scenario asks for it.
+    swing, follow, abort : the motions; the last one for a blow that meets nothing, if a scenario asks for it.
     follows : those after contact.
     torques : over limit, at each node of swing and follows, if something asks for torques as variables; else
         at contact alone.
@@ -115,11 +115,11 @@ class Transcription(ContactProgram):
         contact = Contact(self.swing.end, *add_coasting(b))
         super().__init__(b, Hit(b, contact, elements, shares, after=False))
         self.follow = FollowThrough(b, nodes.follow)
-        after = problem.brake_after
-        self.brake = None if after is None else Brake(b, nodes.follow, after=after)
-        self.follows = [self.follow] if self.brake is None else [self.follow, self.brake]
+        after = problem.abort_after
+        self.abort = None if after is None else AbortMotion(b, nodes.follow, after=after)
+        self.follows = [self.follow] if self.abort is None else [self.follow, self.abort]
         self.torques: list[Affine] = []
-        self._add_ways()
+        self._add_motions()
         add_touch_rows(b, contact.state)
         add_clearance(b, self.swing, self.follow)
         self.hit.add_rows()
@@ -143,7 +143,7 @@ class Transcription(ContactProgram):
 
     @property
     def follow_nodes(self) -> Array:
-        """Places of the nodes of the ways to rest in them, from 0 to 1."""
+        """Places of the nodes of the motions to rest in them, from 0 to 1."""
         return self.follow.nodes
 
     def swing_place(self, s: float) -> Place:
@@ -161,25 +161,23 @@ class Transcription(ContactProgram):
         return [spot for follow in self.follows for spot in follow.spots()]
 
     def torque_courses(self) -> list[TorqueCourse]:
-        """Torques over limit of swing, follow-through and brake, of a program that has them as variables."""
+        """Torques over limit of all motions, of a program that has them as variables."""
         return torque_courses(self.builder, self.swing, self.follows, self.torques)
 
     # ------------------------------------------------------------------ rows
-    def _add_ways(self) -> None:
-        """Nodes of swing, contact (coasting), follow-through and brake: one block for all of them; and what
-        bounds the splines.
-        """
+    def _add_motions(self) -> None:
+        """One block for the nodes of all motions, and of coasting in contact; and what bounds the splines."""
         b, limits = self.builder, self.builder.limits
         instances, places = self.swing.instances()
         for follow in self.follows:
             slots, names = follow.instances()
             instances += slots
             places += names
-        if self.brake is not None:
-            coasting, name = self.brake.coasting_node()
+        if self.abort is not None:
+            coasting, name = self.abort.coasting_node()
             instances.append(coasting)
             places.append(name)
-        outputs = add_nodes(b, instances, places, closed=int(self.brake is not None))
+        outputs = add_nodes(b, instances, places, closed=int(self.abort is not None))
         self._add_torque_rows(places, outputs)
         joints = np.arange(self.coordinates.base, b.ny)
         b.rows.add(
@@ -240,25 +238,25 @@ class Transcription(ContactProgram):
         instances = hit.expected.link(self.follow.start)
         for other in hit.scenarios:
             instances += other.link_after()
-        if self.brake is not None:
-            instances += self.brake.link(hit.contact)
+        if self.abort is not None:
+            instances += self.abort.link(hit.contact)
         at = b.add_block("link", instances, np.zeros(0))
         labels, places = self.coordinates.labels, at + 3 * np.arange(b.ny)
         far, fast = along(labels, "off"), rates(labels)
         b.equal("collision starts from the swing's end", "rate", labels, places, fast)
         b.equal("follow-through starts from the predicted state", "position", labels, places + 1, far)
         b.equal("follow-through starts from the predicted state", "rate", labels, places + 2, fast)
-        if self.brake is not None:
+        if self.abort is not None:
             after = places + 3 * b.ny * len(hit.collisions)
-            b.equal("brake starts where coasting ends", "position", labels, after + 1, far)
-            b.equal("brake starts where coasting ends", "rate", labels, after + 2, fast)
+            b.equal("abort motion starts where coasting ends", "position", labels, after + 1, far)
+            b.equal("abort motion starts where coasting ends", "rate", labels, after + 2, fast)
         for other in hit.scenarios:
             outputs = places + 1 + 3 * b.ny * other.number
             b.equal("state after contact", f"position{other.suffix}", labels, outputs, far)
 
     # ------------------------------------------------------------------ structure
     def _prices(self) -> Prices:
-        coasting = [] if self.brake is None else [self.brake.coast_w]
+        coasting = [] if self.abort is None else [self.abort.coast_w]
         wrenches = [part.w for part in (self.swing, *self.follows, *self.hit.collisions)]
         return motion_prices(self.builder, [self.swing, *self.follows], self.follows, [*wrenches, *coasting])
 
@@ -276,7 +274,7 @@ class Transcription(ContactProgram):
             for s, (place, slots) in zip(self.swing.nodes, found, strict=True)
         ]
         for missed, follow in enumerate(self.follows):
-            curve, begin, nodes, _ = plan.way(2, missed=bool(missed))
+            curve, begin, nodes, _ = plan.segment(2, missed=bool(missed))
             out += [
                 BodyState(2 + missed, place.name, begin + s * curve.duration, self.posture(x, slots))
                 for s, (place, slots) in zip(nodes, follow.spots(), strict=True)
@@ -289,7 +287,7 @@ class Transcription(ContactProgram):
     def decode(self, x: Array) -> Plan:
         """The plan that solver variables (n,) stand for."""
         start_w = static_wrenches(self.coordinates, self.y0, self.legs0)
-        brake = self.brake
+        abort = self.abort
         return Plan(
             problem=self.problem,
             swing=self.swing.spline(x),
@@ -298,7 +296,7 @@ class Transcription(ContactProgram):
             swing_wrench=np.vstack([start_w, self.swing.w.read(x)]),
             follow_nodes=self.follow.nodes,
             follow_wrench=self.follow.w.read(x),
-            brake=None if brake is None else brake.spline(x),
-            brake_wrench=None if brake is None else brake.w.read(x),
+            abort=None if abort is None else abort.spline(x),
+            abort_wrench=None if abort is None else abort.w.read(x),
             **self.hit.decode(x, self.program.outputs(x)),
         )

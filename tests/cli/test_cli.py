@@ -19,10 +19,10 @@ import impactopt
 from impactopt.cli.app import app
 from impactopt.files.output import Record, load_record
 from impactopt.files.problem_file import ProblemFile
-from impactopt.pictures import PICTURES
 from impactopt.planning.multistart import Attempt
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
+from impactopt.report.pictures import PICTURES
 from impactopt.solvers.program import IterationRecord, Status, Violation
 
 GOOD = f"""\
@@ -93,7 +93,7 @@ def quick_pictures(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureReque
         return paths
 
     if "real_pictures" not in request.fixturenames:
-        monkeypatch.setattr("impactopt.pictures.save_pictures", save)
+        monkeypatch.setattr("impactopt.report.pictures.save_pictures", save)
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from impactopt.transcription.transcription import Transcription
 Array = NDArray[np.float64]
 SCENARIOS = (
     Scenario(name="heavy {5 kg}", mass=2.0),
-    Scenario(name="missing", missing=True, brake_after=0.02),
+    Scenario(name="missing", missing=True, abort_after=0.02),
 )
 
 

@@ -22,7 +22,7 @@ from impactopt.contact import FreeMass, HuntCrossley, RigidWall, SpringDamper
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import BothSoles
 from impactopt.problem.problem import ImpactProblem
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 from impactopt.simulation.reference import FullDynamics
 
 pytestmark = pytest.mark.filterwarnings("ignore::impactopt.errors.NoCompilerWarning")

@@ -18,9 +18,9 @@ from impactopt.errors import InputError
 from impactopt.files.output import FORMAT, Record, load_record, record_of, save_record, write_file
 from impactopt.files.record_schema import check_summary
 from impactopt.kinematics.support import margin
-from impactopt.pictures import PICTURES, save_pictures
-from impactopt.pictures.torque import _binned
 from impactopt.problem.problem import ImpactProblem
+from impactopt.report.pictures import PICTURES, save_pictures
+from impactopt.report.pictures.torque import _binned
 from impactopt.solvers.program import Status
 from impactopt.transcription.plan import Plan
 

@@ -155,7 +155,7 @@ WORDS = st.text("ab \"'\\\n=#[", min_size=1).filter(lambda text: bool(text.strip
 SCENARIOS = st.lists(
     st.builds(Scenario, name=WORDS, torque=SMALL, cone_margin=SMALL)
     | st.builds(
-        Scenario, name=st.text("cd", min_size=1), missing=st.just(True), brake_after=st.none() | SMALL
+        Scenario, name=st.text("cd", min_size=1), missing=st.just(True), abort_after=st.none() | SMALL
     ),
     max_size=2,
     unique_by=lambda s: s.name,

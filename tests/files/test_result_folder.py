@@ -14,7 +14,7 @@ from impactopt.cli.show import PAGE
 from impactopt.errors import InputError
 from impactopt.files.output import DERIVED, Record, load_record, remove_file, save_record, write_file
 from impactopt.files.result_folder import keep_record, keep_series, set_aside
-from impactopt.pictures import PICTURES
+from impactopt.report.pictures import PICTURES
 from impactopt.solvers.program import Status
 
 NOT_SOLVED = [s for s in Status if not s.usable]

@@ -17,7 +17,7 @@ from support.small_robots import arm, biped
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
 from impactopt.kinematics.fixed_order import elimination_order, solve_in_order
-from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
@@ -388,7 +388,7 @@ def test_a_reached_posture_has_the_point_the_soles_and_the_limits(case: Case) ->
     pin.framesForwardKinematics(model, data, case.posture)
     away = np.array([0.05, 0.04, 0.06]) if c.base else np.array([0.1, -0.2, 0.1])
     point = data.oMf[frame].translation + away
-    q = reach(c, striker, point, case.posture)
+    q = inverse_kinematics(c, striker, point, case.posture)
     pin.framesForwardKinematics(model, data, q)
     np.testing.assert_allclose(data.oMf[frame].translation, point, atol=1e-7)
     for leg in c.legs:
@@ -409,7 +409,7 @@ def test_reach_keeps_away_from_limits_where_it_could_stay() -> None:
     pin.framesForwardKinematics(robot.model, data, q)
     point = data.oMf[robot.model.getFrameId("striker:fist")].translation + 0.01
     for options, margin in (({}, 0.02), ({"margin": 0.1}, 0.1)):
-        found = reach(case.c, "fist", point, q, **options)
+        found = inverse_kinematics(case.c, "fist", point, q, **options)
         assert robot.joint_positions(found)[elbow] <= robot.upper[elbow] - margin + 1e-9
 
 
@@ -422,7 +422,7 @@ def test_reach_turns_a_continuous_joint_past_half_a_turn() -> None:
     behind[:2] = np.cos(-2.9), np.sin(-2.9)
     pin.framesForwardKinematics(robot.model, data, behind)
     point = data.oMf[robot.model.getFrameId("striker:hand")].translation
-    q = reach(c, "hand", point, robot.posture("start"))
+    q = inverse_kinematics(c, "hand", point, robot.posture("start"))
     assert pin.isNormalized(robot.model, q, 1e-9)
     assert robot.joint_positions(q)[0] == pytest.approx(-2.9, abs=1e-6)
 
@@ -437,7 +437,7 @@ def test_a_reach_turns_the_hand(name: str) -> None:
     point = np.array([0.7, 0.0, 0.75]) if name == "planar_arm" else np.array([0.65, 0.0, 0.4])
     along = []
     for facing in (None, (face, down)):
-        q = reach(c, "hammer", point, posture, facing=facing)
+        q = inverse_kinematics(c, "hammer", point, posture, facing=facing)
         pin.framesForwardKinematics(robot.model, data, q)
         np.testing.assert_allclose(data.oMf[frame].translation, point, atol=1e-7)
         along.append(float(down @ data.oMf[frame].rotation @ face))
@@ -450,4 +450,4 @@ def test_a_reach_turns_the_hand(name: str) -> None:
 def test_out_of_reach_says_how_far_off() -> None:
     case = made("arm")
     with pytest.raises(InputError, match=r"out of reach of 'hand'.*off by .*starts at"):
-        reach(case.c, "hand", np.array([2.0, 0.0, 0.5]), case.posture)
+        inverse_kinematics(case.c, "hand", np.array([2.0, 0.0, 0.5]), case.posture)

@@ -37,7 +37,7 @@ def test_nor_in_other_problems(name: str) -> None:
     assert solution.status.usable, solution.result.message
     meshes = Meshes(solution.problem.robot, solution.problem.start_posture)
     assert meshes.known
-    for missed in (False, True) if solution.plan.brake is not None else (False,):
+    for missed in (False, True) if solution.plan.abort is not None else (False,):
         assert meshes.touching(solution.plan.motion(1e-3, missed=missed).q) == []
 
 

@@ -66,7 +66,7 @@ def test_keys_may_leave_their_unit_out_and_name_entries_of_lists() -> None:
             "problem.point.1": 0.1,
             "problem.normal": np.array([1.0, 0.0, 0.0]),
             "scenarios.heavy.mass": 3,
-            "scenarios.0.brake_after": 0.03,
+            "scenarios.0.abort_after": 0.03,
             "swing.duration": (0.5, 0.6),
             "terms.torque_limit.fraction": 0.7,
             "solver.ipopt.tol": 1e-5,
@@ -76,7 +76,7 @@ def test_keys_may_leave_their_unit_out_and_name_entries_of_lists() -> None:
     assert data["contact"] == {"stiffness_N_m": 2e4, "damping_N_s_m": 30.0}
     assert data["problem"]["point_m"] == [0.7, 0.1, 0.75]
     assert data["problem"]["normal"] == [1.0, 0.0, 0.0]
-    assert data["scenarios"][1]["mass"] == 3 and data["scenarios"][0]["brake_after_s"] == 0.03
+    assert data["scenarios"][1]["mass"] == 3 and data["scenarios"][0]["abort_after_s"] == 0.03
     assert data["swing"]["duration_s"] == [0.5, 0.6]
     assert data["terms"] == {"torque_limit": {"fraction": 0.7}}
     assert data["solver"] == {"ipopt": {"tol": 1e-5}}

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from impactopt import load_problem, load_robot, standin
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.kinematics.inverse_kinematics import reach
+from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.robots import presets
 from impactopt.robots.robot import Robot
 from impactopt.robots.standin import LINKS, PELVIS
@@ -254,7 +254,7 @@ def test_both_hands_are_in_front_and_reach_40_cm_ahead_of_the_chest(
     begins = frame_at(robot, start, f"striker:{hand}").translation
     assert begins[0] > chest[0] + 0.2
     point = np.array([chest[0] + 0.4, y, 1.0])
-    q = reach(coordinates, hand, point, start)
+    q = inverse_kinematics(coordinates, hand, point, start)
     np.testing.assert_allclose(frame_at(robot, q, f"striker:{hand}").translation, point, atol=1e-7)
     robot.check_limits(q)
     robot.check_stance(q)

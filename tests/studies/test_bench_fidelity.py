@@ -15,8 +15,8 @@ from impactopt.cli.app import app
 from impactopt.collision import effective_mass
 from impactopt.errors import InputError
 from impactopt.kinematics.stance import BothSoles
-from impactopt.pictures.fidelity import fidelity_picture
-from impactopt.pictures.virtual_base import virtual_base_picture
+from impactopt.report.pictures.fidelity import fidelity_picture
+from impactopt.report.pictures.virtual_base import virtual_base_picture
 from impactopt.robots.presets import standin
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import PAPER_SPEEDS

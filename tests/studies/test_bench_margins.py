@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.problem_file import ProblemFile
-from impactopt.pictures.margins import margins_picture
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, TorqueLimit
+from impactopt.report.pictures.margins import margins_picture
 from impactopt.simulation import Perturbation, Simulation
 from impactopt.simulation.robustness import PerturbationRanges, Robustness, draw_perturbations
 from impactopt.solvers.program import Status

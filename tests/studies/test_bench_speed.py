@@ -16,10 +16,10 @@ from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, Effects, VirtualMass
 from impactopt.collision.describe import independent_joints
 from impactopt.errors import InputError
-from impactopt.pictures.pareto import front, pareto_picture
-from impactopt.pictures.scaling import scaling_picture
-from impactopt.pictures.skip import skip_picture
-from impactopt.pictures.style import STYLE
+from impactopt.report.pictures.pareto import front, pareto_picture
+from impactopt.report.pictures.scaling import scaling_picture
+from impactopt.report.pictures.skip import skip_picture
+from impactopt.report.pictures.style import STYLE
 from impactopt.robots.presets import standin
 from impactopt.simulation.cases import Case
 from impactopt.studies.bench import clock, collision, scaling, skip

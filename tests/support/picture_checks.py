@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.text import Text
 
-from impactopt.pictures.style import styled
+from impactopt.report.pictures.style import styled
 
 EDGE = 1.0  # [px] that a text may stand over the picture's edge: rounding
 TOUCH = 1.0  # [px] by which extents may meet, as they have some air around their letters

@@ -1,4 +1,4 @@
-"""Robots for the tests of `impactopt.rigid_body`, and what Pinocchio says of them."""
+"""Robots for the tests of `impactopt.robots.rigid_body`, and what Pinocchio says of them."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from impactopt.cli.app import app
 from impactopt.errors import InputError
-from impactopt.pictures.sweep import sweep_picture
-from impactopt.pictures.sweep_columns import Columns
+from impactopt.report.pictures.sweep import sweep_picture
+from impactopt.report.pictures.sweep_columns import Columns
 from impactopt.sweeps import read_sweep_file, sweep_from_data
 from impactopt.sweeps.figure import Figure
 from impactopt.sweeps.table import read_columns, unit_of, without_unit

@@ -96,7 +96,7 @@ def off(solution: Solution) -> float:
 
 def test_the_estimate_is_the_true_error(functions: None) -> None:
     for elements in (COARSE, halved(COARSE)):
-        solution = planner.solve(problem(collision_elements=elements), between=False)
+        solution = planner.solve(problem(collision_elements=elements), refine=False)
         assert solution.status is Status.SOLVED and solution.elements == ()
         assert solution.contact_error_pct == pytest.approx(off(solution), rel=0.3, abs=0.02)
         if elements == COARSE:

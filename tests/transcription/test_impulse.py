@@ -15,11 +15,11 @@ from scipy.integrate import solve_ivp
 from support.small_plans import LAW, OPTIONS, Planned, changed, planned
 
 from impactopt.files.output import load_record, record_of, save_record
-from impactopt.pictures import PICTURES, save_pictures
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import TorqueLimit
 from impactopt.report.console import result_table
+from impactopt.report.pictures import PICTURES, save_pictures
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status
 from impactopt.transcription.contact_blocks import two_mass_restitution

@@ -39,7 +39,7 @@ impactopt solve my.toml --set target.mass=8   # changes a value; a key's unit ma
 
 `--set` takes a key path and a value as in TOML, and can be repeated. An entry of a list has its index from 0
 (`--set problem.point.1=-0.2`); one of several sections has its index or its name
-(`--set scenarios.missing.brake_after=0.03`).
+(`--set scenarios.missing.abort_after=0.03`).
 
 In Python `impactopt.load_problem("my.toml")` reads a file, and `impactopt.write_problem(problem)` writes one
 without defaults. `problem.hash` does not depend on how a problem was written. A contact law, target, term or

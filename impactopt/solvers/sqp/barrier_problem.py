@@ -17,8 +17,8 @@ import numpy as np
 from impactopt.solvers.program import Determined, Vector, scaled_residual
 from impactopt.solvers.sqp.barrier import Bounded
 from impactopt.solvers.sqp.elastic import Elastic
-from impactopt.solvers.sqp.linesearch import Progress
-from impactopt.solvers.sqp.newton import borrow, give_back
+from impactopt.solvers.sqp.linesearch import SearchStart
+from impactopt.solvers.sqp.newton import acquire, release
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.point import Point, TimedProgram
 
@@ -87,7 +87,7 @@ class BarrierProblem:
         p, x = program, point.x
         moves = p.x_upper - p.x_lower > 1e-12
         bounded = (np.isfinite(p.x_lower) | np.isfinite(p.x_upper)) & moves
-        self.newton = borrow(
+        self.newton = acquire(
             point.jacobian,
             p.hessian(x, 1.0, np.zeros(p.m)),
             determined=determined,
@@ -126,7 +126,7 @@ class BarrierProblem:
 
     def release(self) -> None:
         """Give the Newton system's structure back, for the next program that has it."""
-        give_back(self.newton)
+        release(self.newton)
 
     def _all(self, point: Point) -> Vector:
         """Values of the program's rows, and of the bounded eliminated variables."""
@@ -244,7 +244,7 @@ class BarrierProblem:
         length = min(self.x.longest(step.free, keep), self.s.longest(step.slack, keep))
         return length if self.elastic is None else min(length, self.elastic.longest(keep))
 
-    def progress(self, step: Step, residual: Vector) -> Progress:
+    def progress(self, step: Step, residual: Vector) -> SearchStart:
         """What a search along a step starts from."""
         mu, point = self.mu, self.point
         slope = float(
@@ -255,7 +255,7 @@ class BarrierProblem:
         phi = self._phi(point, self.s.values)
         if self.elastic is not None:
             slope, phi = slope + self.elastic.slope(mu), phi + self.elastic.now(mu)
-        return Progress(theta=self._theta(residual), phi=phi, slope=slope)
+        return SearchStart(theta=self._theta(residual), phi=phi, slope=slope)
 
     def _phi(self, point: Point, slack: Vector) -> float:
         """The barrier function, without what elastic rows add."""

@@ -12,7 +12,7 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from impactopt.codegen.library import address, native_library
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.kernels import Index, Kernels, Panels, Places, Products, Stack, Stage
+from impactopt.solvers.sqp.kernels import EliminationStep, Index, Kernels, Panels, Places, Products, Stack
 
 _ROUTINES = (
     (cython_blas, "dgemm"),
@@ -84,7 +84,7 @@ class CompiledKernels(Kernels):
         return found[1]
 
     @staticmethod
-    def _all(stages: Sequence[Stage]) -> tuple[Any, ...]:
+    def _all(stages: Sequence[EliminationStep]) -> tuple[Any, ...]:
         made, keep = [], []
         for a in stages:
             k, nt, nc = a.tc.shape
@@ -135,20 +135,20 @@ class CompiledKernels(Kernels):
         groups = ctypes.c_int64(len(products))
         self._c.newton_products(groups, *map(address, [*parts, values, weights, W, work]))
 
-    def eliminate(self, stages: Sequence[Stage], J: Vector) -> None:
+    def eliminate(self, stages: Sequence[EliminationStep], J: Vector) -> None:
         if self._c.newton_eliminate(*self._of(stages, self._all)[:2], address(J)):
             raise np.linalg.LinAlgError("rows do not determine their variables")
 
-    def reduce(self, stages: Sequence[Stage], W: Vector) -> None:
+    def reduce(self, stages: Sequence[EliminationStep], W: Vector) -> None:
         self._c.newton_reduce(*self._of(stages, self._all)[:2], address(W))
 
-    def forward(self, stages: Sequence[Stage], g: Vector, off: Vector) -> None:
+    def forward(self, stages: Sequence[EliminationStep], g: Vector, off: Vector) -> None:
         self._c.newton_forward(*self._of(stages, self._all)[:2], address(g), address(off))
 
-    def expand(self, stages: Sequence[Stage], d: Vector) -> None:
+    def expand(self, stages: Sequence[EliminationStep], d: Vector) -> None:
         self._c.newton_expand(*self._of(stages, self._all)[:2], address(d))
 
-    def multipliers(self, stages: Sequence[Stage], v: Vector, y: Vector) -> None:
+    def multipliers(self, stages: Sequence[EliminationStep], v: Vector, y: Vector) -> None:
         self._c.newton_multipliers(*self._of(stages, self._all)[:2], address(v), address(y))
 
     def factor(self, p: Panels, values: Vector) -> bool:

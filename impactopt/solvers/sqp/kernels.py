@@ -20,7 +20,7 @@ Stack = npt.NDArray[np.float64]
 
 
 @dataclass(eq=False, kw_only=True)
-class Stage:
+class EliminationStep:
     """Systems (k) of one shape, r rows each: where their numbers stand, and what eliminating them found.
 
     Places of what is not there point to one number behind the others, which is zero.
@@ -120,7 +120,7 @@ class Kernels:
             i, j = np.tril_indices(part.shape[1])
             W[p.to] += ((part.T * weights[p.rows]) @ part)[i, j]
 
-    def eliminate(self, stages: Sequence[Stage], J: Vector) -> None:
+    def eliminate(self, stages: Sequence[EliminationStep], J: Vector) -> None:
         """X = B^-1 N, and the other equalities' values with the step -X d_c in place of d_e.
 
         Raises
@@ -137,7 +137,7 @@ class Kernels:
                 a.X[i] = la.lapack.dgetrs(lu, pivots, N.T)[0].T
             _add(J, a.tc, -(a.T @ a.X.swapaxes(1, 2)))
 
-    def reduce(self, stages: Sequence[Stage], W: Vector) -> None:
+    def reduce(self, stages: Sequence[EliminationStep], W: Vector) -> None:
         """W with -X d_c in place of d_e."""
         for a in stages:
             a.H[:], a.G[:] = W[a.hee], W[a.heu]
@@ -148,7 +148,7 @@ class Kernels:
             _add(W, a.hcc, C[:, i, j] + C[:, j, i])
             _add(W, a.hcv, C[:, :, nc:])
 
-    def forward(self, stages: Sequence[Stage], g: Vector, off: Vector) -> None:
+    def forward(self, stages: Sequence[EliminationStep], g: Vector, off: Vector) -> None:
         """Gradient and residual with d_e = -(x0 + X d_c)."""
         for a in stages:
             a.x0[:] = self._solve(a, off[a.q], 0)
@@ -157,12 +157,12 @@ class Kernels:
             _add(g, a.c, -(a.X @ own[..., None])[..., 0])
             _add(g, a.u, -(a.G @ a.x0[..., None])[..., 0])
 
-    def expand(self, stages: Sequence[Stage], d: Vector) -> None:
+    def expand(self, stages: Sequence[EliminationStep], d: Vector) -> None:
         """d_e of all stages, the last one first."""
         for a in reversed(stages):
             d[a.e] = -a.x0 - (d[a.c][:, None] @ a.X)[:, 0]
 
-    def multipliers(self, stages: Sequence[Stage], v: Vector, y: Vector) -> None:
+    def multipliers(self, stages: Sequence[EliminationStep], v: Vector, y: Vector) -> None:
         """Those of the stages' rows, from a gradient, which is spent, and from those of the other rows."""
         for a in stages:
             a.own[:] = v[a.e]
@@ -204,7 +204,7 @@ class Kernels:
         return x
 
     @staticmethod
-    def _solve(a: Stage, right: Stack, transposed: int) -> Stack:
+    def _solve(a: EliminationStep, right: Stack, transposed: int) -> Stack:
         found = [
             la.lapack.dgetrs(lu.T, p, b, trans=transposed)[0]
             for lu, p, b in zip(a.lu, a.pivots, right, strict=True)

@@ -15,7 +15,7 @@ _SHORTEST = 0.05  # gamma_alpha of eq. 23
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class SearchStart:
     """What a line search starts from: violation theta, barrier function phi and its slope along the step."""
 
     theta: float
@@ -47,7 +47,7 @@ class Filter:
         """A filter for a run that starts with this violation (section 3.3)."""
         return cls(least=1e-4 * max(1.0, theta), most=1e4 * max(1.0, theta))
 
-    def shortest(self, at: Progress) -> float:
+    def shortest(self, at: SearchStart) -> float:
         """The length below which no step will do (eq. 23)."""
         length = _VIOLATION
         if at.slope < 0.0:
@@ -56,7 +56,7 @@ class Filter:
                 length = min(length, _SWITCH * at.theta**_VIOLATION_POWER / (-at.slope) ** _SLOPE_POWER)
         return max(_SHORTEST * length, 1e-14)
 
-    def accepts(self, at: Progress, length: float, theta: float, phi: float) -> bool:
+    def accepts(self, at: SearchStart, length: float, theta: float, phi: float) -> bool:
         """Whether a trial point is taken (steps A-5.3 and A-5.4)."""
         if not (np.isfinite(theta) and np.isfinite(phi)) or theta > self.most:
             return False
@@ -66,7 +66,7 @@ class Filter:
             return at.falls(length, phi)
         return theta <= (1.0 - _VIOLATION) * at.theta or phi <= at.phi - _OBJECTIVE * at.theta
 
-    def remember(self, at: Progress, length: float, phi: float) -> None:
+    def remember(self, at: SearchStart, length: float, phi: float) -> None:
         """Augment the filter, but after a step for phi's sake (eq. 22)."""
         if at.switches(length) and at.falls(length, phi):
             return

@@ -197,7 +197,7 @@ class NewtonSystem:
 _structures: OrderedDict[bytes, NewtonSystem] = OrderedDict()
 
 
-def borrow(
+def acquire(
     jacobian: Matrix,
     hessian: Matrix,
     *,
@@ -231,7 +231,7 @@ def borrow(
     return system
 
 
-def give_back(system: NewtonSystem) -> None:
+def release(system: NewtonSystem) -> None:
     """Keep the structure for the next program that has it."""
     _structures[system.key] = system
     while len(_structures) > _KEPT:

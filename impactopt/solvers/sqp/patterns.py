@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from impactopt.solvers.program import Matrix
-from impactopt.solvers.sqp.kernels import Index, Places, Products, Stage
+from impactopt.solvers.sqp.kernels import EliminationStep, Index, Places, Products
 
 
 class Elimination(NamedTuple):
@@ -142,7 +142,7 @@ def shapes(systems: list[Touched]) -> list[list[Touched]]:
     return list(out.values())
 
 
-def stage(systems: list[Touched], rows: Places, pairs: Places) -> Stage:
+def stage(systems: list[Touched], rows: Places, pairs: Places) -> EliminationStep:
     """Systems of one shape; rows, pairs : places of the entries of equalities and W, as of `numbered`."""
     q, e, t, c, u = (np.array([getattr(s, name) for s in systems]) for name in ("q", "e", "t", "c", "u"))
     i, j = _lower(c.shape[1])
@@ -157,4 +157,4 @@ def stage(systems: list[Touched], rows: Places, pairs: Places) -> Stage:
         "hcv": pairs[c[:, :, None], u[:, None, c.shape[1] :]],
     }
     numbers = {"q": q, "e": e, "t": t, "u": u, **places}
-    return Stage(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})
+    return EliminationStep(**{name: np.ascontiguousarray(a, dtype=np.int32) for name, a in numbers.items()})

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from impactopt.solvers.program import Vector
 from impactopt.solvers.sqp.barrier_problem import BarrierProblem, Step, Trial
-from impactopt.solvers.sqp.linesearch import Filter, Progress
+from impactopt.solvers.sqp.linesearch import Filter, SearchStart
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
@@ -58,7 +58,9 @@ class LineSearch:
         return found
 
 
-def _bent(problem: BarrierProblem, among: Filter, step: Step, at: Progress, longest: float) -> Found | None:
+def _bent(
+    problem: BarrierProblem, among: Filter, step: Step, at: SearchStart, longest: float
+) -> Found | None:
     """The step as far as the bounds of variables let it, where it is slacks that stop it: each of them
     stops by itself short of its own bound, and what its row is then off by is the next step's to mend.
 
@@ -79,7 +81,7 @@ def _bent(problem: BarrierProblem, among: Filter, step: Step, at: Progress, long
 
 
 def _searched(
-    problem: BarrierProblem, among: Filter, step: Step, at: Progress, longest: float, residual: Vector
+    problem: BarrierProblem, among: Filter, step: Step, at: SearchStart, longest: float, residual: Vector
 ) -> Found | None:
     """Along the step, backwards from its longest part; None: no part of it is progress."""
     length, trials = longest, 0
@@ -98,7 +100,7 @@ def _searched(
 
 
 def _corrected(
-    problem: BarrierProblem, among: Filter, at: Progress, residual: Vector, trial: Trial, longest: float
+    problem: BarrierProblem, among: Filter, at: SearchStart, residual: Vector, trial: Trial, longest: float
 ) -> Found | None:
     """Second-order corrections: the step again, with what it left of the rows (section 2.4)."""
     if problem.elastic is not None:
@@ -118,5 +120,5 @@ def _corrected(
     return None
 
 
-def _accepts(among: Filter, at: Progress, length: float, trial: Trial) -> bool:
+def _accepts(among: Filter, at: SearchStart, length: float, trial: Trial) -> bool:
     return among.accepts(at, length, trial.theta, trial.phi) and trial.point.differentiable

@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from impactopt.solvers.ipopt_functions import BufferFunction, Functions, Pattern, Progress
+from impactopt.solvers.ipopt_functions import BufferFunction, Functions, IterationCallback, Pattern
 from impactopt.solvers.program import (
     NonlinearProgram,
     SolverResult,
@@ -46,7 +46,7 @@ def solve_sqpmethod(
     began = time.perf_counter()
     functions = Functions(program, 1e-6, began + time_limit)
     functions.start(x0)
-    progress = Progress(functions, None, began)
+    progress = IterationCallback(functions, None, began)
     solver, _alive = _build(functions, progress, x0, qp)
     bounds = {
         "lbx": program.x_lower, "ubx": program.x_upper, "lbg": program.g_lower, "ubg": program.g_upper
@@ -83,7 +83,7 @@ def solve_sqpmethod(
     )
 
 
-def _build(functions: Functions, progress: Progress, x0: Vector, qp: str) -> tuple[Any, list[Any]]:
+def _build(functions: Functions, progress: IterationCallback, x0: Vector, qp: str) -> tuple[Any, list[Any]]:
     """The nlpsol object, and what has to stay alive as long as it does."""
     program = functions.program
     n, m = program.n, program.m

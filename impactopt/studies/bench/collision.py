@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.collision import SDC, Collision
-from impactopt.pictures.pareto import pareto_picture
+from impactopt.report.pictures.pareto import pareto_picture
 from impactopt.simulation.cases import errors_against
 from impactopt.simulation.reference import FullDynamics
 from impactopt.studies.bench.clock import medians, runner, shortest

@@ -17,7 +17,7 @@ import numpy as np
 
 from impactopt.collision import Collision
 from impactopt.errors import InputError
-from impactopt.pictures.fidelity import fidelity_picture
+from impactopt.report.pictures.fidelity import fidelity_picture
 from impactopt.simulation.cases import PAPER_SPEEDS, Case, errors_against
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.hierarchy import (

@@ -16,12 +16,12 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
-from impactopt.pictures.margins import margins_picture
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import Balance, ContactWrenchCone, Term, TorqueLimit
+from impactopt.report.pictures.margins import margins_picture
 from impactopt.simulation import Perturbation, simulate
 from impactopt.simulation.robustness import STEP, robustness
 from impactopt.studies.bench.planning import DEMO

@@ -63,7 +63,7 @@ def run(
     title = "plans by the model of their collision, replayed in full dynamics"
 
     def picture() -> Any:
-        from impactopt.pictures.models import models_picture
+        from impactopt.report.pictures.models import models_picture
 
         return models_picture(rows)
 

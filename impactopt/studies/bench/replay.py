@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from impactopt.errors import InputError
-from impactopt.pictures.convergence import convergence_picture
 from impactopt.planning.solution import Solution
+from impactopt.report.pictures.convergence import convergence_picture
 from impactopt.simulation import Perturbation, Simulation
 from impactopt.studies.bench.planning import DEMO, plan_of
 from impactopt.studies.report import Report, Say, columns_table

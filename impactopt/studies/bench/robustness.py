@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.pictures.robustness import robustness_picture
+from impactopt.report.pictures.robustness import robustness_picture
 from impactopt.simulation import Perturbation, Simulation
 from impactopt.simulation.robustness import STEP, PerturbationRanges, Robustness, robustness
 from impactopt.studies.bench.planning import DEMO, plan_of

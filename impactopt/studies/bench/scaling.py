@@ -19,7 +19,7 @@ import numpy as np
 from impactopt.collision import SDC
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.errors import InputError
-from impactopt.pictures.scaling import scaling_picture
+from impactopt.report.pictures.scaling import scaling_picture
 from impactopt.simulation.cases import Case
 from impactopt.simulation.workers import map_on_workers
 from impactopt.studies.bench.clock import medians, shortest

@@ -20,7 +20,7 @@ from impactopt.collision.outputs import HISTORIES, OF_SOLES
 from impactopt.collision.runge_kutta import rk4_step
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.kinematics.stance import FixedBase, OneSole
-from impactopt.pictures.skip import skip_picture
+from impactopt.report.pictures.skip import skip_picture
 from impactopt.robots.presets import standin
 from impactopt.robots.robot import Robot
 from impactopt.simulation.cases import Case

@@ -159,7 +159,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
 
 def _planned(solution: Solution) -> list[Array]:
     """Configurations (k, nq) of the plan and of its missed blow."""
-    ways = (False, True) if solution.plan.brake is not None else (False,)
+    ways = (False, True) if solution.plan.abort is not None else (False,)
     return [solution.plan.motion(EVERY, missed=missed).q for missed in ways]
 
 

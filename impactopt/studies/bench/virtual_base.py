@@ -27,7 +27,7 @@ from impactopt.collision.stepped import number_of_steps
 from impactopt.errors import InputError
 from impactopt.kinematics.held import Held
 from impactopt.kinematics.stance import BothSoles
-from impactopt.pictures.virtual_base import virtual_base_picture
+from impactopt.report.pictures.virtual_base import virtual_base_picture
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.studies.report import Report, Say, columns_table

@@ -13,7 +13,7 @@ from impactopt.studies.report import Report, Say, cell, columns_table
 from impactopt.studies.reproduce.timing import Times, measure
 
 if TYPE_CHECKING:
-    from impactopt.pictures.style import Picture
+    from impactopt.report.pictures.style import Picture
 
 __all__ = ["run"]
 
@@ -85,13 +85,13 @@ def in_words(times: Times) -> str:
 
 def draw(rows: list[dict[str, Any]]) -> Picture:
     """Formulas as lines, measured ratios as marks."""
-    from impactopt.pictures.style import styled
+    from impactopt.report.pictures.style import styled
 
     return styled(_drawn)(rows)
 
 
 def _drawn(rows: list[dict[str, Any]]) -> Picture:
-    from impactopt.pictures.style import BLUE, PAGE, VERMILION, Picture
+    from impactopt.report.pictures.style import BLUE, PAGE, VERMILION, Picture
 
     figure = Picture(PAGE, 3.6)
     steps = np.array([r["t_s_s"] for r in rows])

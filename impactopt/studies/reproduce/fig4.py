@@ -17,7 +17,7 @@ from impactopt.studies.report import Report, Say, columns_table
 from impactopt.studies.reproduce.timing import measure
 
 if TYPE_CHECKING:
-    from impactopt.pictures.style import Picture
+    from impactopt.report.pictures.style import Picture
 
 __all__ = ["run"]
 
@@ -92,13 +92,13 @@ def run(say: Say, *, measured: Sequence[int] = MEASURED) -> Report:
 
 def draw(rows: list[dict[str, Any]]) -> Picture:
     """Formulas as lines, measured ratios as marks."""
-    from impactopt.pictures.style import styled
+    from impactopt.report.pictures.style import styled
 
     return styled(_drawn)(rows)
 
 
 def _drawn(rows: list[dict[str, Any]]) -> Picture:
-    from impactopt.pictures.style import BLACK, BLUE, PAGE, VERMILION, Picture
+    from impactopt.report.pictures.style import BLACK, BLUE, PAGE, VERMILION, Picture
 
     figure = Picture(PAGE, 3.6)
     fine = np.arange(8, 121)

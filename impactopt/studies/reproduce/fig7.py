@@ -16,7 +16,7 @@ from impactopt.studies.reproduce.motions import HIERARCHY, WHOSE, Fidelity, moti
 from impactopt.studies.reproduce.paper import OPENHRP3, TABLE_2, TABLE_3
 
 if TYPE_CHECKING:
-    from impactopt.pictures.style import Picture
+    from impactopt.report.pictures.style import Picture
 
 __all__ = ["run"]
 
@@ -95,7 +95,7 @@ def _row(motion: str, speed: float, model: str, result: Collision) -> dict[str, 
 
 def draw(found: dict[str, dict[str, Collision]], speeds: dict[str, float]) -> Picture:
     """A row a speed, as in the paper; beside each history what the models are off."""
-    from impactopt.pictures.hierarchy import hierarchy
+    from impactopt.report.pictures.hierarchy import hierarchy
 
     rows = {f"{motion}, {speeds[motion]:g} m/s": models for motion, models in found.items()}
     return hierarchy(rows, reference=FULL)

@@ -29,7 +29,7 @@ from impactopt.codegen.hashing import model_hash
 from impactopt.collision import SDC
 from impactopt.collision.graph import frozen_dynamics, joint_space_model
 from impactopt.collision.runge_kutta import rk4_step
-from impactopt.rigid_body import RigidBody
+from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot
 from impactopt.studies.bench.clock import medians, runner
 

@@ -1,0 +1,113 @@
+"""Pictures of a record: force, ZMP, torque, poses and joint motion, planned beside simulated; the fist's
+effective mass, the solver's way, soles in a replay.
+
+One picture a file, all in the style of `style.py`. `hierarchy.py` and `pareto.py` draw what is in no record:
+collision models beside each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from impactopt.errors import InputError, did_you_mean
+from impactopt.files.output import Record, record_of, write_file
+from impactopt.planning.solution import Solution
+from impactopt.report.pictures.ellipsoid import ellipsoid
+from impactopt.report.pictures.force import force
+from impactopt.report.pictures.hierarchy import hierarchy
+from impactopt.report.pictures.iterations import iterations
+from impactopt.report.pictures.motion import motion
+from impactopt.report.pictures.overview import overview
+from impactopt.report.pictures.replay import replay as _replay
+from impactopt.report.pictures.strobe import strobe
+from impactopt.report.pictures.style import Picture
+from impactopt.report.pictures.torque import torque
+from impactopt.report.pictures.zmp import zero_moment_point
+
+__all__ = [
+    "PICTURES",
+    "Picture",
+    "ellipsoid",
+    "force",
+    "hierarchy",
+    "iterations",
+    "motion",
+    "overview",
+    "plot",
+    "save_pictures",
+    "strobe",
+    "torque",
+    "zero_moment_point",
+]
+
+# file name without .png: what draws it, or gives None where there is nothing to draw
+PICTURES: Mapping[str, Callable[[Record], Picture | None]] = {
+    "force": force,
+    "zmp": zero_moment_point,
+    "torque": torque,
+    "strobe": strobe,
+    "motion": motion,
+    "ellipsoid": ellipsoid,
+    "iterations": iterations,
+    "replay": _replay,
+}
+# why a picture may be None
+_WHY = {
+    "zmp": "the robot stands on no soles",
+    "iterations": "the solver kept no history",
+    "replay": "it needs replay=solution.validate(engine='mujoco') of a robot on soles",
+}
+
+
+def plot(
+    solution: Solution,
+    what: str = "overview",
+    *,
+    simulation: Any | None = None,
+    replay: Any | None = None,
+) -> Picture:
+    """A picture of a solution, which a notebook shows, and ``savefig`` writes: ``Solution.plot``.
+
+    what : "overview", the four that matter (poses, force, ZMP, torque), or one of PICTURES.
+    simulation : of ``solution.validate()``, drawn beside the plan.  replay : of
+        ``solution.validate(engine="mujoco")``, which "replay" draws.
+
+    Raises
+    ------
+    InputError : an unknown picture; one of what the solution has not, such as the ZMP of an arm; a plan whose
+        motion cannot be completed.
+    """
+    draws = {"overview": overview, **PICTURES}
+    if what not in draws:
+        near = did_you_mean(what, draws)
+        raise InputError(f"there is no picture {what!r}{near}: there are {', '.join(draws)}")
+    record = record_of(solution, simulation=simulation, replay=replay)
+    if not record.completed:
+        raise InputError(f"there is no motion to draw: {record.summary['note']}")
+    picture = draws[what](record)
+    if picture is None:
+        raise InputError(f"of this solution there is nothing to draw as {what!r}: {_WHY[what]}")
+    return picture
+
+
+def save_pictures(record: Record, directory: Path, names: Iterable[str] = tuple(PICTURES)) -> list[Path]:
+    """Write the record's pictures as PNG into the directory; what an earlier record left there goes.
+
+    names : of PICTURES; all of them if left out.
+
+    Raises
+    ------
+    InputError : they cannot be written.
+    """
+    written = []
+    for name in names:
+        path = directory / f"{name}.png"
+        picture = PICTURES[name](record) if record.completed else None
+        if picture is None:
+            path.unlink(missing_ok=True)
+            continue
+        write_file(path, picture.write)
+        written.append(path)
+    return written

@@ -1,0 +1,110 @@
+"""What the fist weighs at contact, by the direction that it hits in: the effective-mass ellipsoid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator, MultipleLocator
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PAGE, VERMILION, Array, Picture, styled, title
+
+# what is drawn: axes across and up, from where it is seen
+VIEWS = (
+    (np.array([[1.0, 0, 0], [0, 0, 1.0]]), "x [m]", "z [m]", "from its right"),
+    (np.array([[0, -1.0, 0], [1.0, 0, 0]]), "y, to the right [m]", "x [m]", "from above"),
+)
+REACH = 0.35  # [m] of the largest effective mass in the picture
+MOST = 4.0  # times the mass along the blow that is drawn; beyond it the curve is open
+ANGLES = 181
+GREY = "#bbbbbb"
+
+
+@styled
+def ellipsoid(record: Record) -> Picture:
+    """The robot at contact with its fist's effective mass, from two sides, and in numbers over the direction.
+
+    The curve's distance from the fist is the effective mass along that direction, 1 / (n' J P J' n): soles
+    held, joints free. (An ellipsoid proper has its square root for a radius; a mass is easier to read.) It is
+    open where the mass is beyond what the scale holds, as across an arm that moves in a plane.
+    """
+    a = record.arrays
+    inverse, normal = a["pose_inverse_mass"], a["pose_normal"]
+    mass = float(effective_masses(inverse, normal[None])[0])
+    largest = min(float(np.concatenate([_curve(inverse, view) for view, *_ in VIEWS]).max()), MOST * mass)
+    views = [v for v in VIEWS if np.isfinite(_within(_curve(inverse, v[0]), largest)).any()]
+    figure = Picture(PAGE, 2.8)
+    panels = figure.subplots(1, len(views) + 1, width_ratios=[1.0] * len(views) + [1.2])
+    for axes, (view, across, up, place) in zip(panels, views, strict=False):
+        _robot(axes, record, view, largest)
+        axes.set(xlabel=across, ylabel=up, title=place)
+    _over_angle(panels[-1], inverse, normal, largest)
+    panels[-1].plot(0.0, mass, "o", color=VERMILION, markersize=4, zorder=4)
+    figure.legend(*panels[-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.suptitle(title(record, f"{mass:.1f} kg meet the target along the blow"))
+    return figure
+
+
+def _over_angle(axes: Any, inverse: Array, normal: Array, largest: float) -> None:
+    """Effective mass where the blow's direction is turned up and down, and from side to side."""
+    side = np.cross([0.0, 0.0, 1.0], normal)
+    side = side / np.linalg.norm(side) if np.linalg.norm(side) > 1e-3 else np.array([0.0, 1.0, 0.0])
+    up = np.cross(normal, side)
+    turn = np.linspace(-np.pi / 2, np.pi / 2, ANGLES)
+    for towards, name, style in ((up, "turned up", "-"), (side, "turned to the left", "--")):
+        directions = np.outer(np.cos(turn), normal) + np.outer(np.sin(turn), towards)
+        masses = _within(effective_masses(inverse, directions), largest)
+        if np.isfinite(masses).sum() > 1:
+            axes.plot(np.degrees(turn), masses, style, color=BLUE if style == "-" else GREEN, label=name)
+    axes.set(xlabel="angle to the blow [deg]", ylabel="effective mass [kg]", ylim=(0.0, 1.05 * largest))
+    axes.set_xticks([-90, -45, 0, 45, 90])
+
+
+def effective_masses(inverse: Array, directions: Array) -> Array:
+    """1 / (n' L n) [kg] of unit directions (k, 3); inverse L (3, 3) [1/kg]; infinite where nothing moves."""
+    moved = np.einsum("ki,ij,kj->k", directions, inverse, directions)
+    return np.asarray(1.0 / np.maximum(moved, 1e-12))
+
+
+def _curve(inverse: Array, view: Array) -> Array:
+    return effective_masses(inverse, _circle(view))
+
+
+def _within(masses: Array, largest: float) -> Array:
+    """nan, a gap, where they are beyond the scale."""
+    return np.where(masses <= 1.001 * largest, masses, np.nan)
+
+
+def _circle(view: Array) -> Array:
+    """Unit directions (k, 3) of the world around a view's plane."""
+    turn = np.linspace(0.0, 2 * np.pi, ANGLES)
+    return np.column_stack([np.cos(turn), np.sin(turn)]) @ view
+
+
+def _robot(axes: Any, record: Record, view: Array, largest: float) -> None:
+    """Sticks at contact, the curve about the fist, and the blow as an arrow of its mass."""
+    a = record.arrays
+    inverse, normal = a["pose_inverse_mass"], a["pose_normal"]
+    links = a["pose_links"][int(a["pose_contact"])] @ view.T
+    for ends, strikes in zip(links, a["pose_strikes"], strict=True):
+        axes.plot(*ends.T, color=BLACK if strikes else GREY, linewidth=1.6, solid_capstyle="round", zorder=2)
+    fist = links[0][1]
+    around = _circle(view)
+    scale = REACH / largest
+    masses = _within(effective_masses(inverse, around), largest)
+    curve = fist + scale * masses[:, None] * (around @ view.T)
+    if np.isfinite(curve).all():
+        axes.fill(*curve.T, facecolor=BLUE, alpha=0.15, zorder=1)
+    axes.plot(*curve.T, color=BLUE, zorder=3)
+    tip = fist + scale * effective_masses(inverse, normal[None])[0] * (view @ normal)
+    if np.linalg.norm(tip - fist) > 1e-3:
+        arrow = {"arrowstyle": "-|>", "color": VERMILION, "linewidth": 1.4, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", tip, fist, arrowprops=arrow, zorder=4)
+    axes.margins(0.08)
+    axes.set_aspect("equal")
+    # one length between ticks on both axes: those of a narrow view alone would run into each other
+    largest_span = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+    spacing = np.diff(MaxNLocator(6).tick_values(0.0, largest_span))[0]
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(spacing))

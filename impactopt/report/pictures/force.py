@@ -1,0 +1,51 @@
+"""The contact force, planned and simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.style import COLUMN, PLANNED, SIMULATED, Picture, styled, title
+
+
+@styled
+def force(record: Record) -> Picture:
+    """Contact force over the time since contact."""
+    figure = Picture(COLUMN, 2.6)
+    draw_force(figure, record)
+    figure.axes[0].set_title(title(record, "contact force"))
+    return figure
+
+
+def draw_force(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
+    a, summary = record.arrays, record.summary
+    axes = figure.subplots()
+    label = f"planned: {_impulse(summary)}"
+    style: Any = {"color": PLANNED, "markersize": 4, "label": label, "zorder": 3}
+    axes.plot(1e3 * a["collision_time"], a["collision_force"], "o", **style)
+    end = 1e3 * float(a["collision_time"][-1])
+    if not end:  # an impact without duration: the simulation's contact is all there is to see
+        end = 1e3 * float(a.get("simulated_contact_end", 0.0) - a.get("simulated_contact_start", 0.0))
+        end = end if np.isfinite(end) else 0.0
+    if record.simulated and np.isfinite(a["simulated_contact_start"]):
+        time = 1e3 * (a["simulated_time"] - a["simulated_contact_start"])
+        keep = (time >= 0) & (time < 1.08 * end)
+        label = f"simulated: {_impulse(summary.get('simulated', {}))}"
+        # before contact there is no force, however coarsely the simulation was recorded
+        shown = np.concatenate([[-0.05 * end, 0.0], time[keep]])
+        value = np.concatenate([[0.0, 0.0], a["simulated_force"][keep]])
+        axes.plot(shown, value, color=SIMULATED, label=label)
+    axes.set(xlabel="time since contact [ms]", ylabel="force on the target [N]")
+    axes.set_ylim(bottom=0.0)
+    # below, as no corner of the axes is free of force for every contact
+    figure.legend(title="impulse", loc="outside lower center", ncols=2)
+
+
+def _impulse(summary: Mapping[str, Any]) -> str:
+    value = summary.get("impulse_Ns")
+    return "unknown" if value is None else f"{value:.2f} N s"

@@ -1,0 +1,106 @@
+"""The contact force as every model of the hierarchy has it (the paper's Fig. 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from impactopt.collision import Collision
+from impactopt.errors import InputError
+from impactopt.report.pictures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    Array,
+    Picture,
+    styled,
+)
+
+# in turn, from the coarsest model to the finest; what is beside the reference is drawn thin
+STYLES: tuple[dict[str, Any], ...] = (
+    {"color": GREEN, "linestyle": ":", "linewidth": 1.8},
+    {"color": VERMILION, "linestyle": "--"},
+    {"color": BLUE, "linewidth": 1.4},
+    {"color": ORANGE, "linestyle": "-.", "linewidth": 1.2},
+    {"color": PURPLE, "linewidth": 1.2},
+    {"color": SKY, "linestyle": (0, (4, 1)), "linewidth": 1.2},
+    {"color": "#666666", "linestyle": (0, (1, 1)), "linewidth": 1.2},
+)
+LEAST = 1e-4  # of the impulse; what is off by less is off the picture
+REFERENCE: dict[str, Any] = {"color": BLACK, "linewidth": 3.2, "alpha": 0.35}
+
+
+@styled
+def hierarchy(blows: Mapping[str, Mapping[str, Collision]], *, reference: str = "full dynamics") -> Picture:
+    """Force histories on the left, how far the impulse so far is off on the right; a row a blow.
+
+    blows : of each blow, by title, the :class:`impactopt.collision.Collision` of each model, by name, the
+        coarsest first. Their impulses are off by what the legends say.
+    reference : name of the model that the others are held against.
+
+    Raises
+    ------
+    InputError : no blow; a blow without the reference; more models than can be told apart.
+    """
+    names = list(dict.fromkeys(name for models in blows.values() for name in models if name != reference))
+    if not blows or any(reference not in models for models in blows.values()):
+        raise InputError(f"every blow needs the model {reference!r}, which the others are held against")
+    if len(names) > len(STYLES):
+        raise InputError(f"at most {len(STYLES)} models beside the reference can be told apart: {names}")
+    styles = dict(zip(names, STYLES, strict=False))
+    figure = Picture(PAGE, 2.0 * len(blows) + 0.9)
+    grid = figure.subplots(len(blows), 2, sharex=True, squeeze=False, width_ratios=[1.15, 1.0])
+    last = max(hit.duration for models in blows.values() for hit in models.values())
+    for (left, right), (heading, models) in zip(grid, blows.items(), strict=True):
+        true = models[reference]
+        left.plot(*_history(true, last), **REFERENCE)
+        for name, style in styles.items():
+            if name in models:
+                left.plot(*_history(models[name], last), **style)
+                right.plot(*_difference(models[name], true), **style)
+                right.plot([], [], label=_error(models[name], true), **style)
+        left.set_title(f"{heading}: {true.impulse:.2f} N s", loc="left")
+        left.set(ylabel="force [N]", xlim=(-30 * last, 1060 * last))
+        left.set_ylim(bottom=0.0)
+        right.set(yscale="log", ylabel="impulse off by [N s]", ylim=(LEAST * true.impulse, true.impulse))
+        right.legend(title="in the end", loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.6)
+    for axes in grid[-1]:
+        axes.set_xlabel("time since contact [ms]")
+    handles = [Line2D([], [], label=reference, **REFERENCE)]
+    handles += [Line2D([], [], label=name, **style) for name, style in styles.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _history(hit: Collision, last: float) -> tuple[Array, Array]:
+    """Time [ms] and force [N]: it begins with a jump, by the damper, and ends at separation."""
+    time = 1e3 * np.concatenate([[-0.03 * last, 0.0], hit.time, [1.06 * last]])
+    return time, np.concatenate([[0.0, 0.0], hit.force, [0.0]])
+
+
+def _difference(hit: Collision, true: Collision) -> tuple[Array, Array]:
+    """Time [ms] and how far the impulse delivered until then is from the true one's [N s]."""
+    time = np.union1d(hit.time, true.time)
+    ours, theirs = (_delivered(one, time) for one in (hit, true))
+    return 1e3 * time, np.abs(ours - theirs)
+
+
+def _delivered(hit: Collision, time: Array) -> Array:
+    """Impulse [N s] until each time, of which those of the force are a part: straight lines between those."""
+    force = np.interp(time, hit.time, hit.force, right=0.0)
+    steps = np.diff(time) * (force[1:] + force[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _error(hit: Collision, true: Collision) -> str:
+    """Of the impulse."""
+    error = 100 * (hit.impulse / true.impulse - 1)
+    return f"{error:+.2f} %" if abs(error) >= 0.005 else "< 0.01 %"

@@ -1,0 +1,57 @@
+"""How a solver went: what is maximized, what was violated, and the optimality, over its iterations."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.style import BLUE, COLUMN, GREEN, VERMILION, Array, Picture, styled, title
+
+LEAST = 1e-12  # drawn for what is smaller
+
+
+@styled
+def iterations(record: Record) -> Picture | None:
+    """What is maximized (the impulse, less small prices) above; violation and stationarity below.
+
+    None without a history.
+    """
+    if "history_iteration" not in record.arrays:
+        return None
+    figure = Picture(COLUMN, 3.6)
+    draw_iterations(figure, record)
+    figure.suptitle(title(record, "the solver's way"))
+    return figure
+
+
+def draw_iterations(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
+    a = record.arrays
+    count = a["history_iteration"]
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    gain = -a["history_objective"]
+    top.plot(count, gain, color=BLUE)
+    # first iterates are far off: what they violate lets them promise anything
+    top.set_ylim(*_middle_of(gain))
+    several = "objectives" in record.summary.get(
+        "problem", {}
+    )  # other than the impulse, in units of their own
+    top.set(ylabel="maximized [-]" if several else "maximized [N s]")
+    for key, label, style, colour in (
+        ("max_violation", "largest violation", "-", VERMILION),
+        ("kkt", "stationarity", "--", GREEN),
+    ):
+        values = np.maximum(a[f"history_{key}"], LEAST)
+        bottom.semilogy(count, values, style, color=colour, label=label)
+    seconds = float(a["history_seconds"][-1])
+    bottom.set(xlabel=f"iterations [-], {count[-1]} in {seconds:.1f} s", ylabel="violated, not optimal [-]")
+    figure.legend(loc="outside lower center", ncols=2)
+
+
+def _middle_of(values: Array) -> tuple[float, float]:
+    """Limits that show the last half whole, and of the first what is within ten times its span."""
+    last = values[len(values) // 2 :]
+    low, high = float(last.min()), float(last.max())
+    pad = max(5 * (high - low), 0.05 * abs(values[-1]), 1e-9)
+    return max(float(values.min()), low - pad) - 0.05 * pad, min(float(values.max()), high + pad) + 0.05 * pad

@@ -1,0 +1,53 @@
+"""Angles and velocities of the joints that move most."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    Picture,
+    joint_label,
+    styled,
+    title,
+)
+
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
+
+
+@styled
+def motion(record: Record) -> Picture:
+    """Angles and velocities of the joints that move most."""
+    a = record.arrays
+    names, time, angle = a["joints"], a["reference_time"], a["reference_angle"]
+    until = float(a["reference_end"])
+    chosen = np.argsort(-np.ptp(angle, axis=0))[: len(COLOURS)]
+    rate = a["reference_v"][:, -len(names) :] / a["velocity_limit"]
+    figure = Picture(PAGE, 4.6)
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    for j, colour in zip(chosen, COLOURS, strict=False):
+        top.plot(time, angle[:, j], color=colour, label=joint_label(names[j]))
+        bottom.plot(time, rate[:, j], color=colour)
+        if record.simulated:
+            top.plot(a["simulated_time"], a["simulated_angle"][:, j], ":", color=BLACK, linewidth=1.2)
+    for axes in (top, bottom):
+        axes.axvspan(a["reference_contact_start"], a["reference_contact_end"], color="#bbbbbb", zorder=0)
+    top.set(ylabel="angle [rad]", title=title(record, "joints that move most"), xlim=(0.0, until))
+    bottom.set(xlabel="time [s]", ylabel="planned velocity / limit")
+    handles, labels = top.get_legend_handles_labels()
+    if record.simulated:
+        handles.append(Line2D([], [], color=BLACK, linestyle=":", linewidth=1.2))
+        labels.append("simulated")
+    handles.append(Line2D([], [], color="#bbbbbb", linewidth=6))
+    labels.append("contact")
+    top.legend(handles, labels, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
+    return figure

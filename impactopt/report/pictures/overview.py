@@ -1,0 +1,34 @@
+"""The four pictures that matter in one: poses, force, ZMP while in contact, torque."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.force import draw_force
+from impactopt.report.pictures.strobe import draw_strobe, strobe_height
+from impactopt.report.pictures.style import PAGE, Picture, styled, title
+from impactopt.report.pictures.torque import draw_torque, torque_height
+from impactopt.report.pictures.zmp import draw_zmp
+
+MIDDLE = 2.6  # [in] of force and ZMP
+
+
+@styled
+def overview(record: Record) -> Picture:
+    """Poses above, force and ZMP side by side (the force alone for a robot without soles), torque below."""
+    heights = [strobe_height(record), MIDDLE, torque_height(record)]
+    figure = Picture(PAGE, sum(heights) + 0.2)
+    parts: Any = figure.subfigures(3, 1, height_ratios=heights)
+    above, middle, below = parts
+    draw_strobe(above, record)
+    stands = len(record.arrays["polygon"]) > 0
+    if stands:
+        left, right = middle.subfigures(1, 2)
+        draw_force(left, record)
+        draw_zmp(right, record, phases=(1,))
+    else:
+        draw_force(middle, record)
+    draw_torque(below, record)
+    figure.suptitle(title(record, f"poses, contact force, {'zero-moment point, ' * stands}torque"))
+    return figure

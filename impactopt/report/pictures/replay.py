@@ -1,0 +1,100 @@
+"""How the soles stood in a replay: where each was pressed, how hard, and whether it slipped or rose."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from impactopt.files.output import Record
+from impactopt.kinematics.support import zmp
+from impactopt.report.pictures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PHASES,
+    VERMILION,
+    Array,
+    Picture,
+    styled,
+    title,
+)
+
+SOLE_COLOURS = (BLUE, VERMILION)
+PHASE_COLOURS = (ORANGE, BLACK, GREEN)
+
+
+@styled
+def replay(record: Record) -> Picture | None:
+    """Centres of pressure on the soles, normal forces, slip and lift; None without a replay on soles."""
+    a = record.arrays
+    if not record.replayed or not len(a["replayed_soles"]):
+        return None
+    figure = Picture(PAGE, 4.2)
+    places = figure.subplot_mosaic([["cop", "force"], ["cop", "move"]], width_ratios=[2, 3])
+    _centres(figure, places["cop"], a)
+    time, start = a["replayed_time"], float(a["replayed_contact_start"])
+    names = [str(name).replace("_", " ") for name in a["replayed_soles"]]
+    for k, (name, colour) in enumerate(zip(names, SOLE_COLOURS, strict=False)):
+        places["force"].plot(
+            time, a["replayed_sole_ground"][:, k, 2], color=colour, label=name, linewidth=1.1
+        )
+        places["move"].plot(time, 1e3 * a["replayed_slip"][:, k], color=colour, label=f"{name}, slip")
+        places["move"].plot(time, 1e3 * a["replayed_lift"][:, k], ":", color=colour, label=f"{name}, lift")
+    for which in ("force", "move"):
+        if np.isfinite(start):
+            end = float(a["replayed_contact_end"])
+            places[which].axvspan(start, end if np.isfinite(end) else time[-1], color="#bbbbbb", zorder=0)
+        places[which].set(xlim=(0.0, time[-1]))
+        places[which].set_ylim(bottom=0.0)
+        places[which].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
+    places["force"].tick_params(labelbottom=False)
+    places["force"].set(ylabel="normal force [N]", title="force on each sole; grey: contact")
+    places["move"].set(xlabel="time [s]", ylabel="slip, lift [mm]", title="the corner that moved most")
+    figure.suptitle(title(record, f"soles in the replay ({_verdict(record)})"))
+    return figure
+
+
+def _verdict(record: Record) -> str:
+    report = record.summary.get("replayed", {})
+    stands, reason = report.get("standing"), report.get("reason", "")
+    return "stands at the end" if stands else str(reason).split(":")[0] if stands is None else str(reason)
+
+
+def _centres(figure: Picture, axes: Any, a: Any) -> None:
+    """Paths of the centres of pressure by phase, from above: forward is up, left is left."""
+    time, start, end = a["replayed_time"], a["replayed_contact_start"], a["replayed_contact_end"]
+    phase = (time >= start).astype(int) + (time >= end).astype(int)  # nan compares false
+    for k, name in enumerate(a["replayed_soles"]):
+        corners = a[f"sole_{name}"]
+        axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
+        label = str(name).replace("_", " ")
+        axes.annotate(
+            label,
+            (-corners[:, 1].mean(), corners[:, 0].max()),
+            (0, 2),
+            textcoords="offset points",
+            color="#666666",
+            ha="center",
+            fontsize=6.5,
+        )
+        loaded = np.isfinite(a["replayed_cop_margin"][:, k])
+        for which, colour in enumerate(PHASE_COLOURS):
+            keep = loaded & (phase == which)
+            points: Array = zmp(a["replayed_sole_ground"][keep, k])
+            axes.plot(-points[:, 1], points[:, 0], ".", color=colour, markersize=2.5, zorder=3 + (which == 1))
+    axes.set_aspect("equal")
+    axes.set(
+        xlabel="y, to the right [m]",
+        ylabel="x, forward [m]",
+        title="centre of pressure\n",
+    )
+    axes.grid(False)
+    key = [
+        Line2D([], [], linestyle="", marker="o", color=colour, label=name)
+        for name, colour in zip(PHASES, PHASE_COLOURS, strict=True)
+    ]
+    figure.legend(handles=key, loc="outside lower left", ncols=3)

@@ -1,0 +1,118 @@
+"""The motion in a few poses, one beside the other, as under a strobe light."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import FigureBase
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.style import BLACK, BLUE, PAGE, VERMILION, Array, Picture, styled, title
+
+BOX = 0.18  # [m] side of the target
+GAP = 0.12  # [m] between poses
+GREY = "#999999"
+
+
+@styled
+def strobe(record: Record) -> Picture:
+    """The robot as sticks at a few instants, and the way of its striking point."""
+    figure = Picture(PAGE, strobe_height(record) + 0.2)
+    draw_strobe(figure, record)
+    figure.suptitle(title(record, f"seen from {_view(record)[1]}"))
+    return figure
+
+
+def strobe_height(record: Record) -> float:
+    """How high [in] it is where it is as wide as a page."""
+    low, high, width = _extent(record)
+    scale = (PAGE - 0.6) / (len(record.arrays["pose_time"]) * (width + GAP))  # [in/m]
+    return min(float((high - low) * scale) + 0.75, PAGE)
+
+
+def draw_strobe(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
+    a = record.arrays
+    view, _ = _view(record)
+    low, high, width = _extent(record)
+    axes = figure.subplots()
+    links, path, time = a["pose_links"] @ view.T, a["pose_path"] @ view.T, a["pose_time"]
+    across = _middle(record)
+    places = (width + GAP) * np.arange(len(time))
+    for k, (place, instant) in enumerate(zip(places, time, strict=True)):
+        shift = np.array([place - across, 0.0])
+        corners = _box(a["pose_point"], a["pose_normal"], view) + shift
+        axes.fill(*corners.T, facecolor="#dddddd", edgecolor=GREY, linewidth=0.6, zorder=1)
+        gone = path[a["reference_time"] <= instant] + shift
+        axes.plot(*gone.T, color=VERMILION, linewidth=0.8, zorder=2)
+        for ends, strikes in zip(links[k], a["pose_strikes"], strict=True):
+            style: Any = {"color": BLUE, "zorder": 4} if strikes else {"color": BLACK, "zorder": 3}
+            axes.plot(*(ends + shift).T, linewidth=1.8, solid_capstyle="round", **style)
+        axes.plot(*(links[k][0][1] + shift), "o", color=BLUE, markersize=3, zorder=5)
+    axes.axhline(0.0, color=GREY, linewidth=0.8, zorder=0)
+    axes.set_aspect("equal")
+    axes.set(xlim=(-0.5 * (width + GAP), places[-1] + 0.5 * (width + GAP)), ylim=(low, high))
+    body = float(np.median(links[0][..., 0])) - across  # times stand below it
+    axes.set_xticks(places + body, [f"{t:.2f}" for t in time])
+    contact = int(a["pose_contact"])
+    axes.get_xticklabels()[contact].set_fontweight("bold")
+    axes.tick_params(axis="x", length=0)
+    axes.spines["bottom"].set_visible(False)
+    axes.grid(False)
+    axes.set(xlabel="time [s]; bold: contact begins", ylabel="z [m]")
+    figure.legend(handles=_key(bool(a["pose_strikes"].all())), loc="outside lower center", ncols=4)
+
+
+def _key(alone: bool) -> list[Line2D | Patch]:
+    others = [] if alone else [Line2D([], [], color=BLACK, linewidth=1.8, label="the others")]
+    return [
+        Line2D([], [], color=BLUE, linewidth=1.8, label="limb that strikes"),
+        *others,
+        Line2D([], [], color=VERMILION, linewidth=0.8, label="way of the striking point"),
+        Patch(facecolor="#dddddd", edgecolor=GREY, label="target before the blow"),
+    ]
+
+
+def _view(record: Record) -> tuple[Array, str]:
+    """What projects the world onto the picture (2, 3), and where from: no blow goes to the left."""
+    n = record.arrays["pose_normal"]
+    if abs(n[1]) > abs(n[0]):
+        sign = -1.0 if n[1] < 0 else 1.0
+        return np.array([[0, sign, 0], [0, 0, 1.0]]), "the front" if sign > 0 else "behind"
+    sign = -1.0 if n[0] < -1e-9 else 1.0
+    return np.array([[sign, 0, 0], [0, 0, 1.0]]), "its right" if sign > 0 else "its left"
+
+
+def _middle(record: Record) -> float:
+    """Across, between what is drawn of a pose [m]."""
+    points = _drawn(record)[:, 0]
+    return float(points.max() + points.min()) / 2
+
+
+def _extent(record: Record) -> tuple[float, float, float]:
+    """Lowest and highest point, and width, of all that is drawn of a pose [m]."""
+    points = _drawn(record)
+    (low, high), width = (points[:, 1].min(), points[:, 1].max()), np.ptp(points[:, 0])
+    return min(float(low), 0.0) - 0.05, float(high) + 0.05, float(width)
+
+
+def _drawn(record: Record) -> Array:
+    """Points (k, 2) [m] of the picture: links, the striking point's way, the target's corners."""
+    a = record.arrays
+    view, _ = _view(record)
+    parts = [a["pose_links"].reshape(-1, 3), a["pose_path"]]
+    box = _box(a["pose_point"], a["pose_normal"], view)
+    return np.concatenate([np.concatenate(parts) @ view.T, box])
+
+
+def _box(point: Array, normal: Array, view: Array) -> Array:
+    """Corners (4, 2) [m] of a box whose face is where it is hit."""
+    flat = view @ normal
+    length = float(np.linalg.norm(flat))
+    along = flat / length if length > 1e-9 else np.array([1.0, 0.0])
+    side = np.array([-along[1], along[0]])
+    signs = ((0, -1), (0, 1), (1, 1), (1, -1))
+    return np.array([view @ point + BOX * length * p * along + BOX / 2 * s * side for p, s in signs])

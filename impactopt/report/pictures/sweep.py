@@ -1,0 +1,256 @@
+"""The picture of a sweep, as its file's [figure] says: a heatmap, lines or a scatter of its table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.files.output import write_file
+from impactopt.report.pictures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    Picture,
+    styled,
+)
+from impactopt.report.pictures.sweep_columns import (
+    Columns,
+    SweepColumns,
+    combined,
+    errors_against,
+    name_of_error,
+)
+from impactopt.sweeps.definition import Sweep
+from impactopt.sweeps.figure import Figure as Section
+from impactopt.sweeps.table import read_columns
+
+__all__ = ["drawn_table", "save_sweep_picture", "sweep_picture"]
+
+Array = NDArray[np.float64]
+
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK)
+MARKS = ("o", "s", "^", "D", "v", "P", "X")
+NOWHERE = "#d9d9d9"  # rows that are impossible
+FEW = 25  # points of a line, with marks
+MOST = 20_000  # points of a scatter: more are no clearer
+SCALE = "cividis"
+DASHES: Any = ("-", "--", ":")  # of contours
+_PLAIN = FuncFormatter(lambda x, _: _number(x))
+
+
+def save_sweep_picture(sweep: Sweep, table: Path) -> Path | None:
+    """Draw a sweep's table as its [figure] says, into ``figure.png`` beside it; None without [figure].
+
+    Raises
+    ------
+    InputError : as of `sweep_picture`; a column that there is not; a file that cannot be read or written.
+    """
+    if sweep.figure is None:
+        return None
+    path, picture = table.with_name("figure.png"), drawn_table(sweep.figure, table)
+    write_file(path, picture.write)
+    return path
+
+
+def drawn_table(section: Section, table: Path) -> Picture:
+    """`sweep_picture` of a table's file."""
+    return sweep_picture(section, read_columns(table, (*section.columns, "reason")))
+
+
+@styled
+def sweep_picture(section: Section, columns: Columns) -> Picture:
+    """The picture of a sweep's table.
+
+    columns : of the table by name; with those that `section` names, and `reason`.
+
+    Raises
+    ------
+    InputError : a heatmap of rows that are no grid; columns that are no numbers where they have to be; no
+        rows to hold others against.
+    """
+    data = SweepColumns(section, columns)
+    if section.drawn_as == "heatmap":
+        figure = _heatmap(section, data)
+    elif section.drawn_as == "lines":
+        figure = _lines(section, data)
+    else:
+        figure = _scatter(section, data)
+    if section.title:
+        figure.suptitle(section.title, x=0.01, ha="left")
+    return figure
+
+
+# ---------------------------------------------------------------- heatmap
+def _heatmap(section: Section, data: SweepColumns) -> Picture:
+    x, y = data.numbers(section.x), data.numbers(section.y[0])
+    across, i = np.unique(x, return_inverse=True)
+    up, j = np.unique(y, return_inverse=True)
+    if len(x) != len(across) * len(up) or len({*zip(i.tolist(), j.tolist(), strict=True)}) != len(x):
+        raise InputError(
+            f"[figure] kind: a heatmap needs each {section.x} with each {section.y[0]} once, as of [grid]; "
+            "take a scatter"
+        )
+    shown = section.colour or ["impulse_Ns"]
+    figure = Picture(PAGE, 2.9 if len(shown) < 3 else 2.4)
+    panels = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, shown, strict=True):
+        table = np.full((len(up), len(across)), np.nan)
+        table[j, i] = data.results(name)
+        table[~np.isfinite(table)] = np.nan
+        axes.set_facecolor(NOWHERE)
+        logarithmic = "colour" in section.log
+        mesh = axes.pcolormesh(
+            across, up, np.ma.masked_invalid(table), shading="nearest", cmap=SCALE, rasterized=True,
+            norm=LogNorm() if logarithmic else None,
+        )  # fmt: skip
+        axes.grid(visible=False)
+        bar = figure.colorbar(mesh, ax=axes, format=_PLAIN)
+        bar.outline.set_visible(False)
+        axes.set_title(data.label(name), loc="left")
+        axes.set_xlabel(data.label(section.x))
+        for dashes, (column, level) in zip(DASHES, section.contour.items(), strict=False):
+            _contour(axes, across, up, (i, j), data.results(column), level, dashes)
+        _scales(axes, section)
+    panels[0].set_ylabel(data.label(section.y[0]))
+    handles: list[Any] = []
+    if data.reasons:
+        handles.append(Patch(facecolor=NOWHERE, label=f"no collision: {data.note()}"))
+    for dashes, (column, level) in zip(DASHES, section.contour.items(), strict=False):
+        what, _, unit = data.label(column).partition(" [")
+        label = f"{what} {level:g} {unit.rstrip(']')}".rstrip()
+        handles.append(Line2D([], [], color=BLACK, linestyle=dashes, linewidth=1.4, label=label))
+    if handles:
+        figure.legend(handles=handles, loc="outside lower left", ncols=min(len(handles), 2))
+    return figure
+
+
+def _contour(
+    axes: Any, x: Array, y: Array, at: tuple[Any, Any], values: Array, level: float, dashes: str
+) -> None:
+    table = np.full((len(y), len(x)), np.nan)
+    table[at[1], at[0]] = values
+    finite = np.isfinite(table)
+    if min(table.shape) < 2 or not (table[finite].min() < level < table[finite].max()):
+        return
+    masked = np.ma.masked_invalid(table)
+    for colour, width, style in (("white", 3.2, "-"), (BLACK, 1.4, dashes)):
+        axes.contour(x, y, masked, [level], colors=colour, linewidths=width, linestyles=style)
+
+
+# ---------------------------------------------------------------- lines
+def _lines(section: Section, data: SweepColumns) -> Picture:
+    x = data.numbers(section.x)
+    groups, names = combined(section.colour, data)
+    panel, titles = combined([section.panel] if section.panel else [], data)
+    figure = Picture(PAGE, 0.7 + (1.6 if len(section.y) > 1 else 2.2) * len(section.y))
+    grid = figure.subplots(len(section.y), len(titles), sharex=True, sharey="row", squeeze=False)
+    scale = _shades(section, data, names)
+    there: dict[str, Any] = {}  # lines by what they are called
+    for name, row in zip(section.y, grid, strict=True):
+        values, label = data.results(name), data.label(name)
+        if section.against:
+            values, label = errors_against(section, data, values), name_of_error(section, data, name)
+        for k, axes in enumerate(row):
+            for g, series in enumerate(names):
+                chosen = np.flatnonzero((panel == k) & (groups == g))
+                order = chosen[np.argsort(x[chosen], kind="stable")]
+                if not np.isfinite(values[order]).any():
+                    continue
+                mark = MARKS[g % len(MARKS)] if len(order) <= FEW else None
+                (line,) = axes.plot(x[order], values[order], color=scale[g], marker=mark, markersize=4)
+                there[section.labels.get(series, series)] = line
+            _scales(axes, section)
+        row[0].set_ylabel(label)
+    for k, title in enumerate(titles):
+        grid[0, k].set_title(title, loc="left")
+        grid[-1, k].set_xlabel(data.label(section.x))
+    if len(there) > 1:
+        above = data.label(section.colour[0]) if len(section.colour) == 1 else None
+        handles = list(there.values())
+        figure.legend(
+            handles, list(there), loc="outside lower left", title=above, alignment="left", ncols=len(there)
+        )
+    return figure
+
+
+def _shades(section: Section, data: SweepColumns, names: Sequence[str]) -> list[Any]:
+    """Numbers are shades of one scale, kinds are colours of their own."""
+    one = len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
+    if one and len(names) > 2:
+        return [colormaps[SCALE](0.9 * k / (len(names) - 1)) for k in range(len(names))]
+    return [COLOURS[k % len(COLOURS)] for k in range(len(names))]
+
+
+# ---------------------------------------------------------------- scatter
+def _scatter(section: Section, data: SweepColumns) -> Picture:
+    x, y = data.results(section.x), data.results(section.y[0])
+    panel, titles = combined([section.panel] if section.panel else [], data)
+    figure = Picture(PAGE if len(titles) > 1 else 0.75 * PAGE, 3.4)
+    grid = figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False)[0]
+    shown = np.isfinite(x) & np.isfinite(y)
+    drawn = np.flatnonzero(shown)
+    if len(drawn) > MOST:
+        drawn = np.random.default_rng(0).permutation(drawn)[:MOST]
+    size = 22.0 if len(drawn) < 500 else 9.0 if len(drawn) < 5000 else 3.0
+    colour = section.colour[0] if section.colour else None
+    numeric = colour is not None and data.values(colour).dtype != object
+    norm: Any = None
+    if numeric and colour is not None:
+        levels = data.numbers(colour)[drawn]
+        ends = (np.nanmin(levels), np.nanmax(levels)) if len(levels) else (0.0, 1.0)
+        norm = (LogNorm if "colour" in section.log else Normalize)(*ends)
+    groups, names = combined(section.colour[:1] if not numeric else [], data)
+    marks: Any = None
+    for k, (axes, title) in enumerate(zip(grid, titles, strict=True)):
+        own = drawn[panel[drawn] == k]
+        for g, series in enumerate(names):
+            some = own[groups[own] == g]
+            paint: dict[str, Any] = {"color": COLOURS[g % len(COLOURS)], "label": series}
+            if numeric and colour is not None:
+                paint = {"c": data.numbers(colour)[some], "cmap": SCALE, "norm": norm}
+            marks = axes.scatter(x[some], y[some], s=size, edgecolors="none", rasterized=True, **paint)
+        axes.set_title(title, loc="left")
+        axes.set_xlabel(data.label(section.x))
+        _scales(axes, section)
+    grid[0].set_ylabel(data.label(section.y[0]))
+    if numeric and colour is not None:
+        bar = figure.colorbar(marks, ax=grid.tolist(), label=data.label(colour))
+        bar.outline.set_visible(False)
+    elif len(names) > 1 and colour is not None:
+        handles, labels = grid[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower left", title=data.label(colour), ncols=len(labels))
+    if shown.sum() > len(drawn):
+        figure.supxlabel(f"{len(drawn):,} of {shown.sum():,} rows", fontsize=7, x=0.01, ha="left")
+    return figure
+
+
+def _scales(axes: Any, section: Section) -> None:
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
+        if name not in section.log:
+            continue
+        set_scale = axes.set_xscale if name == "x" else axes.set_yscale
+        set_scale("log")
+        axis.set_major_formatter(_PLAIN)
+
+
+def _number(x: float) -> str:
+    """As it is written by hand; large and small powers of ten as such."""
+    power = round(np.log10(abs(x))) if x else 0
+    if abs(power) >= 4 and np.isclose(abs(x), 10.0**power, rtol=1e-9):
+        return f"${'-' if x < 0 else ''}10^{{{power}}}$"
+    return f"{x:g}"

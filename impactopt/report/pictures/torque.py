@@ -1,0 +1,91 @@
+"""Torque demand over limit: joints by time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import FigureBase
+
+from impactopt.files.output import Record
+from impactopt.report.pictures.style import (
+    OVER,
+    PAGE,
+    PHASES,
+    Array,
+    Picture,
+    joint_label,
+    simulated_phases,
+    styled,
+    title,
+)
+
+ROW = 0.13  # [in] of a joint
+
+
+@styled
+def torque(record: Record) -> Picture:
+    """Torque demand over limit, joints by time; contact has a panel of its own, at a larger scale."""
+    figure = Picture(PAGE, torque_height(record) + 0.2)
+    draw_torque(figure, record)
+    kind = "simulated, before saturation" if record.simulated else "planned"
+    figure.suptitle(title(record, f"torque over limit ({kind})"))
+    return figure
+
+
+def torque_height(record: Record) -> float:
+    """How high [in] it has to be, so that joints can be read."""
+    return 0.75 + ROW * max(len(record.arrays["joints"]), 8)
+
+
+def draw_torque(figure: FigureBase, record: Record) -> None:
+    """The same into a figure, or a part of one."""
+    a = record.arrays
+    names = [joint_label(name) for name in a["joints"]]
+    histories = _demand(record)
+    panels = figure.subplots(1, 3, sharey=True, gridspec_kw={"width_ratios": [4, 3, 4]})
+    colours = matplotlib.colormaps["cividis"].with_extremes(over=OVER)
+    mesh: Any = None
+    for k, (axes, (time, ratio)) in enumerate(zip(panels, histories, strict=True)):
+        if len(time) < 2 or time[0] == time[-1]:  # after a contact that never ends; in one without duration
+            axes.set_visible(False)
+            continue
+        edges, values = _binned(time, ratio)
+        rows = np.arange(len(names) + 1) - 0.5
+        mesh = axes.pcolormesh(edges, rows, values.T, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True)
+        axes.grid(False)
+        axes.set(
+            xlabel="time since contact [ms]" if k == 1 else "time [s]",
+            title=f"{'contact' if k == 1 else PHASES[k]}: at most {ratio.max():.2f}",
+        )
+    panels[0].set_yticks(np.arange(len(names)), names, fontsize=6.5)
+    panels[0].invert_yaxis()
+    for axes in panels[1:]:
+        axes.tick_params(left=False)
+    bar = figure.colorbar(mesh, ax=list(panels), extend="max", aspect=40, pad=0.01)
+    bar.set_label("|demand| / limit")
+
+
+def _demand(record: Record) -> list[tuple[Array, Array]]:
+    """Times and |demand| / limit (k, n) of the three phases."""
+    a = record.arrays
+    if not record.simulated:
+        parts = [a["reference_phase"] == k for k in range(3)]
+        torques = [a["reference_torque"][parts[0]], a["collision_torque"], a["reference_torque"][parts[2]]]
+        times = [a["reference_time"][parts[0]], 1e3 * a["collision_time"], a["reference_time"][parts[2]]]
+    else:
+        phase = simulated_phases(record)
+        torques = [a["simulated_demand"][phase == k] for k in range(3)]
+        times = [a["simulated_time"][phase == k] for k in range(3)]
+        times[1] = 1e3 * (times[1] - times[1][:1])
+    ratios = [np.abs(values) / a["torque_limit"] for values in torques]
+    return list(zip(times, ratios, strict=True))
+
+
+def _binned(time: Array, values: Array, most: int = 500) -> tuple[Array, Array]:
+    """Edges and, between them, the largest of the values: no peak gets lost in a pixel."""
+    count = min(most, len(time))
+    wanted = np.linspace(time[0], time[-1], count, endpoint=False)
+    start = np.unique(np.searchsorted(time, wanted, side="right") - 1)
+    return np.append(time[start], time[-1]), np.maximum.reduceat(values, start, axis=0)

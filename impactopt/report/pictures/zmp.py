@@ -1,0 +1,157 @@
+"""The path of the zero-moment point in the support polygon, planned and simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import FigureBase
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from impactopt.files.output import Record
+from impactopt.kinematics.support import zmp
+from impactopt.report.pictures.style import (
+    BLACK,
+    OVER,
+    PAGE,
+    PHASES,
+    Array,
+    Picture,
+    simulated_phases,
+    styled,
+    title,
+)
+
+
+@styled
+def zero_moment_point(record: Record) -> Picture | None:
+    """Path of the ZMP in the support polygon, seen from above; None without soles."""
+    if not len(record.arrays["polygon"]):
+        return None
+    figure = Picture(PAGE, 3.1)
+    draw_zmp(figure, record)
+    figure.suptitle(title(record, "zero-moment point, from above"))
+    return figure
+
+
+def draw_zmp(figure: FigureBase, record: Record, phases: Sequence[int] = (0, 1, 2)) -> None:
+    """The same into a figure, or a part of one; a panel for each of the phases."""
+    a = record.arrays
+    paths = _zmp_paths(record)
+    panels: Any = figure.subplots(1, len(phases), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, k in zip(panels, phases, strict=True):
+        _ground(axes, a)
+        norm = None
+        for kind in ("simulated", "planned"):
+            if (kind, k) not in paths:
+                continue
+            time, points = paths[kind, k]
+            norm = norm or Normalize(*_span(time, k))
+            if kind == "simulated":
+                _coloured_line(axes, time, points, norm)
+            else:
+                marks = _stations(time, 25) if k != 1 else np.arange(len(time))
+                axes.scatter(
+                    -points[marks, 1],
+                    points[marks, 0],
+                    c=time[marks],
+                    norm=norm,
+                    s=13,
+                    edgecolors=BLACK,
+                    linewidths=0.5,
+                    zorder=4,
+                )
+        if norm is not None:
+            place: Any = {"location": "bottom", "aspect": 25} if len(phases) > 1 else {"shrink": 0.8}
+            bar = figure.colorbar(matplotlib.cm.ScalarMappable(norm), ax=axes, **place)
+            bar.set_label("time since contact [ms]" if k == 1 else "time [s]")
+        margin = _margin(record, k)
+        text = "" if margin is None else f": margin {1e3 * margin:.0f} mm"
+        what = PHASES[k] if len(phases) > 1 else f"ZMP, {PHASES[k]}"
+        axes.set_title(what + text, color=BLACK if margin is None or margin >= 0 else OVER)
+    panels[0].set_ylabel("x, forward [m]")
+    figure.legend(handles=_zmp_key(record), loc="outside lower center", ncols=4 if len(phases) > 1 else 2)
+
+
+def _zmp_paths(record: Record) -> dict[tuple[str, int], tuple[Array, Array]]:
+    """Times ([s]; [ms] since contact in the collision) and points (k, 2) by kind and phase."""
+    a, out = record.arrays, {}
+    for k in (0, 2):
+        keep = (a["reference_phase"] == k) & (a["reference_time"] <= a["reference_end"])
+        out["planned", k] = a["reference_time"][keep], zmp(a["reference_ground"][keep])
+    if len(a["collision_ground"]):  # no path of an impact without duration
+        out["planned", 1] = 1e3 * a["collision_time"][1:], zmp(a["collision_ground"])
+    if record.simulated:
+        time, phase = a["simulated_time"], simulated_phases(record)
+        for k in range(3):
+            keep = phase == k
+            if keep.any():
+                shown = 1e3 * (time[keep] - time[keep][0]) if k == 1 else time[keep]
+                out["simulated", k] = shown, zmp(a["simulated_sole_ground"][keep].sum(axis=1))
+    return out
+
+
+def _zmp_key(record: Record) -> list[Line2D | Patch]:
+    grey = matplotlib.colormaps["cividis"](0.5)
+    key: list[Line2D | Patch] = [
+        Line2D([], [], linestyle="", marker="o", color=grey, markeredgecolor=BLACK, label="planned"),
+        Line2D([], [], linestyle="--", color=BLACK, linewidth=1.0, label="support polygon"),
+        Patch(facecolor="#eeeeee", edgecolor="#999999", label="sole"),
+    ]
+    if record.simulated:
+        key.insert(1, Line2D([], [], color=grey, linewidth=1.8, label="simulated"))
+    return key
+
+
+def _span(time: Array, phase: int) -> tuple[float, float]:
+    return (0.0, float(time[-1])) if phase == 1 else (float(time[0]), float(time[-1]))
+
+
+def _stations(time: Array, count: int) -> NDArray[np.intp]:
+    """Indices of instants about evenly spread over the time."""
+    return np.searchsorted(time, np.linspace(time[0], time[-1], count)).clip(0, len(time) - 1)
+
+
+def _ground(axes: Any, arrays: Mapping[str, Array]) -> None:
+    """Soles and support polygon from above: forward is up, left is left."""
+    for name, corners in arrays.items():
+        if name.startswith("sole_"):
+            axes.fill(-corners[:, 1], corners[:, 0], facecolor="#eeeeee", edgecolor="#999999", linewidth=1.0)
+            middle = corners.mean(axis=0)
+            axes.annotate(
+                name.removeprefix("sole_"),
+                (-middle[1], corners[:, 0].min()),
+                (0, 3),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                color="#666666",
+                fontsize=6.5,
+            )
+    polygon = np.vstack([arrays["polygon"], arrays["polygon"][:1]])
+    axes.plot(-polygon[:, 1], polygon[:, 0], "--", color=BLACK, linewidth=1.0)
+    axes.set_aspect("equal")
+    axes.set_xlabel("y, to the right [m]")
+    axes.grid(False)
+
+
+def _coloured_line(axes: Any, time: Array, points: Array, norm: Normalize) -> None:
+    path = np.column_stack([-points[:, 1], points[:, 0]])
+    pieces = np.stack([path[:-1], path[1:]], axis=1)
+    lines = LineCollection(list(pieces), cmap="cividis", norm=norm, linewidth=1.8, zorder=3)
+    lines.set_array(time[:-1])
+    axes.add_collection(lines, autolim=True)
+    axes.autoscale_view()
+
+
+def _margin(record: Record, phase: int) -> float | None:
+    """ZMP margin [m] of a phase, simulated where there is a simulation."""
+    source = record.summary.get("simulated", record.summary)
+    value: float | None = source.get("zmp_margin_m", {}).get(("swing", "collision", "follow")[phase])
+    return value

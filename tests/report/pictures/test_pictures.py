@@ -1,0 +1,295 @@
+"""Pictures: what is drawn is the solution's own numbers, with units, and nothing lies over anything else."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PathCollection
+from PIL import Image
+from support.fake_solution import MissingSolution, still_problem, still_solution
+from support.picture_checks import frowns
+from support.small_plans import Planned
+from typer.testing import CliRunner
+
+from impactopt.cli.app import app
+from impactopt.collision import effective_mass
+from impactopt.errors import InputError
+from impactopt.files.output import Record, record_of
+from impactopt.kinematics.support import zmp
+from impactopt.planning.solution import Solution
+from impactopt.report.pictures import PICTURES, hierarchy, overview
+from impactopt.report.pictures.ellipsoid import effective_masses
+from impactopt.report.pictures.style import DPI, PAGE, Picture
+from impactopt.simulation.reference.poses import inverse_mass, poses_of
+from impactopt.studies.figures import FIGURES, chosen, drawn
+
+ROOT = Path(__file__).resolve().parents[2]
+DRAWS: dict[str, Callable[[Record], Picture | None]] = {"overview": overview, **PICTURES}
+LABELLED = re.compile(r"\[[^\]]+\]|/ limit")
+
+
+def solution_of(planned: Planned) -> Solution:
+    return Solution(
+        problem=planned.problem,
+        plan=planned.plan,
+        result=planned.result,
+        solver="ipopt",
+        build_seconds=0.0,
+        solve_seconds=0.0,
+        violations=(),
+    )
+
+
+@pytest.fixture(scope="module")
+def punch_record(biped_plan: Planned) -> Record:
+    """A biped's plan, solved and simulated; its replay on free soles is made up."""
+    made = still_solution(problem=still_problem()).validate(engine="mujoco")
+    return record_of(solution_of(biped_plan), simulation=biped_plan.simulation, replay=made)
+
+
+@pytest.fixture(scope="module")
+def arm_record(arm_plan: Planned) -> Record:
+    return record_of(solution_of(arm_plan), simulation=arm_plan.simulation)
+
+
+@pytest.fixture(scope="module")
+def records(punch_record: Record, arm_record: Record) -> dict[str, Record]:
+    still, missing = still_solution(), still_solution(kind=MissingSolution)
+    return {
+        "biped": punch_record,
+        "arm": arm_record,
+        "still": record_of(still, simulation=still.validate()),
+        "plan alone": record_of(still),
+        "missed": record_of(missing, simulation=missing.validate()),
+    }
+
+
+# ---------------------------------------------------------------- what a person would frown at
+@pytest.mark.parametrize("name", DRAWS)
+@pytest.mark.parametrize("which", ["biped", "arm", "still", "plan alone", "missed"])
+def test_nothing_is_cut_or_lies_over_anything_else(records: dict[str, Record], which: str, name: str) -> None:
+    picture = DRAWS[name](records[which])
+    if picture is None:
+        assert name in ("zmp", "replay")
+        return
+    assert frowns(picture) == []
+    assert picture.get_size_inches()[0] <= PAGE
+    for axes in picture.axes:
+        for text in (axes.get_xlabel(), axes.get_ylabel()):
+            assert not text or LABELLED.search(text), text
+    assert any(axes.get_xlabel() for axes in picture.axes)
+
+
+def test_frowns_are_found() -> None:
+    picture = Picture(3.0, 2.0)
+    axes = picture.subplots()
+    axes.plot([0, 1], [0, 1], label="a line")
+    assert frowns(picture) == []
+    axes.legend(loc="center")
+    axes.text(0.2, 0.8, "one text", transform=axes.transAxes)
+    axes.text(0.25, 0.8, "another text", transform=axes.transAxes)
+    picture.text(0.9, 0.3, "a text that leaves the picture")
+    found = " ".join(frowns(picture))
+    assert "a legend" in found and "'one text' lies over 'another text'" in found
+    assert "cut: 'a text that leaves the picture'" in found
+
+
+def test_a_picture_is_sharp_and_as_large_as_it_says(punch_record: Record) -> None:
+    picture = PICTURES["zmp"](punch_record)
+    assert picture is not None
+    content, shown = picture._repr_png_()
+    image = Image.open(io.BytesIO(content))
+    assert image.size[0] == round(PAGE * DPI)
+    assert shown["width"] == image.size[0] // 2
+
+
+# ---------------------------------------------------------------- what is drawn
+def test_the_force_is_the_plans_and_the_simulations(punch_record: Record) -> None:
+    a, picture = punch_record.arrays, PICTURES["force"](punch_record)
+    assert picture is not None
+    planned, simulated = picture.axes[0].lines
+    np.testing.assert_array_equal(planned.get_ydata(), a["collision_force"])
+    np.testing.assert_array_equal(planned.get_xdata(), 1e3 * a["collision_time"])
+    assert np.max(simulated.get_ydata()) == a["simulated_force"].max()
+    x, y = simulated.get_data()
+    impulse = float(
+        np.trapezoid(y, 1e-3 * np.asarray(x)) if hasattr(np, "trapezoid") else np.trapz(y, x) / 1e3
+    )
+    assert impulse == pytest.approx(punch_record.summary["simulated"]["impulse_Ns"], rel=0.02)
+
+
+def test_the_zero_moment_point_is_the_plans_with_time_as_colour(punch_record: Record) -> None:
+    a, picture = punch_record.arrays, PICTURES["zmp"](punch_record)
+    assert picture is not None
+    (marks,) = [c for c in picture.axes[1].collections if isinstance(c, PathCollection)]
+    points = zmp(a["collision_ground"])
+    np.testing.assert_allclose(marks.get_offsets(), np.column_stack([-points[:, 1], points[:, 0]]))
+    np.testing.assert_allclose(np.asarray(marks.get_array()), 1e3 * a["collision_time"][1:])
+    assert any(isinstance(c, LineCollection) for c in picture.axes[1].collections), "simulated"
+    polygon = next(line for line in picture.axes[1].lines if len(line.get_xdata()) == len(a["polygon"]) + 1)
+    np.testing.assert_allclose(np.asarray(polygon.get_ydata())[:-1], a["polygon"][:, 0])
+
+
+def test_poses_are_the_motions_by_forward_kinematics(biped_plan: Planned, punch_record: Record) -> None:
+    problem, reference = biped_plan.problem, biped_plan.trajectory
+    a = punch_record.arrays
+    k = int(a["pose_contact"])
+    assert a["pose_time"][k] == pytest.approx(reference.contact_start)
+    assert a["pose_time"][0] == 0.0 and abs(a["pose_time"][-1] - reference.end) < 1e-3
+    # at contact the striking point is where it is to hit, and the soles are on the ground, all the time
+    np.testing.assert_allclose(a["pose_links"][k][0][1], problem.point, atol=1e-6)
+    soles = a["pose_links"][:, -1], a["pose_links"][:, -3]
+    np.testing.assert_allclose([sole[..., 2] for sole in soles], 0.0, atol=1e-6)
+    # links are rigid
+    lengths = np.linalg.norm(np.diff(a["pose_links"], axis=2), axis=-1)[..., 0]
+    np.testing.assert_allclose(lengths, np.tile(lengths[0], (len(lengths), 1)), atol=1e-9)
+    np.testing.assert_allclose(a["pose_path"][0], a["pose_links"][0][0][1])
+
+
+def test_the_strobe_draws_every_pose_and_the_way(punch_record: Record) -> None:
+    a, picture = punch_record.arrays, PICTURES["strobe"](punch_record)
+    assert picture is not None
+    (axes,) = picture.axes
+    assert [t.get_text() for t in axes.get_xticklabels()] == [f"{t:.2f}" for t in a["pose_time"]]
+    heights = np.concatenate([np.asarray(line.get_ydata()) for line in axes.lines])
+    for links in a["pose_links"]:
+        assert np.isin(links[:, :, 2].ravel(), heights).all()
+
+
+def test_the_mass_at_the_fist_is_the_collision_models_effective_mass(biped_plan: Planned) -> None:
+    """One computed with Pinocchio's mass matrix, the other from our symbolic frozen dynamics."""
+    problem, q = biped_plan.problem, biped_plan.trajectory.q[10]
+    inverse = inverse_mass(problem, q)
+    for n in (problem.normal, np.array([0.6, 0.0, 0.8]), np.array([0.0, -1.0, 0.0])):
+        symbolic = effective_mass(problem.robot, striker=problem.striker, normal=n, stance=problem.stance)
+        assert effective_masses(inverse, n[None])[0] == pytest.approx(float(symbolic(q)), rel=1e-9)
+
+
+def test_the_mass_of_the_blow_is_marked(punch_record: Record) -> None:
+    a, picture = punch_record.arrays, PICTURES["ellipsoid"](punch_record)
+    assert picture is not None
+    mass = 1.0 / (a["pose_normal"] @ a["pose_inverse_mass"] @ a["pose_normal"])
+    (marked,) = [line for line in picture.axes[-1].lines if line.get_marker() == "o"]
+    assert np.asarray(marked.get_ydata()).item() == pytest.approx(mass)
+    assert f"{mass:.1f} kg" in str(picture.get_suptitle())
+
+
+def test_the_solvers_way_is_its_history(punch_record: Record) -> None:
+    a, picture = punch_record.arrays, PICTURES["iterations"](punch_record)
+    assert picture is not None
+    (gain,) = picture.axes[0].lines
+    np.testing.assert_array_equal(gain.get_ydata(), -a["history_objective"])
+    low, high = picture.axes[0].get_ylim()
+    assert low <= -a["history_objective"][-1] <= high
+
+
+def test_the_torque_map_is_the_demand_over_the_limit(arm_record: Record) -> None:
+    a, picture = arm_record.arrays, PICTURES["torque"](arm_record)
+    assert picture is not None
+    largest = max(float(np.max(np.asarray(axes.collections[0].get_array()))) for axes in picture.axes[:3])
+    assert largest == pytest.approx(np.abs(a["simulated_demand"] / a["torque_limit"]).max(), rel=1e-6)
+
+
+# ---------------------------------------------------------------- the hierarchy
+def blow(force: float, end: float) -> Any:
+    time = np.linspace(0.0, end, 200)
+    return SimpleNamespace(
+        time=time, force=force * (1 - time / end), impulse=force * end / 2, duration=end, peak_force=force
+    )
+
+
+def test_the_ladder_holds_each_model_against_the_reference() -> None:
+    models = {"coarse": blow(300.0, 0.04), "fine": blow(399.0, 0.05), "full dynamics": blow(400.0, 0.05)}
+    picture = hierarchy({"one": models, "two": models})
+    assert frowns(picture) == []
+    left, right = picture.axes[:2]
+    assert len(left.lines) == 3
+    legend = right.get_legend()
+    assert legend is not None
+    assert [t.get_text() for t in legend.get_texts()] == ["-40.00 %", "-0.25 %"]
+    # what the impulse is off by at the end: 10 N s true, 6 and 9.975 N s
+    ends = [np.asarray(line.get_ydata())[-1] for line in right.lines if len(line.get_xdata())]
+    np.testing.assert_allclose(ends, [4.0, 0.025], rtol=1e-3)
+
+
+def test_a_ladder_without_its_reference_is_refused() -> None:
+    with pytest.raises(InputError, match="needs the model 'full dynamics'"):
+        hierarchy({"one": {"coarse": blow(300.0, 0.04)}})
+    with pytest.raises(InputError, match="at most 7 models"):
+        hierarchy({"one": {**{str(k): blow(1.0, 0.1) for k in range(8)}, "full dynamics": blow(1.0, 0.1)}})
+
+
+# ---------------------------------------------------------------- of a solution
+def test_a_solution_draws_itself() -> None:
+    solution = still_solution()
+    assert len(solution.plot().axes) >= 4
+    with_simulation = solution.plot("force", simulation=solution.validate())
+    assert len(with_simulation.axes[0].lines) == 2 and len(solution.plot("force").axes[0].lines) == 1
+    assert solution.plot("replay", replay=solution.validate(engine="mujoco")) is not None
+    with pytest.raises(InputError, match=r"no picture 'forse' \(did you mean 'force'"):
+        solution.plot("forse")
+    with pytest.raises(InputError, match="nothing to draw as 'replay': it needs replay"):
+        solution.plot("replay")
+
+
+def test_poses_of_an_instant_impact_have_no_end_of_contact(biped_plan: Planned) -> None:
+    import dataclasses
+
+    reference = biped_plan.trajectory
+    instant = dataclasses.replace(reference, contact_end=reference.contact_start)
+    assert (
+        len(poses_of(biped_plan.problem, instant).time)
+        == len(poses_of(biped_plan.problem, reference).time) - 1
+    )
+
+
+# ---------------------------------------------------------------- figures of the docs
+def test_every_figure_of_the_documents_has_its_command() -> None:
+    used = set()
+    for file in [*ROOT.glob("docs/**/*.md"), ROOT / "README.md"]:
+        used |= set(re.findall(r"figures/([\w-]+)\.(?:png|svg)", file.read_text(encoding="utf-8")))
+    assert len(used) > 8
+    assert used <= set(FIGURES), "add them to FIGURES"
+    kept = {path.stem for path in (ROOT / "docs" / "figures").glob("*.png")}
+    assert kept == used, "figures that are made but not shown, or shown but not there"
+
+
+def test_figures_are_made_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def maker(source: str, say: Any) -> Callable[[str], Picture]:
+        made.append(source)
+        return lambda name: Picture(1.0, 1.0)
+
+    monkeypatch.setattr(
+        "impactopt.studies.figures._MAKERS",
+        dict.fromkeys(("plot", "reproduce", "bench", "sweep"), maker),
+    )
+    result = CliRunner().invoke(app, ["figures", "zmp", "fig7", "force", "--quiet", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["fig7.png", "force.png", "zmp.png"]
+    assert made == ["punch", "fig7"], "what has one source is computed once"
+    result = CliRunner().invoke(app, ["figures", "figg7"])
+    assert result.exit_code == 2 and "fig7" in result.output
+
+
+def test_every_figure_has_a_source_that_exists() -> None:
+    from impactopt.studies.registry import BENCHES, REPRODUCED
+
+    studies = {path.stem for path in (ROOT / "problems" / "sweeps").glob("*.toml")}
+    known = {"plot": DRAWS, "reproduce": REPRODUCED, "bench": BENCHES, "sweep": studies}
+    assert chosen(FIGURES) == list(FIGURES)
+    for name, (how, source) in FIGURES.items():
+        assert (name if how == "plot" else source) in known[how]
+
+
+def test_figures_of_the_formulas_are_drawn() -> None:
+    ((name, picture),) = drawn(["fig3"], lambda text: None)
+    assert name == "fig3" and frowns(picture) == []

@@ -1,0 +1,54 @@
+"""Sums in runs: what C and sparse products make of them, against sums one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from impactopt.transcription import runs
+from impactopt.transcription.scatter_add import Runs, count_up, union, with_transposed
+
+seeds = st.integers(0, 2**31)
+
+
+@given(seeds, st.booleans())
+def test_runs_add_what_they_say(seed: int, compiled: bool) -> None:
+    rng = np.random.default_rng(seed)
+    count, entries, places = int(rng.integers(0, 9)), rng.standard_normal(20), 30
+    length = rng.integers(0, 6, count)
+    entry, place = rng.integers(0, 14, count), rng.integers(0, 24, count)
+    factor, out = rng.standard_normal(count), rng.standard_normal(places)
+    expected = out.copy()
+    for e, p, n, f in zip(entry, place, length, factor, strict=True):
+        for i in range(n):
+            expected[p + i] += f * entries[e + i]
+    with pytest.MonkeyPatch.context() as patch:
+        if not compiled:
+            patch.setattr(runs, "_library", lambda: None)
+        Runs.make(entry, place, length, factor, (places, entries.size)).add_to(out, entries)
+    np.testing.assert_allclose(out, expected, atol=1e-12)
+
+
+@given(seeds, st.booleans())
+def test_a_matrix_and_its_transpose(seed: int, compiled: bool) -> None:
+    matrix = np.random.default_rng(seed).standard_normal((4, 4))
+    across = np.arange(16, dtype=np.int32).reshape(4, 4).T.ravel()
+    with pytest.MonkeyPatch.context() as patch:
+        if not compiled:
+            patch.setattr(runs, "_library", lambda: None)
+        both = with_transposed(matrix.ravel(), across)
+    np.testing.assert_array_equal(both.reshape(4, 4), matrix + matrix.T)
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.integers(1, 8)), max_size=12))
+def test_union_lists_each_number_once(parts: list[tuple[int, int]]) -> None:
+    first, length = (np.array([p[k] for p in parts], dtype=np.intp) for k in range(2))
+    numbers = sorted({a + i for a, n in parts for i in range(n)})
+    assert union(first, length).tolist() == numbers
+
+
+def test_count_up() -> None:
+    assert count_up(np.array([2, 0, 3])).tolist() == [0, 1, 0, 1, 2]
+    assert count_up(np.zeros(0, dtype=np.intp)).size == 0

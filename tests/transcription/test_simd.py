@@ -1,0 +1,158 @@
+"""Functions in lanes: for every instance what CasADi's own function of one instance gives."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.small_plans import arm_problem, transcribed
+
+from impactopt.codegen.cache import cached
+from impactopt.codegen.compiler import find_compiler
+from impactopt.codegen.library import NativeCode
+from impactopt.errors import NoCompilerWarning
+from impactopt.transcription import lanes
+from impactopt.transcription.batched import BatchedFunction
+from impactopt.transcription.simd import LANES, in_lanes
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.structured import derivative_functions
+from impactopt.transcription.transcription import Transcription
+
+Array = NDArray[np.float64]
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setenv("IMPACTOPT_CACHE", str(tmp_path / "cache"))
+    yield tmp_path / "cache"
+    gc.collect()
+
+
+def compiled(*functions: Any, count: int = LANES) -> dict[str, Any]:
+    return cached("lanes", (count,), lambda: [in_lanes(f, count) for f in functions])
+
+
+def every_operation() -> Any:
+    """A function of z (4) and p (1) with all operations that lanes know; the last input row is an angle."""
+    z, p = ca.SX.sym("z", 4), ca.SX.sym("p", 1)
+    a, b, c, d = ca.vertsplit(z)
+    small = a / (1 + ca.fabs(a))  # in (-1, 1)
+    big = 1 + a**2
+    out = [
+        a + b - p[0] * c / big + (-d) + 2 * a + 1 / big + 0.1 * d**2,
+        ca.sqrt(big) + ca.sin(b) * ca.cos(c) - ca.tan(small),
+        ca.asin(small) + ca.acos(small) + ca.atan(b) + ca.atan2(c, d),
+        ca.sinh(small) + ca.cosh(small) + ca.tanh(b) + ca.exp(-big) + ca.log(big),
+        big**b + ca.fmin(a, b) + ca.fmax(c, d) + ca.sign(a) + ca.hypot(a, b) + big**2.5,
+        ca.if_else(a < b, c, d) + ca.if_else(a <= 0, b, c) + ca.if_else(p[0] == a, 3.0, 4.0),
+        ca.if_else(ca.logic_and(a > 0, b > 0), c, 0) + ca.if_else(ca.logic_or(a > 0, c > 0), d, 0),
+        ca.if_else(ca.logic_not(a > b), 5.0, 0) + (c != d),
+        ca.SX(0.0),
+    ]
+    return z, p, ca.vertcat(*out)
+
+
+@needs_compiler
+@pytest.mark.parametrize(("part", "count"), [(3, 8), (10_000, 8), (3, 4), (3, 2)])
+def test_every_operation_gives_in_lanes_what_it_gives_alone(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, part: int, count: int
+) -> None:
+    monkeypatch.setattr(lanes, "_PART", part)
+    functions = derivative_functions("all", *every_operation())
+    found, rng = compiled(*functions, count=count), np.random.default_rng(0)
+    for plain in functions:
+        function = found[plain.name()]
+        mapped = plain.map(count)
+        assert isinstance(in_lanes(plain), NativeCode)
+        assert (function.name_in(), function.name_out()) == (plain.name_in(), plain.name_out())
+        for i in range(plain.n_in()):
+            assert function.sparsity_in(i) == mapped.sparsity_in(i)
+        assert function.sparsity_out(0) == mapped.sparsity_out(0)
+        for _ in range(5):
+            arguments = [rng.standard_normal((plain.size1_in(i), count)) for i in range(plain.n_in())]
+            half = slice(count // 2)
+            arguments[1][0, half] = arguments[0][0, half]  # p equals a in half of the lanes
+            arguments[0][2, ::2] = arguments[0][3, ::2]
+            expected = np.array(mapped(*arguments).nonzeros())
+            assert np.isfinite(expected).all()
+            np.testing.assert_allclose(function(*arguments).nonzeros(), expected, rtol=1e-14, atol=1e-14)
+
+
+@needs_compiler
+def test_each_lane_is_on_its_own(cache: Path) -> None:
+    x = ca.SX.sym("x", 2)
+    (function,) = compiled(ca.Function("f", [x], [ca.vertcat(1 / x[0], ca.sqrt(x[1]))])).values()
+    arguments = np.ones((2, LANES))
+    arguments[:, 3] = 0.0, -1.0
+    out = np.array(function(arguments))
+    assert np.isinf(out[0, 3]) and np.isnan(out[1, 3])
+    np.testing.assert_array_equal(np.delete(out, 3, axis=1), 1)
+
+
+@needs_compiler
+@pytest.mark.parametrize("count", [1, 7, LANES, LANES + 3, 2 * LANES])
+def test_any_count_of_instances_fills_whole_calls(cache: Path, count: int) -> None:
+    functions = derivative_functions("all", *every_operation())
+    found, rng = compiled(*functions), np.random.default_rng(count)
+    z, p, multipliers = (rng.standard_normal((count, n)) for n in (4, 1, 9))
+    for plain in functions:
+        one, many = BatchedFunction(plain, count, p), BatchedFunction(found[plain.name()], count, p)
+        given = (z, multipliers) if plain.n_in() == 3 else (z,)
+        for a in (given, tuple(-x for x in given)):
+            np.testing.assert_allclose(many(*a), one(*a), rtol=1e-14, atol=1e-14)
+        assert many(*given).shape == (count, plain.nnz_out(0))
+        filled = many.inputs[0]
+        assert len(filled) % LANES == 0 and len(filled) - count < LANES
+        np.testing.assert_array_equal(filled[count:], np.broadcast_to(z[-1], filled[count:].shape))
+        for a, b in zip(many.pattern, one.pattern, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_the_operations_above_are_all() -> None:
+    functions = derivative_functions("all", *every_operation())
+    kinds = {f.instruction_id(k) for f in functions for k in range(f.n_instructions())}
+    assert kinds >= {*lanes._OF_VECTORS, *lanes._IN_EACH_LANE} - {ca.OP_ASSIGN}
+
+
+def test_an_unknown_operation_stays_out_of_lanes() -> None:
+    x = ca.SX.sym("x", 2)
+    function = ca.Function("f", [x], [ca.erf(x)])
+    assert in_lanes(function) is function
+
+
+def test_without_a_compiler_an_instance_a_call(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("IMPACTOPT_NO_COMPILER", "1")
+    value, *_ = derivative_functions("all", *every_operation())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NoCompilerWarning)
+        assert compiled(value)["all"] is value
+
+
+@needs_compiler
+def test_a_program_in_lanes_is_the_program(cache: Path) -> None:
+    """All blocks of a small robot's motion."""
+    problem = arm_problem()
+    plain = transcribed(problem)
+    fast = Transcription(problem, problem.coordinates, compiled(*plain.functions.values()))
+    rng = np.random.default_rng(1)
+    x = first_iterate(plain) + 0.01 * rng.standard_normal(plain.program.n)
+    multipliers = rng.standard_normal(plain.program.m)
+    for name, out in fast.program.outputs(x).items():
+        np.testing.assert_allclose(out, plain.program.outputs(x)[name], rtol=1e-14, atol=1e-14)
+    a, b = (t.program for t in (plain, fast))
+    assert all(block.value.columns == LANES for block in b.blocks)
+    same(a.constraints(x), b.constraints(x))
+    same(a.jacobian(x).data, b.jacobian(x).data)
+    same(a.hessian(x, 1.3, multipliers).data, b.hessian(x, 1.3, multipliers).data)
+
+
+def same(a: Array, b: Array) -> None:
+    np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14 * np.abs(a).max())

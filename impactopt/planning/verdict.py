@@ -74,8 +74,8 @@ def _too_stiff(t: ContactProgram) -> str:
 
 def _told(found: Parting, limit: float) -> str:
     words = (
-        f"one contact is not enough: even at {limit:.2g} m/s, the most that the joints allow, point masses as "
-        f"heavy as striker and target separate {1e3 * found.time:.2g} ms after they touch, before the "
+        f"one contact is not enough: even at {limit:.2g} m/s, the most that the joints allow, point masses "
+        f"as heavy as striker and target separate {1e3 * found.time:.2g} ms after they touch, before the "
         f"target's {found.event!r}"
     )
     if found.needed is not None:
@@ -92,5 +92,6 @@ def _too_long(t: ContactProgram) -> str:
         return ""
     return (
         f"this contact is soft: between point masses as heavy as striker and target one phase of it takes "
-        f"{1e3 * t.expected.natural:.2g} ms, and `[collision] duration_s` allows {1e3 * longest:.2g} ms at most"
+        f"{1e3 * t.expected.natural:.2g} ms, and `[collision] duration_s` allows {1e3 * longest:.2g} ms at "
+        "most"
     )

@@ -15,7 +15,7 @@ author = "the impactopt authors"
 copyright = "the impactopt authors, BSD-2-Clause"
 version = release = impactopt.__version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "commands", "docstrings", "mathml", "notebooks"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "commands", "docstrings", "families", "mathml", "notebooks"]
 exclude_patterns = ["_ext"]
 
 # pages

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from support.browser import Job, visit
 
+import impactopt
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 LOADS = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "video": "src"}
@@ -53,6 +55,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pages(site: Path) -> dict[Path, Page]:
     return {file: Page(file) for file in sorted(site.rglob("*.html"))}
+
+
+def test_every_public_name_is_in_the_reference(pages: dict[Path, Page]) -> None:
+    described = set().union(*(page.anchors for page in pages.values()))
+    public = {f"impactopt.{name}" for name in impactopt.__all__ if name != "__version__"}
+    assert public - described == set()
 
 
 def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Page]) -> None:

@@ -14,6 +14,7 @@ from support.rooms import (
     PACKAGE,
     RANK,
     ROOMS,
+    ROOMS_IN_ORDER,
     imports,
     modules_imported,
     room,
@@ -67,6 +68,12 @@ def test_engines_share_no_code_with_the_planner() -> None:
     for file in [*engines, *shared]:
         assert rooms_imported(file) <= ENGINE, file
         assert not [name for name in imports(file) if "rigid_body" in name], file
+
+
+def test_every_room_says_what_lives_there() -> None:
+    entries = [file for file in FILES if file.name == "__init__.py"]
+    assert len(entries) >= len(ROOMS_IN_ORDER) - 1  # errors is a file
+    assert [str(file) for file in entries if not ast.get_docstring(ast.parse(file.read_text("utf-8")))] == []
 
 
 def test_no_file_is_longer_than_400_lines() -> None:

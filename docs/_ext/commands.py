@@ -1,4 +1,7 @@
-"""The directive `commands`: what `impactopt NAME --help` prints, a section a command."""
+"""The directive `commands`: what `impactopt NAME --help` prints, a section a command.
+
+Its arguments are the commands that are left out.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ class Commands(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         root: Any = get_command(cli)
         sections: list[nodes.Node] = []
-        for name in self.arguments or sorted(root.commands):
+        for name in sorted(set(root.commands) - set(self.arguments)):
             command = root.commands[name]
             section = nodes.section(ids=[f"impactopt-{name}"])
             section += nodes.title("", "", nodes.literal("", f"impactopt {name}"))

@@ -119,7 +119,7 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
-    The rest: :class:`Solved`.
+    Its other attributes are those of :class:`Solved`.
     """
 
     plan: Plan

@@ -44,7 +44,7 @@ class StrikeSolution(Solved):
     """A solved (or stopped) strike.
 
     strike : posture and velocity at contact, and the blow; for a status that is not usable, of the best
-    iterate.  The rest: :class:`impactopt.planning.solution.Solved`.
+    iterate.  Its other attributes are those of :class:`impactopt.planning.solution.Solved`.
     """
 
     strike: PlannedStrike
@@ -105,9 +105,8 @@ def optimize_strike(
 
     Raises
     ------
-    InputError : an unknown method, solver or option; a problem that the method has no slopes
-        of, a start of the wrong length, several of a given start, a problem with objectives of a whole
-        motion only.
+    InputError : an unknown method, solver or option; a start of the wrong length; `starts` beside a given
+        start; objectives of a whole motion only; with "shooting", a quantity that it has no derivatives of.
     """
     if method not in METHODS:
         raise InputError(

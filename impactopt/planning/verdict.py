@@ -74,12 +74,12 @@ def _too_stiff(t: ContactProgram) -> str:
 
 def _told(found: Parting, limit: float) -> str:
     words = (
-        f"one contact is not enough: at {limit:.2g} m/s, as fast as the joints can be, bodies as heavy as "
-        f"striker and target part {1e3 * found.time:.2g} ms after they touch, before the target's "
-        f"{found.event!r}"
+        f"one contact is not enough: even at {limit:.2g} m/s, the most that the joints allow, point masses "
+        f"as heavy as striker and target separate {1e3 * found.time:.2g} ms after they touch, before the "
+        f"target's {found.event!r}"
     )
     if found.needed is not None:
-        words += f", which takes {found.needed:.2g} m/s"
+        words += f"; {found.needed:.2g} m/s would be enough"
     if found.stiffness is not None:
         words += f"; a contact stiffness of {found.stiffness:.1g} would do"
     return words
@@ -91,6 +91,7 @@ def _too_long(t: ContactProgram) -> str:
     if not isinstance(t.expected, Collision) or t.expected.natural <= longest:
         return ""
     return (
-        f"this contact is soft: between bodies as heavy as striker and target one phase of it takes "
-        f"{1e3 * t.expected.natural:.2g} ms, and `[collision] duration_s` has {1e3 * longest:.2g} ms at most"
+        f"this contact is soft: between point masses as heavy as striker and target one phase of it takes "
+        f"{1e3 * t.expected.natural:.2g} ms, and `[collision] duration_s` allows {1e3 * longest:.2g} ms at "
+        "most"
     )

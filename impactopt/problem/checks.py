@@ -14,17 +14,27 @@ from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_number, check_whole, did_you_mean
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.held import Held
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.terms import Term
 from impactopt.robots.robot import Robot
 
-__all__ = ["COLLISIONS", "INSTANT", "check_apart", "check_at_rest", "check_collision", "check_names"]
+__all__ = [
+    "COLLISIONS",
+    "INSTANT",
+    "check_apart",
+    "check_at_rest",
+    "check_collision",
+    "check_moves",
+    "check_names",
+]
 
 # models of the collision, cheapest first; those of no duration; "auto": the cheapest that is good enough
 INSTANT = ("rigid", "virtual-mass")
 COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
 MOST_FREEZES = 64
 MANY = 100  # scenarios or obstacles
+STUCK = 1e-12  # mobility along the normal over the largest in any direction, that is none
 
 
 def check_apart(kind: str, names: Sequence[str]) -> None:
@@ -52,6 +62,18 @@ def check_at_rest(
             f"the start posture cannot be held at rest: its centre of mass is {-1e3 * inside:.0f} mm "
             f"outside the support polygon of {', '.join(soles)}; start from a posture with its weight on "
             "what is held, or hold more"
+        )
+
+
+def check_moves(problem: Any) -> None:
+    """InputError if no joint moves the striking point along the normal where it meets the target."""
+    c, n = problem.coordinates, problem.normal
+    striker = problem.robot.striker(problem.striker).model_frame
+    mobility = Held.at(c.model, problem.contact_posture, [s.frame for s in c.soles], striker).inverse_mass()
+    if n @ mobility @ n <= STUCK * np.linalg.norm(mobility):
+        raise InputError(
+            f"no joint of {problem.robot.name!r} moves {problem.striker!r} along the normal "
+            f"{np.round(n, 6).tolist()} at the point: turn the normal, move the point, or take another robot"
         )
 
 

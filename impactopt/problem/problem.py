@@ -36,6 +36,7 @@ from impactopt.problem.checks import (
     check_apart,
     check_at_rest,
     check_collision,
+    check_moves,
     check_names,
 )
 from impactopt.problem.hashing import problem_hash
@@ -155,8 +156,8 @@ class ImpactProblem:
             for term in self.terms:
                 found.attempt(partial(check_names, self.robot, term))
         found.attempt(self._check_objectives)
-        if hits and aimed and stands and termed:
-            found.attempt(lambda: self.contact_posture)
+        if hits and aimed and stands and termed and found.attempt(lambda: self.contact_posture):
+            found.attempt(partial(check_moves, self))
         found.raise_if_any("the problem")
 
     def _check_aim(self) -> None:

@@ -1,0 +1,12 @@
+"""From a problem to a nonlinear program (variables, rows, blocks), and from its solution back to a `Plan`.
+
+* transcription.py, strike.py    the programs of a whole motion and of the blow alone: which parts they have
+* swing.py, follow.py, hit.py    parts; builder.py: what each of them takes
+* layout.py, rows.py             the variables and rows that parts add
+* blocks.py, contact_blocks.py   the nonlinear functions
+* structured.py                  the program that a solver gets
+* plan.py                        the plan
+
+A new term or objective needs no change here (`problem/`). A part that all programs share, such as another
+model of the contact, begins here.
+"""

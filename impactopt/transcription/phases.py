@@ -8,17 +8,15 @@ from impactopt.problem.problem import ImpactProblem
 # of the shortest compression that each of the two may last which an event makes of it, and the first of them
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
-OF_NATURAL, LEAST = (
-    0.15,
-    2e-3,
-)  # of a phase without a shortest time: share of the natural one, and [s] at most
+# of a phase without a shortest time: share of the natural one, [s] at most, and share of the longest time
+OF_NATURAL, LEAST, HALF = 0.15, 2e-3, 0.5
 
 
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     """How long [s] each phase of the contact lasts at least; ``natural``: its last one, of a point mass."""
-    target, shortest = problem.target, problem.contact_duration[0]
+    target, (shortest, longest) = problem.target, problem.contact_duration
     if not shortest:  # no bound: far below what a blow takes, as rows are over these times
-        shortest = min(OF_NATURAL * natural, LEAST)
+        shortest = min(OF_NATURAL * natural, LEAST, HALF * longest)
     shares = [SHARE if target.guards else 1.0] * (len(target.phases) - 1) + [1.0]
     if target.at_once:
         shares[0] = AT_ONCE

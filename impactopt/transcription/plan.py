@@ -108,13 +108,19 @@ class PlannedScenario:
 class Plan:
     """A planned impact motion.
 
-    swing, follow : splines in the independent coordinates; compression, restitution [s].
-    swing_nodes (k,), swing_wrench (k, 6 a sole): where on [0, 1] the program had nodes, and the wrenches
-    there, in each sole's frame [N, N m]; follow_nodes, follow_wrench likewise. The reference that coasts
-    through the collision keeps the swing's last wrench. hand_speed [m/s] along the normal at contact; impulse
-    [N s] to the target. scenarios: what is predicted of other targets, in the problem's order; a missing one
-    is not hit, so it is not among them. abort, abort_wrench: the abort motion, as follow, for a blow that
-    hits nothing; None if the problem does not ask for it.
+    Attributes
+    ----------
+    problem : what it was planned for.
+    swing, follow : splines in the independent coordinates, from start to contact and from there to rest.
+    compression, restitution : [s] durations of the contact's phases.
+    swing_nodes, follow_nodes : (k,) places of the program's nodes, fractions of each spline from 0 to 1.
+    swing_wrench, follow_wrench : (k, 6 a sole) wrenches at these nodes, in each sole's frame [N, N m]. In
+        contact the reference keeps the last one of the swing.
+    collision : what is predicted of the contact.
+    hand_speed : [m/s] along the normal, at contact.
+    impulse : [N s] to the target.
+    scenarios : what is predicted of other targets, in the problem's order, without those that are missing.
+    abort, abort_wrench : the abort motion, as `follow` and `follow_wrench`; None if the problem has none.
     """
 
     problem: ImpactProblem

@@ -1,4 +1,4 @@
-"""The ladder of collision models, from the point mass to several freezes; held hands, matrices of gains."""
+"""The hierarchy of collision models, from point mass to several freezes; held hands, matrices of gains."""
 
 import dataclasses
 

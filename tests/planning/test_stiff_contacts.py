@@ -72,6 +72,14 @@ def test_a_contact_too_soft_for_its_time_is_named(stiffness: float) -> None:
     assert "Rows that cannot be met: " in solution.result.message
 
 
+def test_a_time_far_too_short_for_its_contact_is_named() -> None:
+    """Shorter than the least that a phase is given where no shortest time is asked for."""
+    solution = solve(dataclasses.replace(load_problem("arm_planar"), contact_duration=(0.0, 5e-5)))
+    assert solution.status is Status.INFEASIBLE
+    assert "contact is soft" in solution.result.message
+    assert "0.05 ms at most" in solution.result.message
+
+
 def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
     """The hammer is off again long before the board has bent as far as it takes to break."""
     solution = solve(with_stiffness("chop_arm", 1e7, ratio=False))

@@ -15,6 +15,7 @@ from impactopt.codegen import cache as codegen
 from impactopt.contact.laws import ContactLaw, SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
+from impactopt.files.problem_file import load_problem
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole
 from impactopt.planning.planner import solve
 from impactopt.problem.problem import ImpactProblem, Phase
@@ -140,6 +141,12 @@ def test_a_fixed_base_holds_no_soles() -> None:
 
 
 # ---- bad input, one clear error each
+
+
+def test_a_normal_along_which_no_joint_moves_is_refused() -> None:
+    """A planar arm has none across its plane: there its mass would be infinite."""
+    with pytest.raises(InputError, match=r"no joint.*'hammer'.*\[0.0, 1.0, 0.0\].*turn the normal"):
+        dataclasses.replace(load_problem("arm_planar"), normal=[0.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize(

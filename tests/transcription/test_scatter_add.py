@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from impactopt.transcription import runs
+from impactopt.transcription import scatter_add
 from impactopt.transcription.scatter_add import Runs, count_up, union, with_transposed
 
 seeds = st.integers(0, 2**31)
@@ -26,7 +26,7 @@ def test_runs_add_what_they_say(seed: int, compiled: bool) -> None:
             expected[p + i] += f * entries[e + i]
     with pytest.MonkeyPatch.context() as patch:
         if not compiled:
-            patch.setattr(runs, "_library", lambda: None)
+            patch.setattr(scatter_add, "_library", lambda: None)
         Runs.make(entry, place, length, factor, (places, entries.size)).add_to(out, entries)
     np.testing.assert_allclose(out, expected, atol=1e-12)
 
@@ -37,7 +37,7 @@ def test_a_matrix_and_its_transpose(seed: int, compiled: bool) -> None:
     across = np.arange(16, dtype=np.int32).reshape(4, 4).T.ravel()
     with pytest.MonkeyPatch.context() as patch:
         if not compiled:
-            patch.setattr(runs, "_library", lambda: None)
+            patch.setattr(scatter_add, "_library", lambda: None)
         both = with_transposed(matrix.ravel(), across)
     np.testing.assert_array_equal(both.reshape(4, 4), matrix + matrix.T)
 

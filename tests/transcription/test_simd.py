@@ -18,7 +18,7 @@ from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import find_compiler
 from impactopt.codegen.library import NativeCode
 from impactopt.errors import NoCompilerWarning
-from impactopt.transcription import lanes
+from impactopt.transcription import simd
 from impactopt.transcription.batched import BatchedFunction
 from impactopt.transcription.simd import LANES, in_lanes
 from impactopt.transcription.start import first_iterate
@@ -65,7 +65,7 @@ def every_operation() -> Any:
 def test_every_operation_gives_in_lanes_what_it_gives_alone(
     cache: Path, monkeypatch: pytest.MonkeyPatch, part: int, count: int
 ) -> None:
-    monkeypatch.setattr(lanes, "_PART", part)
+    monkeypatch.setattr(simd, "_PART", part)
     functions = derivative_functions("all", *every_operation())
     found, rng = compiled(*functions, count=count), np.random.default_rng(0)
     for plain in functions:
@@ -119,7 +119,7 @@ def test_any_count_of_instances_fills_whole_calls(cache: Path, count: int) -> No
 def test_the_operations_above_are_all() -> None:
     functions = derivative_functions("all", *every_operation())
     kinds = {f.instruction_id(k) for f in functions for k in range(f.n_instructions())}
-    assert kinds >= {*lanes._OF_VECTORS, *lanes._IN_EACH_LANE} - {ca.OP_ASSIGN}
+    assert kinds >= {*simd._OF_VECTORS, *simd._IN_EACH_LANE} - {ca.OP_ASSIGN}
 
 
 def test_an_unknown_operation_stays_out_of_lanes() -> None:

@@ -30,8 +30,8 @@ class CustomLaw(ContactLaw):
     write ``casadi.fmax`` and ``casadi.if_else`` in the place of ``max`` and ``if``. They have to agree where
     the rate is zero. A force below zero is cut, and so is one while apart.
 
-    A force that is not smooth at zero, as x**1.5, which has no curvature there and is no number below, goes
-    on along its tangent below 1e-6 m: plans search there.
+    A plan's search passes through penetrations below zero. There x**1.5 is no number, and at zero it has no
+    curvature. Such a force is continued along its tangent below 1e-6 m.
 
     >>> law = CustomLaw(
     ...     compression=lambda x, rate, stiffness, hardening, damping: (

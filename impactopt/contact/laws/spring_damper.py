@@ -16,9 +16,9 @@ __all__ = ["SpringDamper"]
 class SpringDamper(ContactLaw):
     """A spring, and a damper that acts in compression only.
 
-    f = k x + d dx/dt while compressing, f = k x in restitution (paper, figs. 1 and 9). That the damper acts
-    in compression only is not written in the paper, but it is what its Table III needs: with it all nine
-    impulses come out to the printed digit, with a Kelvin-Voigt element none does.
+    f = k x + d dx/dt while compressing, f = k x in restitution (paper, figs. 1 and 9). The paper does
+    not say that the damper acts in compression only. Its Table III does: with such a damper all nine
+    impulses come out to the printed digit, with a Kelvin-Voigt element none.
     """
 
     word: ClassVar[str] = "spring damper"

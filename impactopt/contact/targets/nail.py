@@ -21,8 +21,8 @@ class Nail(Target):
     The resistance is R = resistance + hardening (depth + z), where z is how far this blow has driven the
     nail. m dv/dt = f - R while the nail moves (v > 0) or is pushed harder than the wood holds (f > R).
     Otherwise it stands still. It never comes back. The state is (v, z). Its result is `depth` [m]: how far
-    the blow drives it until it stops, with the way that it coasts after separation. The next blow of a
-    series begins at this nail's `depth` plus that.
+    the blow drives it until it stops, the distance that it coasts after separation included. The next blow of
+    a series begins at this nail's `depth` plus that.
 
     Kind of model: Tsujita et al., "Analysis of nailing task motion for a humanoid robot", IROS 2008,
     1570-1575 (the paper's [10]).

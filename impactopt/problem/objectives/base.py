@@ -26,11 +26,7 @@ class Objective(Described):
     An objective has :meth:`quantity`, and :meth:`blocks` if that is not linear; ``whole_motion`` and
     ``needs_torques`` are as in :class:`impactopt.problem.terms.Term`.
 
-    weight [N s a unit] : value of one unit of the quantity; for a cost, its price.
-
-    Raises
-    ------
-    InputError : a weight that is zero or not finite; a negative one of a cost.
+    A weight is not zero; that of a cost is its price, and positive.
     """
 
     name: ClassVar[str] = ""

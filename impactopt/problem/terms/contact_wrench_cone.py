@@ -13,9 +13,9 @@ from impactopt.problem.terms.base import Term
 class ContactWrenchCone(Term):
     """Each sole's wrench lies in the cone of its corners: centre of pressure, friction and torsion.
 
-    Source: Caron et al. 2015, see :mod:`impactopt.kinematics.wrench_cone`. There are no terms for friction or
-    the centre of pressure alone: this cone bounds them foot by foot, and yaw torsion with them, which shrinks
-    where they are used up.
+    Source: Caron et al. 2015, see :mod:`impactopt.kinematics.wrench_cone`. The cone bounds friction, centre
+    of pressure and yaw torsion of each sole together: where friction or pressure use it up, less torsion is
+    left. So there are no terms for one of them alone.
     """
 
     name: ClassVar[str] = "contact wrench cone"

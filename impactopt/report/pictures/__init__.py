@@ -1,5 +1,5 @@
 """Pictures of a record: force, ZMP, torque, poses and joint motion, planned beside simulated; the fist's
-effective mass, the solver's way, soles in a replay.
+effective mass, the solver's iterations, soles in a replay.
 
 One picture a file, all in the style of `style.py`. `hierarchy.py` and `pareto.py` draw what is in no record:
 collision models beside each other.

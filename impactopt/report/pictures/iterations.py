@@ -21,7 +21,7 @@ def iterations(record: Record) -> Picture | None:
         return None
     figure = Picture(COLUMN, 3.6)
     draw_iterations(figure, record)
-    figure.suptitle(title(record, "the solver's way"))
+    figure.suptitle(title(record, "the solver's iterations"))
     return figure
 
 

@@ -19,7 +19,7 @@ GREY = "#999999"
 
 @styled
 def strobe(record: Record) -> Picture:
-    """The robot as sticks at a few instants, and the way of its striking point."""
+    """The robot as sticks at a few instants, and the path of its striking point."""
     figure = Picture(PAGE, strobe_height(record) + 0.2)
     draw_strobe(figure, record)
     figure.suptitle(title(record, f"seen from {_view(record)[1]}"))
@@ -71,7 +71,7 @@ def _key(alone: bool) -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=BLUE, linewidth=1.8, label="limb that strikes"),
         *others,
-        Line2D([], [], color=VERMILION, linewidth=0.8, label="way of the striking point"),
+        Line2D([], [], color=VERMILION, linewidth=0.8, label="path of the striking point"),
         Patch(facecolor="#dddddd", edgecolor=GREY, label="target before the blow"),
     ]
 

@@ -30,7 +30,7 @@ from impactopt.report import animation_of, bodies_page, report_of
 from impactopt.report.pack import unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
-from impactopt.report.visuals import visuals_of
+from impactopt.bodies.visuals import visuals_of
 from impactopt.robots.presets import load_robot
 
 NASTY = '# a problem <script>alert("no")</script> & more\n'

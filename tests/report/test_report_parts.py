@@ -27,7 +27,7 @@ from impactopt.report.pack import pack, unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
-from impactopt.report.visuals import visuals_of
+from impactopt.bodies.visuals import visuals_of
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 

@@ -15,7 +15,7 @@ from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
-from impactopt.simulation.solids import FLOOR, Solid
+from impactopt.simulation.solids import FLOOR
 
 Array = NDArray[np.float64]
 FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is

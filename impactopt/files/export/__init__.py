@@ -85,6 +85,7 @@ def export_planned(
 def _format(to: str) -> Format:
     if to not in FORMATS:
         raise InputError(
-            f"there is no format {to!r} to export to{did_you_mean(to, FORMATS)}: there are {', '.join(FORMATS)}"
+            f"there is no format {to!r} to export to{did_you_mean(to, FORMATS)}: "
+            f"there are {', '.join(FORMATS)}"
         )
     return FORMATS[to]

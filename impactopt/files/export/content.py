@@ -1,4 +1,4 @@
-"""What leaves the house: a plan's motions, the robot's servo, the target, and all of it in words and numbers."""
+"""What is exported: a plan's motions, the robot's servo, the target, and all that is no history in words."""
 
 from __future__ import annotations
 

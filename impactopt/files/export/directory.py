@@ -1,4 +1,4 @@
-"""A directory of exported files: it appears whole, takes the place of an older export, and of nothing else."""
+"""A directory of exported files: it appears whole, takes an older export's place, and nothing else's."""
 
 from __future__ import annotations
 

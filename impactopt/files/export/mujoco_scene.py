@@ -55,8 +55,8 @@ def write(export: Export, directory: Path) -> None:
     p = export.problem
     if type(p.law) not in LAWS or type(p.target) not in (FreeMass, RigidWall, Nail, Board):
         raise InputError(
-            f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; the scenes "
-            "know the laws and targets of problem files. Export to csv, and give MuJoCo the law yourself"
+            f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
+            "know the laws and targets of problem files: export to csv instead"
         )
     mujoco, step = mujoco_module(), _step(export)
     with no_log_file():

@@ -56,7 +56,7 @@ BOARD = """\
         model.joint("target").stiffness = model.joint("target").damping = 0.0
 """
 BASE = """\
-print(f"the root link ends {data.qpos[2]:.3f} m high, the reference's {ref[of + 'base_position'][-1, 2]:.3f} m")
+print(f"root link at the end: {data.qpos[2]:.3f} m high, planned {ref[of + 'base_position'][-1, 2]:.3f} m")
 """
 
 

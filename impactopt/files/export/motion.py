@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -77,6 +78,7 @@ def motion_at(
     jumps : the reference's jumps are among the instants, from both sides, the later ones `JUMP` later;
         else there is a frame at every multiple of 1 / rate, and none elsewhere.
     """
+    reference = _ending(reference)
     grid = frames(reference.end, rate)
     grid = grid if not jumps else np.append(grid[grid < reference.end - JUMP], reference.end)
     edges = (reference.contact_start, reference.contact_end)
@@ -113,6 +115,18 @@ def motion_at(
         contact_end=edges[1],
         end=reference.end,
     )
+
+
+def _ending(reference: Trajectory) -> Trajectory:
+    """With an instant at its end, where it is at rest: a curve through those about it would not be."""
+    fields = {f.name: getattr(reference, f.name) for f in dataclasses.fields(reference)}
+    histories = {name: value for name, value in fields.items() if np.ndim(value)}
+    before = int(np.searchsorted(reference.time, reference.end - JUMP))
+    if before < len(reference.time):
+        kept = {name: np.concatenate([x[:before], x[-1:], x[-1:]]) for name, x in histories.items()}
+        kept["time"][-2:] = reference.end, max(reference.time[-1], reference.end + JUMP)
+        histories = kept
+    return dataclasses.replace(reference, **histories)
 
 
 def _curves(reference: Trajectory, robot: Robot) -> tuple[Array, Array, Array]:

@@ -165,10 +165,20 @@ def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
     spec.worldbody.add_light(
         pos=[0.0, 0.0, 4.0], dir=[0.0, 0.0, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     )
+    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
+    spec.add_texture(
+        name="sky",
+        type=texture.mjTEXTURE_SKYBOX,
+        builtin=builtin.mjBUILTIN_GRADIENT,
+        rgb1=[1.0, 1.0, 1.0],
+        rgb2=[0.85, 0.9, 0.95],
+        width=64,
+        height=384,
+    )
     spec.add_texture(
         name="grid",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        type=texture.mjTEXTURE_2D,
+        builtin=builtin.mjBUILTIN_CHECKER,
         rgb1=[0.82, 0.84, 0.86],
         rgb2=[0.75, 0.77, 0.80],
         width=200,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from impactopt.cli.collide import collide
+from impactopt.cli.compare import compare
 from impactopt.cli.drive import drive
 from impactopt.cli.export import export
 from impactopt.cli.files import check, new, problems, robots
@@ -186,6 +187,12 @@ app.command(
     )
 )(validate)
 app.command(epilog=examples("impactopt show results/punch --open", "impactopt show talos --open"))(show)
+app.command(
+    epilog=examples(
+        "impactopt compare results/punch results/punch_robust",
+        "impactopt compare results/a results/b results/c --out results/compared --json",
+    )
+)(compare)
 app.command(
     epilog=examples(
         "impactopt export results/punch --to csv",

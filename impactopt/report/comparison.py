@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.files.output import Record, plain
@@ -22,6 +23,7 @@ from impactopt.simulation.result import centre_of_pressure
 
 __all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
 
+Array = NDArray[np.float64]
 MOST = 5  # results: the page has a line's style for each of so many
 STYLES = ("planned", "simulated", "free", "one", "two")
 NOT_SET = "-"
@@ -30,6 +32,7 @@ NUMBERS = (
     *("duration_s", "zmp_margin_m", "torque_ratio", "clearance_mm", "max_violation"),
     *("solver", "iterations", "solve_seconds", "collision_model"),
 )
+REPLAYS = ("simulated", "replayed")
 
 
 @dataclass(frozen=True)
@@ -56,9 +59,10 @@ class Comparison:
         """As in `impactopt compare --json`."""
         results = []
         for name, record in self.records.items():
-            s = record.summary
-            replays = {key: s[key] for key in ("simulated", "replayed") if key in s}
-            results.append({"name": name, **{key: s.get(key) for key in NUMBERS}, **replays})
+            row: dict[str, Any] = {"name": name}
+            row |= {key: record.summary.get(key) for key in NUMBERS}
+            row |= {key: record.summary[key] for key in REPLAYS if key in record.summary}
+            results.append(row)
 
         def told(differences: Sequence[Difference]) -> dict[str, dict[str, str]]:
             return {d.key: dict(zip(self.records, d.values, strict=True)) for d in differences}
@@ -173,11 +177,11 @@ def _differences(flat: Sequence[Mapping[str, str]]) -> tuple[Difference, ...]:
     return tuple(row for row in rows if len(set(row.values)) > 1)
 
 
-def histories_of(record: Record) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def histories_of(record: Record) -> dict[str, tuple[Array, Array]]:
     """Time since contact [s] and values, of what a record has: `force` [N], `margin` of the ZMP [mm], `ratio`
     of the largest torque to its limit.
     """
-    a, found = record.arrays, {}
+    a, found = record.arrays, dict[str, tuple[Array, Array]]()
     if not record.completed:
         return found
     start = float(a["reference_contact_start"])

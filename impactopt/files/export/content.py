@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt import __version__
-from impactopt.contact.fields import abouts, snake_case
+from impactopt.contact.fields import abouts
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.files.export.motion import JUMP, Motion, motion_at
 from impactopt.files.output import Record, plain
@@ -192,10 +194,9 @@ def _check_finished(record: Record) -> None:
             )
 
 
-def _numbers(thing: Any) -> dict[str, Any]:
-    """The numbers of a law or a target, by name and unit as in problem files."""
-    if not dataclasses.is_dataclass(thing):
-        given: Mapping[str, float] = thing.parameters  # of a law without a class of its own
-        return dict(given)
-    keys = {field.name: told.key_of(field.name) for field, told in abouts(type(thing))}
-    return {keys.get(name, snake_case(name)): value for name, value in thing.parameters.items()}
+def _numbers(thing: ContactLaw | Target) -> dict[str, float]:
+    """The numbers of a law or a target, by the names and units that problem files have for them."""
+    kind: Any = type(thing)
+    known = dataclasses.is_dataclass(kind)  # a law of one's own may be none
+    keys = {field.name: told.key_of(field.name) for field, told in (abouts(kind) if known else ())}
+    return {keys.get(name, name): value for name, value in thing.parameters.items()}

@@ -30,7 +30,8 @@ def write(export: Export, directory: Path) -> None:
 def _columns(export: Export, motion: Motion) -> dict[str, Array]:
     """Values (k,) by what stands above them."""
     inside = (motion.phase == 1).astype(float)
-    out: dict[str, Array] = {"time [s]": motion.time, "phase": motion.phase, "contact": inside}
+    phase = motion.phase.astype(float)
+    out: dict[str, Array] = {"time [s]": motion.time, "phase": phase, "contact": inside}
     kinds = [joint["kind"] == "prismatic" for joint in export.meta()["joints"]]
     for what, values, turning, sliding in (
         ("position", motion.position, "rad", "m"),

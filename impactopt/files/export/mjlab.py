@@ -6,14 +6,18 @@ Frames are 1 / fps apart: the reference's jumps stand between two of them.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impactopt.files.export.content import Export, body_name
 from impactopt.files.export.motion import Motion, motion_at
 
 __all__ = ["write"]
+
+Array = NDArray[np.float64]
 
 
 def write(export: Export, directory: Path) -> None:
@@ -25,7 +29,7 @@ def write(export: Export, directory: Path) -> None:
             np.savez(directory / f"{name}.npz", **_arrays(export, even))
 
 
-def _arrays(export: Export, motion: Motion) -> dict[str, np.ndarray]:
+def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
     """What a MotionLoader reads, and beside it the names of its columns.
 
     The bodies are the root link and the link of each joint, in the order of the joints.
@@ -55,7 +59,7 @@ def _arrays(export: Export, motion: Motion) -> dict[str, np.ndarray]:
     }
 
 
-def _state(export: Export, motion: Motion, k: int) -> tuple[np.ndarray, np.ndarray]:
+def _state(export: Export, motion: Motion, k: int) -> tuple[Array, Array]:
     """q (nq,) and v (nv,) of Pinocchio at a frame."""
     robot = export.robot
     q, v = pin.neutral(robot.model), np.zeros(robot.nv)

@@ -203,7 +203,12 @@ def _charts(records: Mapping[str, Record], arrays: dict[str, Any]) -> Iterator[d
     for which, title, unit, more in (
         ("force", "Force on the target", "force [N]", {"view": [-0.2e-3 * longest, 1.2e-3 * longest]}),
         ("margin", "ZMP margin", "margin [mm]", {"limits": [{"y": 0.0, "text": "edge"}]}),
-        ("ratio", "Torque demand over limit", "torque / limit", {"limits": [{"y": 1.0, "text": "limit"}]}),
+        (
+            "ratio",
+            "Torque demand over limit",
+            "torque / limit",
+            {"limits": [{"y": 1.0, "text": "limit"}], "include": [0.0, 1.0]},
+        ),
     ):
         series = []
         for k, (name, histories) in enumerate(zip(records, known, strict=True)):
@@ -229,19 +234,21 @@ def _body(comparison: Comparison, title: str) -> Iterator[str]:
     yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
     yield '<div id="trouble"></div>'
     rows = [(row.label, [(cell.text, cell.good) for cell in row.cells]) for row in comparison.rows]
-    yield _section("Numbers", names, rows)
+    yield _table(names, rows)
     yield '<h2>Planned histories</h2><div id="charts"></div>'
     for heading, differences in (
         ("Where the problems differ", comparison.problem),
         ("Where the versions differ", comparison.versions),
     ):
         rows = [(d.key, [(value, True) for value in d.values]) for d in differences]
-        yield _section(heading, names, rows) if rows else f"<h2>{heading}</h2><p>They do not.</p>"
+        yield f"<h2>{heading}</h2>"
+        yield _table(names, rows) if rows else "<p>They do not.</p>"
     yield "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network."
     yield "</main></footer>"
 
 
-def _section(heading: str, names: Sequence[str], rows: Sequence[tuple[str, list[tuple[str, bool]]]]) -> str:
+def _table(names: Sequence[str], rows: Sequence[tuple[str, list[tuple[str, bool]]]]) -> str:
+    """A column for each result; cells are text, and whether it is good."""
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
     lines = []
     for label, cells in rows:
@@ -251,4 +258,4 @@ def _section(heading: str, names: Sequence[str], rows: Sequence[tuple[str, list[
         )
         lines.append(f'<tr><th scope="row">{escape(label)}</th>{told}</tr>')
     table = f"<table><thead><tr><td></td>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
-    return f'<section class="card"><h3>{heading}</h3><div class="scroll" tabindex="0">{table}</div></section>'
+    return f'<section class="card"><div class="scroll" tabindex="0">{table}</div></section>'

@@ -259,6 +259,20 @@ def test_a_humanoids_base_and_zmp_are_told(still: Solution, tmp_path: Path) -> N
     assert not columns["force [N]"][~inside].any()
 
 
+def test_an_impact_without_duration_is_one_jump(still: Solution, tmp_path: Path) -> None:
+    hit = still.plan.collision
+    short = dataclasses.replace(
+        hit, **{name: getattr(hit, name)[:1] for name in ("time", "force", "target_speed", "torque")}
+    )
+    short = dataclasses.replace(short, ground=hit.ground[:0], sole_wrench=hit.sole_wrench[:0])
+    plan = dataclasses.replace(still.plan, compression=0.0, restitution=0.0, collision=short)
+    columns = read_csv(dataclasses.replace(still, plan=plan).export("csv", tmp_path / "csv")[1])
+    assert set(columns["phase"]) == {0.0, 2.0} and not columns["force [N]"].any()
+    steps = np.diff(columns["time [s]"])
+    assert (steps > 0).all() and (steps < 1.5e-6).sum() == 1
+    assert np.isfinite(table(columns, "zmp")[1]).all()
+
+
 def test_mujoco_plays_the_scene(arm: Solution, tmp_path: Path) -> None:
     directory = tmp_path / "scene"
     arm.export("mujoco", directory, joints=["elbow", "wrist", "shoulder"])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from impactopt.errors import InputError, did_you_mean
-from impactopt.files.export.content import export_of
+from impactopt.files.export.content import check_export, export_of
 from impactopt.files.export.directory import write_directory
 from impactopt.files.output import record_of
 from impactopt.files.replay import Planned
@@ -58,7 +58,9 @@ def export(
     InputError : an unknown format, a plan that is not finished, joints that are no order of the robot's, a
         directory with something else in it, a package that is missing. Nothing is written then.
     """
-    _format(to)  # before the record's numbers are computed
+    usual = _format(to).rate
+    # before the record's numbers are computed
+    check_export(solution.status.value, solution.problem.robot, usual if rate is None else rate, joints)
     record = record_of(solution)
     if not record.completed:
         raise InputError(f"there is no motion to export: {record.summary['note']}")

@@ -17,13 +17,13 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.files.export.motion import JUMP, Motion, motion_at
-from impactopt.files.output import Record, plain
+from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
 
-__all__ = ["Export", "body_name", "export_of", "joint_order"]
+__all__ = ["Export", "body_name", "check_export", "export_of", "joint_order"]
 
 Array = NDArray[np.float64]
 SLOWEST, FASTEST = 1.0, 1e5  # [Hz]
@@ -80,7 +80,7 @@ class Export:
                 "phases": list(PHASES),
                 "joints": self._joints(),
                 "base": None
-                if self.motion.base_position is None
+                if self.motion.base is None
                 else {"link": body_name(robot, 1), "quaternion": "w, x, y, z", "axes": "world"},
                 "contact_s": [self.motion.contact_start, self.motion.contact_end],
                 "end_s": self.motion.end,
@@ -133,12 +133,8 @@ def export_of(planned: Planned, *, rate: float, joints: Sequence[str] | None = N
     ------
     InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range.
     """
-    _check_finished(planned.record)
-    rate = check_number("rate [Hz]", rate)
-    if not SLOWEST <= rate <= FASTEST:
-        raise InputError(f"rate [Hz]: {rate:g}; give a number from {SLOWEST:g} to {FASTEST:g}")
     robot = planned.problem.robot
-    order = joint_order(robot, joints)
+    order = check_export(planned.record.summary.get("status"), robot, rate, joints)
     missed = planned.missed
     return Export(
         planned=planned,
@@ -148,6 +144,20 @@ def export_of(planned: Planned, *, rate: float, joints: Sequence[str] | None = N
         motion=motion_at(planned.reference, robot, rate, order, planned.record.arrays),
         missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
     )
+
+
+def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:
+    """The joints' order, if a plan of this status can be exported so; InputError as of `export_of`."""
+    unusable = {s.value: s.message for s in Status if not s.usable}
+    if status in unusable:
+        raise InputError(
+            f"this plan is not finished ({status}), and a robot should not follow it: {unusable[status]} "
+            "Solve the problem first"
+        )
+    rate = check_number("rate [Hz]", rate)
+    if not SLOWEST <= rate <= FASTEST:
+        raise InputError(f"rate [Hz]: {rate:g}; give a number from {SLOWEST:g} to {FASTEST:g}")
+    return joint_order(robot, joints)
 
 
 def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
@@ -181,17 +191,6 @@ def body_name(robot: Robot, joint: int) -> str:
         if frame.type == pin.FrameType.BODY and frame.parentJoint == joint and frame.name != "universe":
             return str(frame.name)
     return str(robot.model.names[joint])
-
-
-def _check_finished(record: Record) -> None:
-    if record.completed:
-        status = record.summary.get("status")
-        unusable = {s.value: s.message for s in Status if not s.usable}
-        if status in unusable:
-            raise InputError(
-                f"this plan is not finished ({status}), and a robot should not follow it: {unusable[status]} "
-                "Solve the problem first"
-            )
 
 
 def _numbers(thing: ContactLaw | Target) -> dict[str, float]:

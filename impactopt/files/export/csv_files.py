@@ -41,14 +41,12 @@ def _columns(export: Export, motion: Motion) -> dict[str, Array]:
     ):
         for name, slides, column in zip(export.joints, kinds, values.T, strict=True):
             out[f"{what} {name} [{sliding if slides else turning}]"] = column
-    if motion.base_position is not None:
-        assert motion.base_quaternion is not None
-        assert motion.base_linear is not None and motion.base_angular is not None
+    if (base := motion.base) is not None:
         for what, values, axes, unit in (
-            ("base position", motion.base_position, "xyz", " [m]"),
-            ("base quaternion", motion.base_quaternion, "wxyz", ""),
-            ("base linear velocity", motion.base_linear, "xyz", " [m/s]"),
-            ("base angular velocity", motion.base_angular, "xyz", " [rad/s]"),
+            ("base position", base.position, "xyz", " [m]"),
+            ("base quaternion", base.quaternion, "wxyz", ""),
+            ("base linear velocity", base.linear, "xyz", " [m/s]"),
+            ("base angular velocity", base.angular, "xyz", " [rad/s]"),
         ):
             out |= {f"{what} {axis}{unit}": column for axis, column in zip(axes, values.T, strict=True)}
     out["force [N]"] = motion.force

@@ -124,13 +124,11 @@ def _messages(export: Export, motion: Motion, k: int) -> Iterator[tuple[str, str
     if motion.zmp is not None:
         point = _vector([*motion.zmp[k], 0.0])
         yield "/zmp", "geometry_msgs/msg/PointStamped", {"header": header, "point": point}
-    if motion.base_position is not None:
-        assert motion.base_quaternion is not None
-        assert motion.base_linear is not None and motion.base_angular is not None
-        turn = dict(zip("wxyz", motion.base_quaternion[k].tolist(), strict=True))
-        pose = {"position": _vector(motion.base_position[k]), "orientation": turn}
+    if (base := motion.base) is not None:
+        turn = dict(zip("wxyz", base.quaternion[k].tolist(), strict=True))
+        pose = {"position": _vector(base.position[k]), "orientation": turn}
         yield "/base_pose", "geometry_msgs/msg/PoseStamped", {"header": header, "pose": pose}
-        twist = {"linear": _vector(motion.base_linear[k]), "angular": _vector(motion.base_angular[k])}
+        twist = {"linear": _vector(base.linear[k]), "angular": _vector(base.angular[k])}
         yield "/base_twist", "geometry_msgs/msg/TwistStamped", {"header": header, "twist": twist}
 
 

@@ -68,10 +68,8 @@ def _state(export: Export, motion: Motion, k: int) -> tuple[Array, Array]:
         joint, angle = own[at], motion.position[k, column]
         q[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(angle), np.sin(angle)) if joint.nq == 2 else angle
         v[joint.idx_v] = motion.velocity[k, column]
-    if motion.base_position is not None:
-        assert motion.base_quaternion is not None
-        assert motion.base_linear is not None and motion.base_angular is not None
-        q[:3], q[3:7] = motion.base_position[k], motion.base_quaternion[k, [1, 2, 3, 0]]
+    if (base := motion.base) is not None:
+        q[:3], q[3:7] = base.position[k], base.quaternion[k, [1, 2, 3, 0]]
         turned = pin.Quaternion(q[3:7]).toRotationMatrix().T
-        v[:3], v[3:6] = turned @ motion.base_linear[k], turned @ motion.base_angular[k]
+        v[:3], v[3:6] = turned @ base.linear[k], turned @ base.angular[k]
     return q, v

@@ -15,11 +15,24 @@ from impactopt.kinematics.support import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["JUMP", "Motion", "frames", "motion_at"]
+__all__ = ["JUMP", "Base", "Motion", "motion_at"]
 
 Array = NDArray[np.float64]
 JUMP = 1e-6  # [s] by which the later one of two rows at a jump is told later
 CONTACT = 1  # phase
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Base:
+    """The robot's root link at k instants, its origin and axes, in the world's axes.
+
+    position (k, 3) [m]; quaternion (k, 4) : w, x, y, z; linear (k, 3) [m/s]; angular (k, 3) [rad/s].
+    """
+
+    position: Array
+    quaternion: Array
+    linear: Array
+    angular: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,8 +42,7 @@ class Motion:
     time (k,) [s], strictly ascending.  phase (k,) : 0 swing, 1 contact, 2 follow-through.
     position, velocity, acceleration, effort (k, n) : of the joints; effort is the feed-forward. In SI units
     of revolute joints; of a prismatic joint m, m/s, m/s2, N.
-    base_position (k, 3) [m], base_quaternion (k, 4) w, x, y, z, base_linear (k, 3) [m/s], base_angular (k, 3)
-    [rad/s] : of the origin of the robot's root link, in the world's axes; None of a robot on a fixed base.
+    base : None of a robot on a fixed base.
     force (k,) [N] on the target, along its normal; zero outside of contact.  zmp (k, 2) [m], or None
     without soles; nan where nothing is known of it.
     contact_start, contact_end, end [s].
@@ -42,10 +54,7 @@ class Motion:
     velocity: Array
     acceleration: Array
     effort: Array
-    base_position: Array | None
-    base_quaternion: Array | None
-    base_linear: Array | None
-    base_angular: Array | None
+    base: Base | None
     force: Array
     zmp: Array | None
     contact_start: float
@@ -53,7 +62,7 @@ class Motion:
     end: float
 
 
-def frames(end: float, rate: float) -> Array:
+def _frames(end: float, rate: float) -> Array:
     """Instants 1 / rate [Hz] apart from 0 to the last one before `end` [s], and one more that is at rest."""
     return np.arange(int(np.ceil(end * rate - 1e-9)) + 1) / rate
 
@@ -79,7 +88,7 @@ def motion_at(
         else there is a frame at every multiple of 1 / rate, and none elsewhere.
     """
     reference = _ending(reference)
-    grid = frames(reference.end, rate)
+    grid = _frames(reference.end, rate)
     grid = grid if not jumps else np.append(grid[grid < reference.end - JUMP], reference.end)
     edges = (reference.contact_start, reference.contact_end)
     curves = _curves(reference, robot)
@@ -108,7 +117,7 @@ def motion_at(
         velocity=whole["velocity"][:, joint][:, order],
         acceleration=whole["acceleration"][:, joint][:, order],
         effort=whole["effort"][:, order],
-        **_base(whole, robot),
+        base=_base(whole) if robot.floating else None,
         force=whole["force"],
         zmp=whole["zmp"] if soles else None,
         contact_start=edges[0],
@@ -191,19 +200,20 @@ def _phase(
     }
 
 
-def _base(whole: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
-    """Pose and twist of the root link, or Nones."""
-    names = ("base_position", "base_quaternion", "base_linear", "base_angular")
-    if not robot.floating:
-        return dict.fromkeys(names)
-    quaternion, rate = whole["position"][:, 3:7], whole["velocity"][:, 3:7]
+def _base(whole: Mapping[str, Any]) -> Base:
+    position, rate = whole["position"], whole["velocity"]
+    quaternion, turning = position[:, 3:7], rate[:, 3:7]
     size = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    # the spin in the link's axes is twice the vector of conj(quaternion) x rate
+    # the spin in the link's axes is twice the vector of conj(quaternion) x its rate
     w, vector = quaternion[:, :1], quaternion[:, 1:]
-    spin = 2 * (w * rate[:, 1:] - rate[:, :1] * vector - np.cross(vector, rate[:, 1:])) / size**2
+    spin = 2 * (w * turning[:, 1:] - turning[:, :1] * vector - np.cross(vector, turning[:, 1:])) / size**2
     quaternion = quaternion / size
-    values = (whole["position"][:, :3], quaternion, whole["velocity"][:, :3], _turned(quaternion, spin))
-    return dict(zip(names, values, strict=True))
+    return Base(
+        position=position[:, :3],
+        quaternion=quaternion,
+        linear=rate[:, :3],
+        angular=_turned(quaternion, spin),
+    )
 
 
 def _product(quaternion: Array, vector: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from impactopt.bodies.visuals import visuals_of
 from impactopt.contact.targets import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
 from impactopt.files.export.content import Export
+from impactopt.files.export.motion import Motion
 from impactopt.files.export.player import LAWS, player
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.mujoco_world import (
@@ -218,12 +220,10 @@ def _add_keyframes(spec: Any, export: Export) -> None:
         for column, joint in enumerate(export.joints):
             qpos[model.joint(joint).qposadr[0]] = motion.position[k, column]
             qvel[model.joint(joint).dofadr[0]] = motion.velocity[k, column]
-        if motion.base_position is not None:
-            assert motion.base_quaternion is not None
-            assert motion.base_linear is not None and motion.base_angular is not None
-            qpos[:3], qpos[3:7] = motion.base_position[k], motion.base_quaternion[k]
-            turned = pin.Quaternion(*motion.base_quaternion[k]).toRotationMatrix()
-            qvel[:3], qvel[3:6] = motion.base_linear[k], turned.T @ motion.base_angular[k]
+        if (base := motion.base) is not None:
+            qpos[:3], qpos[3:7] = base.position[k], base.quaternion[k]
+            turned = pin.Quaternion(*base.quaternion[k]).toRotationMatrix()
+            qvel[:3], qvel[3:6] = base.linear[k], turned.T @ base.angular[k]
         spec.add_key(name=name, qpos=qpos, qvel=qvel, time=float(motion.time[k]))
 
 
@@ -241,10 +241,11 @@ def _reference(export: Export) -> dict[str, Any]:
     return out
 
 
-def _histories(motion: Any) -> Iterator[tuple[str, Array]]:
-    for name in ("time", "phase", "position", "velocity", "acceleration", "effort", "force", "zmp"):
-        if motion is not None and getattr(motion, name) is not None:
+def _histories(motion: Motion | None) -> Iterator[tuple[str, Array]]:
+    names = ("time", "phase", "position", "velocity", "acceleration", "effort", "force", "zmp")
+    for name in names if motion is not None else ():
+        if getattr(motion, name) is not None:
             yield name, getattr(motion, name)
-    for name in ("base_position", "base_quaternion", "base_linear", "base_angular"):
-        if motion is not None and getattr(motion, name) is not None:
-            yield name, getattr(motion, name)
+    if motion is not None and motion.base is not None:
+        for field in dataclasses.fields(motion.base):
+            yield f"base_{field.name}", getattr(motion.base, field.name)

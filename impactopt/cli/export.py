@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Settings
+from impactopt.cli.options import AsJson
 from impactopt.report.plain_errors import plain_errors
 
 # what is done with the files where they go, said when they are written
@@ -55,7 +55,6 @@ def export(
             metavar="A,B,C", help="Order of the joints, each of the robot's once (default: the robot's own)."
         ),
     ] = None,
-    settings: Settings = None,
     problem: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
     ] = None,
@@ -71,13 +70,12 @@ def export(
     with plain_errors("interrupted before the files were written"):
         from impactopt.errors import printable
         from impactopt.files.export import export_planned
-        from impactopt.files.problem_file import parse_settings
         from impactopt.files.replay import load_planned
 
-        planned = load_planned(result, problem_file=problem, settings=parse_settings(settings or ()))
+        planned = load_planned(result, problem_file=problem)
         folder = result if result.is_dir() else result.parent
-        usual = Path(f"{folder.resolve().name}_{to.value}")
-        directory = out if out is not None else folder.parent / usual
+        beside = folder.parent if folder.name.strip(".") else folder.resolve().parent  # not in "."
+        directory = out if out is not None else beside / f"{folder.resolve().name}_{to.value}"
         names = None if joints is None else [name.strip() for name in joints.split(",")]
         written = export_planned(planned, to.value, directory, rate=rate, joints=names)
         if as_json:

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from support.fake_solution import still_solution, strike_record
@@ -228,6 +229,10 @@ def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
     impulse = np.trapezoid(force, 1e-9 * time, axis=0)
     np.testing.assert_allclose(impulse, arm.impulse * arm.problem.normal, atol=0.02 * arm.impulse)
     assert {m.data for _, m in messages["/phase"]} == {0, 1, 2} and "/zmp" not in messages
+    with open(path, "rb") as file:
+        (attached,) = make_reader(file).iter_attachments()
+    assert attached.name == "meta.json"
+    assert json.loads(attached.data)["contact_s"] == [arm.plan.contact_start, arm.plan.contact_end]
 
 
 def read_mcap(path: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -316,7 +321,7 @@ def test_every_law_and_target_plays(planned: Planned, law: Any, target: Any, tmp
         scene_of(problem),
         step=5e-5,
         settle=0.0,
-        until=planned.reference.end,
+        until=planned.reference.contact_end + 0.2,
     )
     assert play(tmp_path / "scene")[0] == pytest.approx(fine.impulse, rel=NEAR)
 
@@ -523,12 +528,14 @@ def test_a_missing_package_says_how_to_get_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
     with pytest.raises(InputError, match=r"pip install 'impactopt\[mcap\]'"):
-        export_planned(planned, "mcap", tmp_path / "out")
+        export_planned(planned, "mcap", tmp_path / "some" / "where" / "out")
     assert list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- the command
-def test_the_command_writes_and_lists_files(planned: Planned, tmp_path: Path) -> None:
+def test_the_command_writes_and_lists_files(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = problem_file("arm_planar")
     text = path.read_text(encoding="utf-8")
     save_record(dataclasses.replace(planned.record, problem=text, problem_path=path), tmp_path / "arm")
@@ -542,6 +549,9 @@ def test_the_command_writes_and_lists_files(planned: Planned, tmp_path: Path) ->
         app, ["export", str(tmp_path / "arm"), "--to", "mujoco", "--out", str(tmp_path / "m")]
     )
     assert (tmp_path / "m" / "play.py").read_text() in done.stdout
+    monkeypatch.chdir(tmp_path / "arm")
+    done = runner.invoke(app, ["export", ".", "--to", "mjlab", "--json"])
+    assert json.loads(done.stdout)["directory"] == str(tmp_path / "arm_mjlab")
     done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "csv", "--joints", "a,b"])
     assert done.exit_code == 2 and done.stderr.count("error:") == 1 and "'a'" in done.stderr
 

@@ -38,6 +38,7 @@ def write_directory(
     new, old = (
         directory.with_name(f".{directory.name[:64]}.{secrets.token_hex(8)}.{x}") for x in ("new", "old")
     )
+    above = [folder for folder in directory.parents if not folder.exists()]  # the nearest first
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
         new.mkdir()
@@ -48,13 +49,16 @@ def write_directory(
         if directory.exists():
             directory.rename(old)
         new.rename(directory)
-    except OSError as error:
-        if old.exists():
-            with contextlib.suppress(OSError):
-                old.rename(directory)
-        raise InputError(f"cannot write {directory}: {error.strerror or error}; give another one") from error
-    finally:
+    except BaseException as error:
         shutil.rmtree(new, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            if old.exists() and not directory.exists():
+                old.rename(directory)
+            for folder in above:
+                folder.rmdir()
+        if not isinstance(error, OSError):
+            raise
+        raise InputError(f"cannot write {directory}: {error.strerror or error}; give another one") from error
     shutil.rmtree(old, ignore_errors=True)
     return [directory / name for name in whole["files"]]
 

@@ -164,9 +164,7 @@ def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
         if k != GROUND and not (solid.core or (solid.of_target and solid.moves)):
             shape = primitive(mujoco, solid)
             spec.worldbody.add_geom(name=f"{solid.name} {k}", rgba=OTHER, **shape, **_seen_only())
-    spec.worldbody.add_light(
-        pos=[0.0, 0.0, 4.0], dir=[0.0, 0.0, -1.0], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    )
+    spec.worldbody.add_light(pos=[1.0, -2.0, 5.0], dir=[-0.2, 0.4, -1.0], castshadow=True)
     texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.add_texture(
         name="sky",

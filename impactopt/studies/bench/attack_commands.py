@@ -54,7 +54,7 @@ _LINES = (
     "export RESULT --to csv --rate 100 --out exported",
     "export RESULT --to ros2 --joints wrist,elbow,shoulder --json",
     "export RESULT --to mcap --problem FILE",
-    "export RESULT --to mujoco --set contact.damping=50",
+    "export RESULT --to mujoco --out exported",
     "export RESULT --to mjlab --json",
     "compare RESULT ../../../result --out compared",
     "compare RESULT ../../../result --json",

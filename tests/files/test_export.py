@@ -348,6 +348,17 @@ def test_a_law_of_ones_own_has_no_scene(planned: Planned, tmp_path: Path) -> Non
     assert [p.name for p in tmp_path.iterdir()] == ["csv"]
 
 
+def test_a_scene_that_mujoco_refuses_is_said(planned: Planned, tmp_path: Path) -> None:
+    robot = planned.problem.robot
+    model = robot.model.copy()
+    model.names[1] = "target"  # as the scene's own joint
+    other = dataclasses.replace(robot, model=model)
+    problem = dataclasses.replace(planned.problem, robot=other)
+    with pytest.raises(InputError, match="MuJoCo refuses the scene"):
+        export_planned(dataclasses.replace(planned, problem=problem), "mujoco", tmp_path / "scene")
+    assert list(tmp_path.iterdir()) == []
+
+
 def frames_in_mujoco(robot: Robot, problem: ImpactProblem, motion: Any) -> list[dict[str, Array]]:
     """Places and velocities of the file's bodies at some frames, by MuJoCo's kinematics of its joints."""
     model = build_world(robot, scene_of(problem), Perturbation(), MujocoOptions())

@@ -60,21 +60,29 @@ def write(export: Export, directory: Path) -> None:
             f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
             "know the laws and targets of problem files: export to csv instead"
         )
-    mujoco, step = mujoco_module(), _step(export)
-    with no_log_file():
-        spec, bodies = robot_on_floor(
-            p.robot, p.robot.striker(p.striker).model_frame, Perturbation(), MujocoOptions(step=step)
-        )
-        spec.modelname, spec.meshdir = p.name or p.robot.name, MESHES
-        _draw_robot(mujoco, spec, bodies, export, directory / MESHES)
-        _add_target(mujoco, spec, p, step)
-        _add_world(mujoco, spec, p)
-        _add_actuators(mujoco, spec, export)
-        _add_keyframes(spec, export)
-        (directory / SCENE).write_text(spec.to_xml(), encoding="utf-8")
-        mujoco.MjModel.from_xml_path(str(directory / SCENE))  # what is written can be read
+    try:
+        with no_log_file():
+            _write_scene(export, directory)
+    except ValueError as error:  # of MuJoCo's compiler
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"MuJoCo refuses the scene of {p.name or p.robot.name!r}: {error}") from error
     np.savez(directory / REFERENCE, **_reference(export))
     (directory / PLAYER).write_text(player(p), encoding="utf-8")
+
+
+def _write_scene(export: Export, directory: Path) -> None:
+    p, mujoco, step = export.problem, mujoco_module(), _step(export)
+    striker = p.robot.striker(p.striker).model_frame
+    spec, bodies = robot_on_floor(p.robot, striker, Perturbation(), MujocoOptions(step=step))
+    spec.modelname, spec.meshdir = p.name or p.robot.name, MESHES
+    _draw_robot(mujoco, spec, bodies, export, directory / MESHES)
+    _add_target(mujoco, spec, p, step)
+    _add_world(mujoco, spec, p)
+    _add_actuators(mujoco, spec, export)
+    _add_keyframes(spec, export)
+    (directory / SCENE).write_text(spec.to_xml(), encoding="utf-8")
+    mujoco.MjModel.from_xml_path(str(directory / SCENE))  # what is written can be read
 
 
 def _step(export: Export) -> float:

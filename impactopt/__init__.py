@@ -49,6 +49,7 @@ _EXPORTS = {
     "draw_perturbations": "simulation.robustness",
     "drive_nail": "planning.nail_driving",
     "effective_mass": "collision",
+    "export": "files.export",
     "g1": "robots.presets",
     "holding_torque": "kinematics.held",
     "load_problem": "files.problem_file",

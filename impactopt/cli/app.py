@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from impactopt.cli.collide import collide
+from impactopt.cli.compare import compare
 from impactopt.cli.drive import drive
+from impactopt.cli.export import export
 from impactopt.cli.files import check, new, problems, robots
 from impactopt.cli.options import (
     NOT_SOLVED,
@@ -185,6 +187,19 @@ app.command(
     )
 )(validate)
 app.command(epilog=examples("impactopt show results/punch --open", "impactopt show talos --open"))(show)
+app.command(
+    epilog=examples(
+        "impactopt compare results/punch results/punch_robust",
+        "impactopt compare results/a results/b results/c --out results/compared --json",
+    )
+)(compare)
+app.command(
+    epilog=examples(
+        "impactopt export results/punch --to csv",
+        "impactopt export results/punch --to ros2 --rate 200 --out goals",
+        "impactopt export results/punch --to mujoco",
+    )
+)(export)
 app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
 app.command(
     epilog=examples(

@@ -315,6 +315,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
             arrays = {name: file[name] for name in file.files}
         summary = json.loads(str(arrays.pop("summary_json")))
         problem = str(arrays.pop("problem_toml"))
+        problem.encode().decode()  # a damaged array may hold characters that there are not
         near = str(arrays.pop("problem_path", ""))
         del arrays["format"]
         check_summary(summary, whole="joints" in arrays)

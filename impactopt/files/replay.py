@@ -71,7 +71,9 @@ def load_planned(
     """
     record = load_record(result)
     if not record.completed:
-        note = record.summary.get("note", "the solve was stopped before there was one")
+        strike = "strike_posture" in record.arrays
+        usual = "it is a strike, the blow alone" if strike else "the solve was stopped before there was one"
+        note = record.summary.get("note", usual)
         raise InputError(f"{result} holds no motion to replay: {note}")
     problem = _problem(record, Path(result), problem_file, settings)
     a, robot = record.arrays, problem.robot

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -217,6 +217,22 @@ class Solution(Solved):
         from impactopt import plot
 
         return plot(self, what, simulation=simulation, replay=replay)
+
+    def export(
+        self,
+        to: str,
+        directory: str | PathLike[str],
+        *,
+        rate: float | None = None,
+        joints: Sequence[str] | None = None,
+    ) -> list[Path]:
+        """Write the plan for other programs: ``solution.export("csv", "results/csv")``; the files.
+
+        to, directory, rate, joints : as of :func:`impactopt.export`.
+        """
+        from impactopt import export
+
+        return [Path(path) for path in export(self, to, directory, rate=rate, joints=joints)]
 
     def clearance(self) -> dict[str, Any]:
         """How far bodies are apart in the plan, and what touches what, by exact geometry at 1 ms: the keys

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from impactopt.files.output import Record
 from impactopt.kinematics.support import margin
 from impactopt.problem.problem import ImpactProblem
+from impactopt.report.histories import at_contact, ground_wrenches, planned_torque
 from impactopt.report.thinning import BUCKETS, thinned
 from impactopt.report.tracks import planned_hand_speed
 from impactopt.simulation.result import centre_of_pressure
@@ -76,18 +77,10 @@ def _force(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any]
     for label, prefix, style in present:
         time, force = (a[f"{prefix}_time"], a.get(f"{prefix}_force"))
         if force is None:
-            time, force = _at_contact(record, a["collision_force"], 0.0)
+            time, force = at_contact(record, a["collision_force"], 0.0)
         series.append(_series(record, arrays, f"force_{style}", label, style, time, force))
     view = _close_up(record)
     return _chart("Force on the target", "force [N]", series, bands=_bands(record), view=view, include=[0.0])
-
-
-def _at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array, Array]:
-    """A history of the planned collision, and one value for all time before and after."""
-    a = record.arrays
-    start, end, last = (float(a[f"reference_{n}"]) for n in ("contact_start", "contact_end", "end"))
-    time = np.concatenate([[0.0, start], start + a["collision_time"], [end, last]])
-    return time, np.concatenate([[otherwise] * 2, values, [otherwise] * 2])
 
 
 def _speed(
@@ -102,7 +95,7 @@ def _speed(
         for label, prefix, style in present
         if prefix in known
     ]
-    time, speed = _at_contact(record, a["collision_target_speed"], np.nan)
+    time, speed = at_contact(record, a["collision_target_speed"], np.nan)
     series.append(_series(record, arrays, "speed_target", "target, planned", OTHERS[0], time, speed))
     start, end = _bands(record)[0]
     view = [max(0.0, start - 0.2), end + 0.2]
@@ -111,28 +104,12 @@ def _speed(
     )
 
 
-def _grounds(record: Record, prefix: str) -> tuple[Array, Array]:
-    """Time and the ground's wrench (k, 6) about the origin; in the planned collision that of its model."""
-    a = record.arrays
-    time = a[f"{prefix}_time"]
-    if prefix != "reference":
-        return time, a[f"{prefix}_sole_ground"].sum(axis=1)
-    keep, ground = a["reference_phase"] != 1, a["collision_ground"]
-    if not len(ground):
-        return time[keep], a["reference_ground"][keep]
-    inside = float(a["reference_contact_start"]) + a["collision_time"][-len(ground) :]
-    order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
-    return np.concatenate([time[keep], inside])[order], np.concatenate([a["reference_ground"][keep], ground])[
-        order
-    ]
-
-
 def _zmp_margin(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, Any] | None:
     if not len(record.arrays["polygon"]):
         return None
     series = []
     for label, prefix, style in present:
-        time, wrench = _grounds(record, prefix)
+        time, wrench = ground_wrenches(record, prefix)
         inside = 1e3 * margin(record.arrays["polygon"], centre_of_pressure(wrench))
         series.append(_series(record, arrays, f"margin_{style}", label, style, time, inside))
     note = "Distance of the zero-moment point from the support polygon's nearest edge; below 0 it is outside."
@@ -155,7 +132,7 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
         return None
     series = []
     for label, prefix, style in present:
-        time, wrench = _grounds(record, prefix)
+        time, wrench = ground_wrenches(record, prefix)
         t, x, y = thinned(time, *centre_of_pressure(wrench).T, whole=_close_up(record))
         points, name = np.column_stack([x, y]), f"zmp_{style}"
         arrays |= {name: points, f"{name}_time": t, f"{name}_margin": 1e3 * margin(polygon, points)}
@@ -180,15 +157,7 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
 def _torque(record: Record) -> list[tuple[str, str, Array, Array]]:
     """Label, style, time, torque (k, n) [N m] of the plan and of the simulation's demand."""
     a = record.arrays
-    time, torque, phase = a["reference_time"], a["reference_torque"], a["reference_phase"]
-    hit = a["collision_torque"]
-    if len(hit) == len(a["collision_time"]) and len(a["collision_ground"]):
-        keep = phase != 1
-        inside = float(a["reference_contact_start"]) + a["collision_time"]
-        order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
-        time = np.concatenate([time[keep], inside])[order]
-        torque = np.concatenate([torque[keep], hit])[order]
-    out = [("planned", "planned", time, torque)]
+    out = [("planned", "planned", *planned_torque(record))]
     if record.simulated:
         out.append(("simulated", "simulated", a["simulated_time"], a["simulated_demand"]))
     return out

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -24,9 +24,13 @@ from impactopt.report.result_rows import (
 )
 from impactopt.solvers.program import IterationRecord
 
+if TYPE_CHECKING:
+    from impactopt.report.comparison import Comparison
+
 __all__ = [
     "SolveConsole",
     "collision_table",
+    "comparison_tables",
     "multistart_table",
     "nail_driving_table",
     "replay_table",
@@ -127,6 +131,30 @@ def collision_table(found: Mapping[str, Any]) -> Table:
         table.add_column(name, justify="right")
     for row in collision_rows(found):
         _add(table, row)
+    return table
+
+
+def comparison_tables(found: Comparison) -> list[Table]:
+    """Numbers of results beside each other, and the keys in which their problems and versions differ."""
+    numbers = _beside("numbers", found.records)
+    for row in found.rows:
+        _add(numbers, row)
+    tables = [numbers]
+    for what, differences in (("problems", found.problem), ("versions", found.versions)):
+        if differences:
+            table = _beside(f"where the {what} differ", found.records)
+            for difference in differences:
+                table.add_row(_plain(difference.key), *map(_plain, difference.values))
+            tables.append(table)
+    return tables
+
+
+def _beside(title: str, names: Iterable[str]) -> Table:
+    """A table with a column for each result."""
+    table = Table(title=title, title_justify="left")
+    table.add_column("", overflow="fold")
+    for name in names:
+        table.add_column(_plain(name), justify="right", overflow="fold")
     return table
 
 

@@ -16,6 +16,8 @@ __all__ = [
     "replay_columns",
     "result_columns",
     "result_rows",
+    "target_rows",
+    "word_row",
 ]
 
 PHASES = ("swing", "collision", "follow")
@@ -66,7 +68,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("speed at contact [m/s]", "hand_speed_m_s", 3),
     ):
         yield number_row(label, [source.get(key) for source in sources], digits)
-    yield from _target_rows([source.get("target") or {} for source in sources])
+    yield from target_rows([source.get("target") or {} for source in sources])
     for label, key, digits, scale, least, most in (
         ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
         ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
@@ -84,7 +86,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
     yield from _model_rows(sources)
     stands = [None, *(source.get("standing") for source in sources[1:])]
-    yield _of_replays(_word_row("stands at the end", stands, no_is_bad=True))
+    yield _of_replays(word_row("stands at the end", stands, no_is_bad=True))
 
 
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:
@@ -107,14 +109,15 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
             ("joint speed / limit", "velocity_ratio", 2, 1.0, 0.0, 1.0),
         )
     ]
-    rows += _target_rows([source.get("target") or {} for source in sources])
+    rows += target_rows([source.get("target") or {} for source in sources])
     return [row for row in rows if row is not None]
 
 
-def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    """What the blows have brought their targets."""
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
-    yield _word_row("the board breaks", [target.get("broken") for target in targets])
+    yield word_row("the board breaks", [target.get("broken") for target in targets])
 
 
 def _model_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
@@ -148,7 +151,8 @@ def number_row(
     return Row(label, tuple(cells))
 
 
-def _word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> Row | None:
+def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> Row | None:
+    """Yes or no; None where no column has either."""
     if all(value is None for value in values):
         return None
     cells = [

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.solids import Solid, joined, simplified
 from impactopt.bodies.surroundings import surroundings_of
+from impactopt.bodies.visuals import Visual, visuals_of
 from impactopt.bodies.world import WorldBody
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
-from impactopt.report.visuals import Visual, visuals_of
 from impactopt.robots.robot import Robot
 
 __all__ = ["pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]

@@ -15,7 +15,7 @@ from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
-from impactopt.simulation.solids import FLOOR, Solid
+from impactopt.simulation.solids import FLOOR
 
 Array = NDArray[np.float64]
 FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
@@ -68,6 +68,19 @@ def build_world(
     <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
     The contact law between target and striker is the engine's business.
     """
+    spec, bodies = robot_on_floor(robot, scene.striker, perturbation, solver)
+    _solids(mujoco_module(), spec, bodies, scene, near)
+    return spec.compile()
+
+
+def robot_on_floor(
+    robot: Robot, striker: str, perturbation: Perturbation, solver: MujocoOptions
+) -> tuple[Any, list[Any]]:
+    """The world of :func:`build_world` before it is compiled, without target and solids; and its bodies, as
+    of :func:`robot_bodies`.
+
+    striker : frame of the model that hits.
+    """
     mujoco = mujoco_module()
     spec = spec_of(robot, solver)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -75,9 +88,7 @@ def build_world(
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
     _surface(floor, perturbation, sole=False)
-    bodies = _robot_bodies(mujoco, spec, robot, scene, perturbation)
-    _solids(mujoco, spec, bodies, scene, near)
-    return spec.compile()
+    return spec, _robot_bodies(mujoco, spec, robot, striker, perturbation)
 
 
 def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
@@ -110,7 +121,7 @@ def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Seque
             )
             shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": f"solid {k}"}
         else:
-            shape = _primitive(mujoco, solid)
+            shape = primitive(mujoco, solid)
         body.add_geom(name=f"solid {k}", contype=0, conaffinity=0, mass=0.0, **shape)
     for one, other in near:
         spec.add_pair(
@@ -123,7 +134,10 @@ def _solids(mujoco: Any, spec: Any, bodies: list[Any], scene: Scene, near: Seque
         )
 
 
-def _primitive(mujoco: Any, solid: Solid) -> dict[str, Any]:
+def primitive(mujoco: Any, solid: Any) -> dict[str, Any]:
+    """Shape and place of a geom that is a box, inflated: of a `Solid` without vertices, or of a body of the
+    world.
+    """
     half, radius = np.asarray(solid.half), solid.radius
     place = {"pos": solid.place, "quat": quaternion(solid.rotation)}
     if not radius:
@@ -134,7 +148,7 @@ def _primitive(mujoco: Any, solid: Solid) -> dict[str, Any]:
 
 
 def _robot_bodies(
-    mujoco: Any, spec: Any, robot: Robot, scene: Scene, perturbation: Perturbation
+    mujoco: Any, spec: Any, robot: Robot, striker: str, perturbation: Perturbation
 ) -> list[Any]:
     model = robot.model
     bodies = robot_bodies(mujoco, spec, robot)
@@ -150,7 +164,7 @@ def _robot_bodies(
                 mass=0.0,
             )
             _surface(sphere, perturbation, sole=True)
-    frame = model.frames[model.getFrameId(scene.striker)]
+    frame = model.frames[model.getFrameId(striker)]
     hand = bodies[frame.parentJoint]
     hand.add_site(name="striker", pos=frame.placement.translation)
     if perturbation.payload > 0:

@@ -155,6 +155,17 @@ def test_an_array_in_place_of_a_record_is_damaged(tmp_path: Path) -> None:
         load_record(tmp_path)
 
 
+def test_characters_that_there_are_not_are_damage(tmp_path: Path) -> None:
+    save_record(Record(summary={}, problem="[problem]"), tmp_path)
+    with np.load(tmp_path / "solution.npz") as file:
+        arrays = dict(file)
+    text = arrays["problem_toml"].reshape(1).view(np.uint32).copy()
+    text[3] = 0x7FFFFFFF
+    np.savez(tmp_path / "solution.npz", **{**arrays, "problem_toml": text.view("<U9")[0]})
+    with pytest.raises(InputError, match=r"solution\.npz is damaged"):
+        load_record(tmp_path)
+
+
 def test_a_damaged_record_is_never_read_as_another(tmp_path: Path) -> None:
     """Cut, or one byte changed: an InputError or, where nothing hangs on the byte, the same record."""
     small = Record(summary={"status": "solved"}, problem="text", arrays={"x": np.arange(5.0), "y": np.eye(2)})

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.bodies.shapes import Obstacle
 from impactopt.bodies.surroundings import surroundings_of
+from impactopt.bodies.visuals import visuals_of
 from impactopt.cli.app import app
 from impactopt.contact import Board, KelvinVoigt
 from impactopt.errors import InputError
@@ -30,7 +31,6 @@ from impactopt.report import animation_of, bodies_page, report_of
 from impactopt.report.pack import unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.tracks import tracks_of
-from impactopt.report.visuals import visuals_of
 from impactopt.robots.presets import load_robot
 
 NASTY = '# a problem <script>alert("no")</script> & more\n'

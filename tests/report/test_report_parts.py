@@ -17,6 +17,7 @@ from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
 from impactopt.bodies.surroundings import surroundings_of
+from impactopt.bodies.visuals import visuals_of
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, RigidWall
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
@@ -27,7 +28,6 @@ from impactopt.report.pack import pack, unpack
 from impactopt.report.stage import stage_of
 from impactopt.report.thinning import thinned
 from impactopt.report.tracks import FAR, tracks_of
-from impactopt.report.visuals import visuals_of
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 

@@ -49,7 +49,9 @@ ELSEWHERE = {
     "open",
     "python",
     "python3",
+    "ros2",
     "source",
+    "uv",
 }  # what the reader's machine has
 
 

@@ -51,6 +51,13 @@ _LINES = (
     "validate RESULT --engine pinocchio --missing --out replay --quiet",
     "validate RESULT --engine mujoco --mass 2 --settle 0.1 --step 0.001 --quiet",
     "validate RESULT --problem FILE --quiet",
+    "export RESULT --to csv --rate 100 --out exported",
+    "export RESULT --to ros2 --joints wrist,elbow,shoulder --json",
+    "export RESULT --to mcap --problem FILE",
+    "export RESULT --to mujoco --out exported",
+    "export RESULT --to mjlab --json",
+    "compare RESULT ../../../result --out compared",
+    "compare RESULT ../../../result --json",
     "solve FILE --time-limit 0",
     "solve missing.toml --starts 2 --seed 1",
     "strike missing.toml --starts 2",
@@ -70,6 +77,7 @@ _WORDS = (
     "contact.stiffness=[[[[1]]]]", "a.b.c.d=1", "problem.point.9=1", "[=", "x.toml", "folder", "pipe.toml",
     "empty.toml", "--model", "full", "--posture", "ready", "--freezes", "1000000", "--speed", "--step",
     "--settle", "--payload", "1e-12", "--missing", "--problem", "--engine", "../x.toml", "missing/x/y",
+    "--to", "--rate", "--joints", "shoulder,shoulder",
 )  # fmt: skip
 
 

@@ -1,0 +1,80 @@
+"""The command `impactopt compare`: results beside each other."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import AsJson
+from impactopt.report.plain_errors import plain_errors
+
+FILES = ("compare.json", "compare.png", "compare.html")
+
+
+def compare(
+    results: Annotated[
+        list[Path],
+        typer.Argument(metavar="A B [C...]", help="Directories that `impactopt solve` wrote; two to five."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help=f"Write {', '.join(FILES)} there."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare results: their numbers, where their problems and versions differ, their force, ZMP and torque.
+
+    Exit code: 0 compared, 2 bad input.
+    """
+    with plain_errors("interrupted before the results were compared"):
+        from impactopt.errors import printable
+        from impactopt.files.output import load_record, make_directory, write_file
+        from impactopt.report.comparison import compare as put_together
+
+        names = _names(results)
+        found = put_together({name: load_record(path) for name, path in zip(names, results, strict=True)})
+        text, written = json.dumps(found.describe(), indent=2), []
+        if out is not None:
+            from impactopt.report.pictures.compare import comparison_picture
+
+            picture, page = comparison_picture(found.records), found.page()
+            directory = make_directory(out)
+            written = [directory / name for name in FILES]
+            write_file(written[0], lambda file: file.write(f"{text}\n".encode()))
+            write_file(written[1], picture.write)
+            page.save(written[2])
+        if as_json:
+            typer.echo(text)
+            return
+        from rich.console import Console
+
+        from impactopt.report.console import comparison_tables
+
+        console = Console()
+        for table in comparison_tables(found):
+            console.print(table)
+        for path in written:
+            console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
+
+
+def _names(results: Sequence[Path]) -> list[str]:
+    """The directories' own names; as they were given where two have the same.
+
+    Raises
+    ------
+    InputError : a result is given twice.
+    """
+    from impactopt.errors import InputError
+
+    folders = [path.parent if path.name == "solution.npz" else path for path in results]
+    places = [os.path.realpath(folder) for folder in folders]
+    for path, place in zip(results, places, strict=True):
+        if places.count(place) > 1:
+            raise InputError(f"{path} is given twice; give different results")
+    names = [Path(place).name for place in places]
+    return names if len(set(names)) == len(names) else [str(folder) for folder in folders]

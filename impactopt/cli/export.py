@@ -1,0 +1,90 @@
+"""The command `impactopt export`: a saved plan as files for other programs."""
+
+from __future__ import annotations
+
+import enum
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import AsJson
+from impactopt.report.plain_errors import plain_errors
+
+# what is done with the files where they go, said when they are written
+NEXT = {
+    "ros2": "ros2 action send_goal --stdin /joint_trajectory_controller/follow_joint_trajectory "
+    "control_msgs/action/FollowJointTrajectory < {directory}/motion.yaml",
+    "mujoco": "python {directory}/play.py",
+}
+
+
+class Target(str, enum.Enum):
+    csv = "csv"
+    ros2 = "ros2"
+    mcap = "mcap"
+    mujoco = "mujoco"
+    mjlab = "mjlab"
+
+
+def export(
+    result: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
+        ),
+    ],
+    to: Annotated[
+        Target,
+        typer.Option(
+            help="csv: tables; ros2: goals for FollowJointTrajectory; mcap: ROS 2 messages; mujoco: a scene "
+            "and the lines that play it; mjlab: a motion for policies to track."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Where the files go (default: RESULT_FORMAT)."),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rows a second (default: 1000; mjlab: 50).")
+    ] = None,
+    joints: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,C", help="Order of the joints, each of the robot's once (default: the robot's own)."
+        ),
+    ] = None,
+    problem: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a plan for other programs: reference, feed-forward, gains, contact, abort motion.
+
+    What each format has and loses, and how to run it there: docs/howto/export.md. An earlier export to the
+    same format in DIR is replaced.
+
+    Exit code: 0 written, 2 bad input.
+    """
+    with plain_errors("interrupted before the files were written"):
+        from impactopt.errors import printable
+        from impactopt.files.export import export_planned
+        from impactopt.files.replay import load_planned
+
+        planned = load_planned(result, problem_file=problem)
+        folder = result if result.is_dir() else result.parent
+        beside = folder.parent if folder.name.strip(".") else folder.resolve().parent  # not in "."
+        directory = out if out is not None else beside / f"{folder.resolve().name}_{to.value}"
+        names = None if joints is None else [name.strip() for name in joints.split(",")]
+        written = export_planned(planned, to.value, directory, rate=rate, joints=names)
+        if as_json:
+            told = {"to": to.value, "directory": str(directory), "files": [str(path) for path in written]}
+            typer.echo(json.dumps(told, indent=2))
+            return
+        for path in written:
+            typer.echo(printable(str(path)))
+        if to is Target.mujoco:
+            typer.echo(f"\n{(directory / 'play.py').read_text(encoding='utf-8')}")
+        if to.value in NEXT:
+            typer.echo(printable(NEXT[to.value].format(directory=directory)))

@@ -1,0 +1,201 @@
+"""What is exported: a plan's motions, the robot's servo, the target, and all that is no history in words."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt import __version__
+from impactopt.contact.fields import abouts
+from impactopt.contact.laws import ContactLaw
+from impactopt.contact.targets import Target
+from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.files.export.motion import JUMP, Motion, motion_at
+from impactopt.files.output import plain
+from impactopt.files.replay import Planned
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.robot import Robot
+from impactopt.solvers.program import Status
+
+__all__ = ["Export", "body_name", "check_export", "export_of", "joint_order"]
+
+Array = NDArray[np.float64]
+SLOWEST, FASTEST = 1.0, 1e5  # [Hz]
+PHASES = ("swing", "contact", "follow-through")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Export:
+    """What all writers get.
+
+    planned : the plan, its problem and its references.  joints : names, in the order of all columns.
+    order (n,) : where these are in the robot's own arrays.  rate [Hz].
+    motion : as planned.  missed : if nothing is hit, on the same time axis; it leaves the other one where its
+    contact ends.  None where the plan has no abort motion.
+    """
+
+    planned: Planned
+    joints: tuple[str, ...]
+    order: NDArray[np.intp]
+    rate: float
+    motion: Motion
+    missed: Motion | None
+
+    @property
+    def problem(self) -> ImpactProblem:
+        return self.planned.problem
+
+    @property
+    def robot(self) -> Robot:
+        return self.planned.problem.robot
+
+    @property
+    def motions(self) -> dict[str, Motion]:
+        """By the names of their files."""
+        return {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
+
+    def per_joint(self, values: Array) -> Array:
+        """Numbers (n,) of the robot in the order of the export."""
+        return np.asarray(values)[self.order]
+
+    def meta(self) -> dict[str, Any]:
+        """All that is no history, for `meta.json`."""
+        p, robot, s = self.problem, self.robot, self.planned.record.summary
+        striker = robot.striker(p.striker)
+        frame = robot.model.frames[robot.model.getFrameId(striker.model_frame)]
+        blow = ("impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target")
+        return plain(
+            {
+                "problem": p.name,
+                "hash": p.hash,
+                "robot": robot.name,
+                "rate_Hz": self.rate,
+                "jump_s": JUMP,
+                "phases": list(PHASES),
+                "joints": self._joints(),
+                "base": None
+                if self.motion.base is None
+                else {"link": body_name(robot, 1), "quaternion": "w, x, y, z", "axes": "world"},
+                "contact_s": [self.motion.contact_start, self.motion.contact_end],
+                "end_s": self.motion.end,
+                "missed": None
+                if self.missed is None
+                else {"from_s": self.missed.contact_end, "end_s": self.missed.end},
+                "target": {
+                    "point_m": p.point,
+                    "normal": p.normal,
+                    "kind": p.target.word or type(p.target).__name__,
+                    **_numbers(p.target),
+                },
+                "contact_law": {"law": p.law.word or type(p.law).__name__, **_numbers(p.law)},
+                "striker": {
+                    "name": striker.name,
+                    "link": body_name(robot, int(frame.parentJoint)),
+                    "point_m": np.array(frame.placement.translation),
+                },
+                "expected": {name: s.get(name) for name in blow},
+                "support_polygon_m": self.planned.record.arrays["polygon"],
+                "versions": {**s.get("versions", {}), "export": __version__},
+            }
+        )
+
+    def _joints(self) -> list[dict[str, Any]]:
+        robot, moves = self.robot, list(self.robot.model.joints)[-self.robot.n :]
+        rows = []
+        for name, k in zip(self.joints, self.order, strict=True):
+            prismatic = "JointModelP" in moves[k].shortname()
+            rows.append(
+                {
+                    "name": name,
+                    "kind": "prismatic" if prismatic else "revolute",
+                    "kp": robot.kp[k],
+                    "kd": robot.kd[k],
+                    "effort_limit": robot.torque_limit[k],
+                    "velocity_limit": robot.velocity_limit[k],
+                    "position_limits": [robot.lower[k], robot.upper[k]],
+                }
+            )
+        return rows
+
+
+def export_of(planned: Planned, *, rate: float, joints: Sequence[str] | None = None) -> Export:
+    """A plan at a rate [Hz].
+
+    joints : their order in all columns; the robot's own if left out.
+
+    Raises
+    ------
+    InputError : the plan is not finished; joints that are no order of the robot's; a rate out of its range.
+    """
+    robot = planned.problem.robot
+    order = check_export(planned.record.summary.get("status"), robot, rate, joints)
+    missed = planned.missed
+    return Export(
+        planned=planned,
+        joints=tuple(robot.joint_names[k] for k in order),
+        order=order,
+        rate=rate,
+        motion=motion_at(planned.reference, robot, rate, order, planned.record.arrays),
+        missed=None if missed is None else motion_at(missed, robot, rate, order, {}),
+    )
+
+
+def check_export(status: Any, robot: Robot, rate: float, joints: Sequence[str] | None) -> NDArray[np.intp]:
+    """The joints' order, if a plan of this status can be exported so; InputError as of `export_of`."""
+    unusable = {s.value: s.message for s in Status if not s.usable}
+    if status in unusable:
+        raise InputError(
+            f"this plan is not finished ({status}), and a robot should not follow it: {unusable[status]} "
+            "Solve the problem first"
+        )
+    rate = check_number("rate [Hz]", rate)
+    if not SLOWEST <= rate <= FASTEST:
+        raise InputError(f"rate [Hz]: {rate:g}; give a number from {SLOWEST:g} to {FASTEST:g}")
+    return joint_order(robot, joints)
+
+
+def joint_order(robot: Robot, joints: Sequence[str] | None) -> NDArray[np.intp]:
+    """Where the joints of an export are in the robot's arrays.
+
+    Raises
+    ------
+    InputError : a name that the robot does not have, has twice here, or that is left out.
+    """
+    if joints is None:
+        return np.arange(robot.n)
+    own, given = robot.joint_names, list(joints)
+    for name in given:
+        if name not in own:
+            raise InputError(
+                f"joints: the robot {robot.name!r} has no joint {name!r}{did_you_mean(name, own)}; "
+                f"there are {', '.join(own)}"
+            )
+    for what, names in (
+        ("named twice", [name for name in own if given.count(name) > 1]),
+        ("left out", [name for name in own if name not in given]),
+    ):
+        if names:
+            raise InputError(f"joints: {', '.join(names)} {what}; give each of {robot.n} joints once")
+    return np.array([own.index(name) for name in given], dtype=np.intp)
+
+
+def body_name(robot: Robot, joint: int) -> str:
+    """The link that a joint of the model moves, as its URDF calls it; the world's of joint 0."""
+    for frame in robot.model.frames:
+        if frame.type == pin.FrameType.BODY and frame.parentJoint == joint and frame.name != "universe":
+            return str(frame.name)
+    return str(robot.model.names[joint])
+
+
+def _numbers(thing: ContactLaw | Target) -> dict[str, float]:
+    """The numbers of a law or a target, by the names and units that problem files have for them."""
+    kind: Any = type(thing)
+    known = dataclasses.is_dataclass(kind)  # a law of one's own may be none
+    keys = {field.name: told.key_of(field.name) for field, told in (abouts(kind) if known else ())}
+    return {keys.get(name, name): value for name, value in thing.parameters.items()}

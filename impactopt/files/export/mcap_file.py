@@ -1,0 +1,145 @@
+"""MCAP: the motion, the expected force and the ZMP as messages of ROS 2, for players, plots and bags.
+
+Both libraries are the format's own (Foxglove; MIT licence). They need no ROS.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impactopt.errors import InputError
+from impactopt.files.export.content import Export
+from impactopt.files.export.motion import Motion
+from impactopt.files.export.ros2 import stamp
+
+__all__ = ["write"]
+
+WORLD = "world"  # frame of all that has one
+_RULE = "=" * 80
+# as in ROS 2's own packages, without their comments
+_PARTS = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque",
+    "trajectory_msgs/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\n"
+    "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start",
+}
+_HEADER = ("builtin_interfaces/Time", "std_msgs/Header")
+_TYPES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "trajectory_msgs/msg/JointTrajectory": (
+        "std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points",
+        (*_HEADER, "builtin_interfaces/Duration", "trajectory_msgs/JointTrajectoryPoint"),
+    ),
+    "geometry_msgs/msg/WrenchStamped": (
+        "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
+        (*_HEADER, "geometry_msgs/Vector3", "geometry_msgs/Wrench"),
+    ),
+    "geometry_msgs/msg/PointStamped": (
+        "std_msgs/Header header\ngeometry_msgs/Point point",
+        (*_HEADER, "geometry_msgs/Point"),
+    ),
+    "geometry_msgs/msg/PoseStamped": (
+        "std_msgs/Header header\ngeometry_msgs/Pose pose",
+        (*_HEADER, "geometry_msgs/Point", "geometry_msgs/Quaternion", "geometry_msgs/Pose"),
+    ),
+    "geometry_msgs/msg/TwistStamped": (
+        "std_msgs/Header header\ngeometry_msgs/Twist twist",
+        (*_HEADER, "geometry_msgs/Vector3", "geometry_msgs/Twist"),
+    ),
+    "std_msgs/msg/UInt8": ("uint8 data", ()),
+}
+
+
+def write(export: Export, directory: Path) -> None:
+    """`motion.mcap`: topics /motion, /missed, /phase, /expected_force, /zmp, /base_pose and /base_twist.
+
+    meta.json is in it too, as an attachment.
+
+    Raises
+    ------
+    InputError : the extra `mcap` is not installed.
+    """
+    try:
+        from mcap_ros2.writer import Writer
+    except ImportError as error:
+        raise InputError(
+            "MCAP files need the package mcap-ros2-support; run: pip install 'impactopt[mcap]'"
+        ) from error
+    with open(directory / "motion.mcap", "wb") as file:
+        bag = Writer(file)
+        schemas = {name: bag.register_msgdef(name, _definition(name)) for name in _TYPES}
+        meta = json.dumps(export.meta(), indent=2, allow_nan=False)
+        bag.add_attachment(0, 0, "meta.json", "application/json", meta.encode())
+        for topic, motion in export.motions.items():
+            bag.write_message(
+                topic=f"/{topic}",
+                schema=schemas["trajectory_msgs/msg/JointTrajectory"],
+                message=_trajectory(export, motion),
+                log_time=0,
+            )
+        for k, time in enumerate(export.motion.time):
+            for topic, kind, message in _messages(export, export.motion, k):
+                log_time = round(1e9 * float(time))
+                bag.write_message(topic=topic, schema=schemas[kind], message=message, log_time=log_time)
+        bag.finish()
+
+
+def _definition(name: str) -> str:
+    own, parts = _TYPES[name]
+    return "\n".join([own, *(f"{_RULE}\nMSG: {part}\n{_PARTS[part]}" for part in parts)])
+
+
+def _trajectory(export: Export, motion: Motion) -> dict[str, Any]:
+    points = [
+        {
+            "positions": motion.position[k].tolist(),
+            "velocities": motion.velocity[k].tolist(),
+            "accelerations": motion.acceleration[k].tolist(),
+            "effort": motion.effort[k].tolist(),
+            "time_from_start": _time(time),
+        }
+        for k, time in enumerate(motion.time)
+    ]
+    return {"header": _header(0.0), "joint_names": list(export.joints), "points": points}
+
+
+def _messages(export: Export, motion: Motion, k: int) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Topic, type and message of what is told at each instant."""
+    header = _header(motion.time[k])
+    yield "/phase", "std_msgs/msg/UInt8", {"data": int(motion.phase[k])}
+    push = _vector(motion.force[k] * export.problem.normal)
+    wrench = {"force": push, "torque": _vector(np.zeros(3))}
+    yield "/expected_force", "geometry_msgs/msg/WrenchStamped", {"header": header, "wrench": wrench}
+    if motion.zmp is not None:
+        point = _vector([*motion.zmp[k], 0.0])
+        yield "/zmp", "geometry_msgs/msg/PointStamped", {"header": header, "point": point}
+    if (base := motion.base) is not None:
+        turn = dict(zip("wxyz", base.quaternion[k].tolist(), strict=True))
+        pose = {"position": _vector(base.position[k]), "orientation": turn}
+        yield "/base_pose", "geometry_msgs/msg/PoseStamped", {"header": header, "pose": pose}
+        twist = {"linear": _vector(base.linear[k]), "angular": _vector(base.angular[k])}
+        yield "/base_twist", "geometry_msgs/msg/TwistStamped", {"header": header, "twist": twist}
+
+
+def _header(time: float) -> dict[str, Any]:
+    return {"stamp": _time(time), "frame_id": WORLD}
+
+
+def _time(time: float) -> dict[str, int]:
+    sec, nanosec = stamp(float(time))
+    return {"sec": sec, "nanosec": nanosec}
+
+
+def _vector(values: Any) -> dict[str, float]:
+    return dict(zip("xyz", (float(x) for x in values), strict=True))

@@ -1,0 +1,75 @@
+"""mjlab (and BeyondMimic's whole_body_tracking): a motion for policies that track it, as one npz.
+
+Frames are 1 / fps apart: the reference's jumps stand between two of them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.files.export.content import Export, body_name
+from impactopt.files.export.motion import Motion, motion_at
+
+__all__ = ["write"]
+
+Array = NDArray[np.float64]
+
+
+def write(export: Export, directory: Path) -> None:
+    """`motion.npz`, and `missed.npz` of a plan with an abort motion."""
+    planned = export.planned
+    for name, reference in (("motion", planned.reference), ("missed", planned.missed)):
+        if reference is not None:
+            even = motion_at(reference, export.robot, export.rate, export.order, {}, jumps=False)
+            np.savez(directory / f"{name}.npz", **_arrays(export, even))
+
+
+def _arrays(export: Export, motion: Motion) -> dict[str, Any]:
+    """What a MotionLoader reads, and beside it the names of its columns.
+
+    The bodies are the root link and the link of each joint, in the order of the joints.
+    """
+    robot, model = export.robot, export.robot.model
+    data, n = model.createData(), len(motion.time)
+    joints = [1 if robot.floating else 0, *(model.getJointId(name) for name in export.joints)]
+    place, turn, linear, angular = (np.zeros((n, len(joints), size)) for size in (3, 4, 3, 3))
+    for k in range(n):
+        pin.forwardKinematics(model, data, *_state(export, motion, k))
+        for b, j in enumerate(joints):
+            place[k, b] = data.oMi[j].translation
+            turn[k, b] = pin.Quaternion(data.oMi[j].rotation).coeffs()[[3, 0, 1, 2]]
+            velocity = pin.getVelocity(model, data, j, pin.LOCAL_WORLD_ALIGNED)
+            linear[k, b], angular[k, b] = velocity.linear, velocity.angular
+    turn[1:] *= np.where(np.cumsum((turn[1:] * turn[:-1]).sum(-1) < 0, axis=0) % 2, -1.0, 1.0)[..., None]
+    return {
+        "fps": np.array([export.rate]),
+        "joint_pos": motion.position,
+        "joint_vel": motion.velocity,
+        "body_pos_w": place,
+        "body_quat_w": turn,
+        "body_lin_vel_w": linear,
+        "body_ang_vel_w": angular,
+        "joint_names": np.array(export.joints),
+        "body_names": np.array([body_name(robot, j) for j in joints]),
+    }
+
+
+def _state(export: Export, motion: Motion, k: int) -> tuple[Array, Array]:
+    """q (nq,) and v (nv,) of Pinocchio at a frame."""
+    robot = export.robot
+    q, v = pin.neutral(robot.model), np.zeros(robot.nv)
+    own = list(robot.model.joints)[-robot.n :]
+    for column, at in enumerate(export.order):
+        joint, angle = own[at], motion.position[k, column]
+        q[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(angle), np.sin(angle)) if joint.nq == 2 else angle
+        v[joint.idx_v] = motion.velocity[k, column]
+    if (base := motion.base) is not None:
+        q[:3], q[3:7] = base.position[k], base.quaternion[k, [1, 2, 3, 0]]
+        turned = pin.Quaternion(q[3:7]).toRotationMatrix().T
+        v[:3], v[3:6] = turned @ base.linear[k], turned @ base.angular[k]
+    return q, v

@@ -1,0 +1,257 @@
+"""MuJoCo: a scene with robot, floor and target, the reference beside it, and the lines that play it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from impactopt.bodies.clearance import GROUND
+from impactopt.bodies.shapes import face_axes
+from impactopt.bodies.solids import Solid, joined, simplified
+from impactopt.bodies.visuals import visuals_of
+from impactopt.contact.targets import Board, FreeMass, Nail, RigidWall
+from impactopt.errors import InputError
+from impactopt.files.export.content import Export
+from impactopt.files.export.motion import Motion
+from impactopt.files.export.player import LAWS, player
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.mujoco_world import (
+    MujocoOptions,
+    mujoco_module,
+    no_log_file,
+    primitive,
+    quaternion,
+    robot_on_floor,
+)
+from impactopt.simulation.perturbation import Perturbation
+
+__all__ = ["PLAYER", "write"]
+
+Array = NDArray[np.float64]
+SCENE, REFERENCE, PLAYER, MESHES = "scene.xml", "reference.npz", "play.py", "meshes"
+LONGEST, HAND = 2e-4, 1.0  # [s] of a step; [kg] of a hand, about, where the target is heavier
+TRIANGLES, CELL = 20_000, 0.004  # of a mesh, and the cells [m] that a finer one is simplified to
+WOOD, OTHER = (
+    (0.72, 0.55, 0.35, 1.0),
+    (0.6, 0.6, 0.65, 0.35),
+)  # colours of the target, and of what stands about
+
+
+def write(export: Export, directory: Path) -> None:
+    """`scene.xml` with its meshes, `reference.npz`, and `play.py`.
+
+    The joint ``target`` slides along the normal, and the actuator ``contact`` measures how deep the striking
+    point is in the target, and pulls both together or apart.
+
+    Raises
+    ------
+    InputError : MuJoCo is not installed; a law or a target without a formula here.
+    """
+    p = export.problem
+    if type(p.law) not in LAWS or type(p.target) not in (FreeMass, RigidWall, Nail, Board):
+        raise InputError(
+            f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
+            "know the laws and targets of problem files: export to csv instead"
+        )
+    try:
+        with no_log_file():
+            _write_scene(export, directory)
+    except ValueError as error:  # of MuJoCo's compiler
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"MuJoCo refuses the scene of {p.name or p.robot.name!r}: {error}") from error
+    np.savez(directory / REFERENCE, **_reference(export))
+    (directory / PLAYER).write_text(player(p), encoding="utf-8")
+
+
+def _write_scene(export: Export, directory: Path) -> None:
+    p, mujoco, step = export.problem, mujoco_module(), _step(export)
+    striker = p.robot.striker(p.striker).model_frame
+    spec, bodies = robot_on_floor(p.robot, striker, Perturbation(), MujocoOptions(step=step))
+    spec.modelname, spec.meshdir = p.name or p.robot.name, MESHES
+    _draw_robot(mujoco, spec, bodies, export, directory / MESHES)
+    _add_target(mujoco, spec, p, step)
+    _add_world(mujoco, spec, p)
+    _add_actuators(mujoco, spec, export)
+    _add_keyframes(spec, export)
+    (directory / SCENE).write_text(spec.to_xml(), encoding="utf-8")
+    mujoco.MjModel.from_xml_path(str(directory / SCENE))  # what is written can be read
+
+
+def _step(export: Export) -> float:
+    """[s] with which explicit steps follow the contact: a part of its fastest time."""
+    p, summary = export.problem, export.planned.record.summary
+    peak = float(summary.get("peak_force_N") or 1e3)
+
+    def force(depth: float, rate: float = 0.0) -> float:
+        return float(p.law.force(depth, rate))
+
+    depth = float(brentq(lambda x: force(x) - peak, 0.0, 10.0)) if force(10.0) > peak else 1e-3
+    stiffness = (force(1.01 * depth) - force(depth)) / (0.01 * depth)
+    damping = (force(depth, 1e-3) - force(depth)) / 1e-3
+    mass = min(HAND, p.target.parameters.get("mass", HAND))
+    fastest = (0.04 * np.sqrt(mass / max(stiffness, 1e-9)), 0.1 * mass / max(damping, 1e-9))
+    return float(f"{min(LONGEST, *fastest):.2g}")
+
+
+def _draw_robot(mujoco: Any, spec: Any, bodies: list[Any], export: Export, meshes: Path) -> None:
+    """Its visual shapes, one mesh for each joint and colour; they touch nothing and weigh nothing."""
+    groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
+    for visual in visuals_of(export.robot):
+        groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
+    meshes.mkdir()
+    for k, ((joint, colour), solids) in enumerate(groups.items()):
+        solid = joined(solids)
+        if len(solid.triangles) > TRIANGLES:
+            solid = simplified(solid, CELL)
+        name = f"{k:02d}"
+        _write_stl(meshes / f"{name}.stl", solid)
+        # of a shell: thin meshes have no volume
+        spec.add_mesh(name=name, file=f"{name}.stl", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+        bodies[joint].add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=[*colour, 1.0], **_seen_only()
+        )
+    spec.assets = {path.name: path.read_bytes() for path in meshes.iterdir()}
+
+
+def _write_stl(path: Path, solid: Solid) -> None:
+    """As binary STL."""
+    corners = solid.vertices[solid.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
+    table = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    table["normal"], table["corners"] = normal, corners
+    path.write_bytes(bytes(80) + np.uint32(len(table)).tobytes() + table.tobytes())
+
+
+def _seen_only() -> dict[str, Any]:
+    return {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": 2}
+
+
+def _add_target(mujoco: Any, spec: Any, p: ImpactProblem, step: float) -> None:
+    """A body whose z axis is the normal, with its face at the origin, on a slide joint if it moves."""
+    rows = face_axes(p.normal)  # normal, across, up
+    axes = np.column_stack([rows[1], rows[2], rows[0]])
+    body = spec.worldbody.add_body(name="target", pos=p.point, quat=quaternion(axes))
+    body.add_site(name="face")
+    target = p.target
+    if not isinstance(target, RigidWall):
+        body.gravcomp, body.explicitinertial, body.ipos = 1.0, True, np.zeros(3)
+        body.mass = float(target.parameters["mass"])
+        body.inertia = np.full(3, 1e-3 * body.mass)  # it does not turn
+        spring = (
+            {"stiffness": target.stiffness, "damping": target.damping} if isinstance(target, Board) else {}
+        )
+        joint = body.add_joint(
+            name="target", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0.0, 0.0, 1.0], **spring
+        )
+        if isinstance(target, Nail):
+            joint.frictionloss = target.resistance + target.hardening * target.depth
+            # as stiff as steps allow: a softer one creeps under forces that are below the resistance
+            joint.solref_friction = [2 * step, 1.0]
+            joint.solimp_friction = [0.999, 0.9999, 1e-3, 0.5, 2.0]
+    place = pin.SE3(axes, np.asarray(p.point)).inverse()
+    for solid in p.world:
+        if solid.of_target and solid.moves and not solid.core:
+            shape = primitive(mujoco, solid)
+            moved = place * pin.SE3(solid.rotation, solid.place)
+            shape |= {"pos": moved.translation, "quat": quaternion(moved.rotation)}
+            body.add_geom(name=solid.name, rgba=WOOD, **shape, **_seen_only())
+
+
+def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
+    """What holds the target and what stands about, light, and a grid on the floor."""
+    for k, solid in enumerate(p.world):
+        if k != GROUND and not (solid.core or (solid.of_target and solid.moves)):
+            shape = primitive(mujoco, solid)
+            spec.worldbody.add_geom(name=f"{solid.name} {k}", rgba=OTHER, **shape, **_seen_only())
+    spec.worldbody.add_light(pos=[1.0, -2.0, 5.0], dir=[-0.2, 0.4, -1.0], castshadow=True)
+    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
+    spec.add_texture(
+        name="sky",
+        type=texture.mjTEXTURE_SKYBOX,
+        builtin=builtin.mjBUILTIN_GRADIENT,
+        rgb1=[1.0, 1.0, 1.0],
+        rgb2=[0.85, 0.9, 0.95],
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name="grid",
+        type=texture.mjTEXTURE_2D,
+        builtin=builtin.mjBUILTIN_CHECKER,
+        rgb1=[0.82, 0.84, 0.86],
+        rgb2=[0.75, 0.77, 0.80],
+        width=200,
+        height=200,
+    )
+    grid = spec.add_material(name="grid", texrepeat=[2, 2], texuniform=True)
+    grid.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    spec.geom("floor").material = "grid"
+
+
+def _add_actuators(mujoco: Any, spec: Any, export: Export) -> None:
+    """A motor for each joint, in the order of the export, and the contact last."""
+    for name, limit in zip(export.joints, export.per_joint(export.robot.torque_limit), strict=True):
+        spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            forcerange=[-limit, limit],
+        )
+    # its length is how far the striker is beyond the face along the normal; it acts on both
+    spec.add_actuator(
+        name="contact",
+        target="striker",
+        refsite="face",
+        trntype=mujoco.mjtTrn.mjTRN_SITE,
+        gear=[0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
+    )
+
+
+def _add_keyframes(spec: Any, export: Export) -> None:
+    """`start`, at rest, and `contact`, as planned just before it."""
+    motion, model = export.motion, spec.compile()
+    at_contact = int(np.flatnonzero(motion.phase == 0)[-1])
+    for name, k in (("start", 0), ("contact", at_contact)):
+        qpos, qvel = np.zeros(model.nq), np.zeros(model.nv)
+        for column, joint in enumerate(export.joints):
+            qpos[model.joint(joint).qposadr[0]] = motion.position[k, column]
+            qvel[model.joint(joint).dofadr[0]] = motion.velocity[k, column]
+        if (base := motion.base) is not None:
+            qpos[:3], qpos[3:7] = base.position[k], base.quaternion[k]
+            turned = pin.Quaternion(*base.quaternion[k]).toRotationMatrix()
+            qvel[:3], qvel[3:6] = base.linear[k], turned.T @ base.angular[k]
+        spec.add_key(name=name, qpos=qpos, qvel=qvel, time=float(motion.time[k]))
+
+
+def _reference(export: Export) -> dict[str, Any]:
+    """Arrays of the motion, and of the abort motion with `missed_` before their names."""
+    robot = export.robot
+    out = {
+        "joints": np.array(export.joints),
+        **{name: export.per_joint(getattr(robot, name)) for name in ("kp", "kd", "torque_limit")},
+        "contact": np.array([export.motion.contact_start, export.motion.contact_end]),
+        "impulse": np.array(float(export.planned.record.summary["impulse_Ns"])),
+    }
+    for prefix, motion in (("", export.motion), ("missed_", export.missed)):
+        out |= {f"{prefix}{name}": value for name, value in _histories(motion)}
+    return out
+
+
+def _histories(motion: Motion | None) -> Iterator[tuple[str, Array]]:
+    names = ("time", "phase", "position", "velocity", "acceleration", "effort", "force", "zmp")
+    for name in names if motion is not None else ():
+        if getattr(motion, name) is not None:
+            yield name, getattr(motion, name)
+    if motion is not None and motion.base is not None:
+        for field in dataclasses.fields(motion.base):
+            yield f"base_{field.name}", getattr(motion.base, field.name)

@@ -1,0 +1,49 @@
+"""ROS 2: goals of control_msgs/action/FollowJointTrajectory as YAML, for `ros2 action send_goal --stdin`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impactopt.files.export.content import Export
+from impactopt.files.export.motion import Motion
+
+__all__ = ["stamp", "write"]
+
+
+def write(export: Export, directory: Path) -> None:
+    """`motion.yaml`, and `missed.yaml` of a plan with an abort motion."""
+    for name, motion in export.motions.items():
+        with open(directory / f"{name}.yaml", "w", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in _lines(export, motion))
+
+
+def stamp(seconds: float) -> tuple[int, int]:
+    """Whole seconds, and what is left in nanoseconds."""
+    return divmod(round(1e9 * seconds), 1_000_000_000)
+
+
+def _lines(export: Export, motion: Motion) -> Iterator[str]:
+    meta = export.meta()
+    yield f"# {json.dumps(meta['problem'])} for {json.dumps(meta['robot'])}, {export.rate:g} Hz; SI units"
+    yield f"# contact from {motion.contact_start:.9g} to {motion.contact_end:.9g} s; meta.json has the rest"
+    # what is text in JSON is text in YAML, whatever is in the names
+    yield "trajectory:"
+    yield f"  joint_names: {json.dumps(list(export.joints))}"
+    yield "  points:"
+    for k, time in enumerate(motion.time):
+        sec, nanosec = stamp(float(time))
+        yield f"  - positions: {_numbers(motion.position[k])}"
+        yield f"    velocities: {_numbers(motion.velocity[k])}"
+        yield f"    accelerations: {_numbers(motion.acceleration[k])}"
+        yield f"    effort: {_numbers(motion.effort[k])}"
+        yield f"    time_from_start: {{sec: {sec}, nanosec: {nanosec}}}"
+
+
+def _numbers(row: Any) -> str:
+    """With a point in each of them: ROS refuses whole numbers where it wants floats."""
+    return f"[{', '.join(repr(float(f'{x:.10g}')) for x in np.asarray(row))}]"

@@ -1,0 +1,261 @@
+"""Results beside each other: their numbers, where their problems and versions differ, and a page of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.files.output import Record, plain
+from impactopt.files.problem_file.toml import TOMLError, read_toml
+from impactopt.kinematics.support import margin
+from impactopt.report.histories import at_contact, ground_wrenches, planned_torque
+from impactopt.report.page import html_page
+from impactopt.report.report import Report
+from impactopt.report.result_rows import Cell, Row, number_row, target_rows, word_row
+from impactopt.report.thinning import thinned
+from impactopt.simulation.result import centre_of_pressure
+
+__all__ = ["MOST", "Comparison", "Difference", "compare", "histories_of"]
+
+Array = NDArray[np.float64]
+MOST = 5  # results: the page has a line's style for each of so many
+STYLES = ("planned", "simulated", "free", "one", "two")
+NOT_SET = "-"
+NUMBERS = (
+    *("status", "message", "impulse_Ns", "peak_force_N", "contact_ms", "hand_speed_m_s", "target"),
+    *("duration_s", "zmp_margin_m", "torque_ratio", "clearance_mm", "max_violation"),
+    *("solver", "iterations", "solve_seconds", "collision_model"),
+)
+REPLAYS = ("simulated", "replayed")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A key, and what each result has there, as text."""
+
+    key: str
+    values: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """Results beside each other.
+
+    records : by name.  rows : numbers, a cell for each.  problem, versions : keys in which they differ.
+    """
+
+    records: Mapping[str, Record]
+    rows: tuple[Row, ...]
+    problem: tuple[Difference, ...]
+    versions: tuple[Difference, ...]
+
+    def describe(self) -> dict[str, Any]:
+        """As in `impactopt compare --json`."""
+        results = []
+        for name, record in self.records.items():
+            row: dict[str, Any] = {"name": name}
+            row |= {key: record.summary.get(key) for key in NUMBERS}
+            row |= {key: record.summary[key] for key in REPLAYS if key in record.summary}
+            results.append(row)
+
+        def told(differences: Sequence[Difference]) -> dict[str, dict[str, str]]:
+            return {d.key: dict(zip(self.records, d.values, strict=True)) for d in differences}
+
+        return {
+            "results": plain(results),
+            "problem": told(self.problem),
+            "versions": told(self.versions),
+        }
+
+    def page(self) -> Report:
+        """All of it as one HTML page; times are since each one's own contact."""
+        arrays: dict[str, Any] = {}
+        charts = list(_charts(self.records, arrays))
+        title = " and ".join(self.records)
+        body = "\n".join(_body(self, title))
+        return Report(
+            html_page(title=title, kind="report", body=body, header={"charts": charts}, arrays=arrays)
+        )
+
+
+def compare(records: Mapping[str, Record]) -> Comparison:
+    """Results beside each other, by name.
+
+    Raises
+    ------
+    InputError : fewer than two, or more than `MOST`.
+    """
+    if not 2 <= len(records) <= MOST:
+        raise InputError(f"{len(records)} results to compare; give 2 to {MOST}")
+    summaries = [record.summary for record in records.values()]
+    versions = [{str(k): str(v) for k, v in s.get("versions", {}).items()} for s in summaries]
+    return Comparison(
+        records=dict(records),
+        rows=tuple(row for row in _rows(summaries) if row is not None),
+        problem=_differences(_problems(list(records.values()))),
+        versions=_differences(versions),
+    )
+
+
+def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    yield Row(
+        "status",
+        tuple(
+            Cell(str(s.get("status", NOT_SET)), s.get("status") in ("solved", "acceptable"))
+            for s in summaries
+        ),
+    )
+    replays = [s.get("replayed") or s.get("simulated") or {} for s in summaries]
+    for label, key, digits in (
+        ("impulse [N s]", "impulse_Ns", 2),
+        ("peak force [N]", "peak_force_N", 0),
+        ("contact time [ms]", "contact_ms", 1),
+        ("speed at contact [m/s]", "hand_speed_m_s", 3),
+        ("duration [s]", "duration_s", 2),
+    ):
+        yield number_row(label, [s.get(key) for s in summaries], digits)
+    yield from target_rows([s.get("target") or {} for s in summaries])
+    for label, key, digits, scale, least, most in (
+        ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
+        ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
+    ):
+        phases = dict.fromkeys(phase for s in summaries for phase in s.get(key, {}))
+        for phase in phases:
+            values = [s.get(key, {}).get(phase) for s in summaries]
+            yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
+    yield number_row("least distance of bodies [mm]", [s.get("clearance_mm") for s in summaries], 1)
+    yield number_row("replayed impulse [N s]", [r.get("impulse_Ns") for r in replays], 2)
+    yield number_row("replayed, largest slip of a sole [mm]", [r.get("sole_slip_mm") for r in replays], 2)
+    yield word_row("replayed, stands at the end", [r.get("standing") for r in replays], no_is_bad=True)
+    yield number_row("iterations", [s.get("iterations") for s in summaries], 0)
+    yield number_row("solved in [s]", [s.get("solve_seconds") for s in summaries], 1)
+
+
+def _problems(records: Sequence[Record]) -> list[dict[str, str]]:
+    """Flat keys of each problem's file; of what a summary says of it if one has no file."""
+    tables = []
+    for record in records:
+        try:
+            tables.append(read_toml(record.problem) if record.problem else None)
+        except TOMLError:
+            tables.append(None)
+    if any(table is None for table in tables):
+        tables = [record.summary.get("problem", {}) for record in records]
+    return [dict(_flat("", table)) for table in tables]
+
+
+def _flat(above: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Keys with dots, a list of tables by number, and values as text."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _flat(f"{above}.{key}" if above else str(key), item)
+    elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        for k, item in enumerate(value):
+            yield from _flat(f"{above}.{k}", item)
+    else:
+        yield above, _text(value)
+
+
+def _text(value: Any) -> str:
+    """5 and 5.0 are the same."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_text, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.12g}" if isinstance(value, (int, float)) else str(value)
+
+
+def _differences(flat: Sequence[Mapping[str, str]]) -> tuple[Difference, ...]:
+    keys = dict.fromkeys(key for table in flat for key in table)
+    rows = [Difference(key, tuple(table.get(key, NOT_SET) for table in flat)) for key in keys]
+    return tuple(row for row in rows if len(set(row.values)) > 1)
+
+
+def histories_of(record: Record) -> dict[str, tuple[Array, Array]]:
+    """Time since contact [s] and values, of what a record has: `force` [N], `margin` of the ZMP [mm], `ratio`
+    of the largest torque to its limit.
+    """
+    a, found = record.arrays, dict[str, tuple[Array, Array]]()
+    if not record.completed:
+        return found
+    start = float(a["reference_contact_start"])
+    if len(a["collision_time"]) > 1:
+        time, force = at_contact(record, a["collision_force"], 0.0)
+        found["force"] = time - start, force
+    if len(a["polygon"]):
+        time, wrench = ground_wrenches(record, "reference")
+        found["margin"] = time - start, 1e3 * margin(a["polygon"], centre_of_pressure(wrench))
+    time, torque = planned_torque(record)
+    found["ratio"] = time - start, np.abs(torque / a["torque_limit"]).max(axis=1)
+    return found
+
+
+def _charts(records: Mapping[str, Record], arrays: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Descriptions of the page's charts; their numbers go to `arrays`."""
+    known = [histories_of(record) for record in records.values()]
+    longest = max((float(r.summary.get("contact_ms") or 0.0) for r in records.values()), default=0.0)
+    for which, title, unit, more in (
+        ("force", "Force on the target", "force [N]", {"view": [-0.2e-3 * longest, 1.2e-3 * longest]}),
+        ("margin", "ZMP margin", "margin [mm]", {"limits": [{"y": 0.0, "text": "edge"}]}),
+        (
+            "ratio",
+            "Torque demand over limit",
+            "torque / limit",
+            {"limits": [{"y": 1.0, "text": "limit"}], "include": [0.0, 1.0]},
+        ),
+    ):
+        series = []
+        for k, (name, histories) in enumerate(zip(records, known, strict=True)):
+            if which in histories:
+                x, y = thinned(*histories[which], whole=[-0.01, 2e-3 * longest])
+                arrays |= {f"{which}{k}_x": x, f"{which}{k}_y": y}
+                series.append({"label": name, "style": STYLES[k], "x": f"{which}{k}_x", "y": f"{which}{k}_y"})
+        if series:
+            yield {
+                "kind": "lines",
+                "title": title,
+                "x": "time since contact [s]",
+                "y": unit,
+                "series": series,
+                "include": [0.0],
+                **more,
+            }
+
+
+def _body(comparison: Comparison, title: str) -> Iterator[str]:
+    names = list(comparison.records)
+    yield f'<header><h1>{escape(title)}</h1><span class="sub">compared</span>'
+    yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
+    yield '<div id="trouble"></div>'
+    rows = [(row.label, [(cell.text, cell.good) for cell in row.cells]) for row in comparison.rows]
+    yield _table(names, rows)
+    yield '<h2>Planned histories</h2><div id="charts"></div>'
+    for heading, differences in (
+        ("Where the problems differ", comparison.problem),
+        ("Where the versions differ", comparison.versions),
+    ):
+        rows = [(d.key, [(value, True) for value in d.values]) for d in differences]
+        yield f"<h2>{heading}</h2>"
+        yield _table(names, rows) if rows else "<p>They do not.</p>"
+    yield "</main><footer><main>Made by impactopt. This file holds all that it shows and needs no network."
+    yield "</main></footer>"
+
+
+def _table(names: Sequence[str], rows: Sequence[tuple[str, list[tuple[str, bool]]]]) -> str:
+    """A column for each result; cells are text, and whether it is good."""
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
+    lines = []
+    for label, cells in rows:
+        told = "".join(
+            f"<td>{escape(text)}</td>" if good else f'<td class="bad">! {escape(text)}</td>'
+            for text, good in cells
+        )
+        lines.append(f'<tr><th scope="row">{escape(label)}</th>{told}</tr>')
+    table = f"<table><thead><tr><td></td>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+    return f'<section class="card"><div class="scroll" tabindex="0">{table}</div></section>'

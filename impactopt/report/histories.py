@@ -1,0 +1,49 @@
+"""Histories of a result over its whole time: in contact those of the model that the plan has of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.files.output import Record
+
+__all__ = ["at_contact", "ground_wrenches", "planned_torque"]
+
+Array = NDArray[np.float64]
+
+
+def at_contact(record: Record, values: Array, otherwise: float) -> tuple[Array, Array]:
+    """A history of the planned collision, and one value for all time before and after."""
+    a = record.arrays
+    start, end, last = (float(a[f"reference_{n}"]) for n in ("contact_start", "contact_end", "end"))
+    time = np.concatenate([[0.0, start], start + a["collision_time"], [end, last]])
+    return time, np.concatenate([[otherwise] * 2, values, [otherwise] * 2])
+
+
+def ground_wrenches(record: Record, prefix: str) -> tuple[Array, Array]:
+    """Time and the ground's wrench (k, 6) about the origin; in the planned collision that of its model."""
+    a = record.arrays
+    time = a[f"{prefix}_time"]
+    if prefix != "reference":
+        return time, a[f"{prefix}_sole_ground"].sum(axis=1)
+    keep, ground = a["reference_phase"] != 1, a["collision_ground"]
+    if not len(ground):
+        return time[keep], a["reference_ground"][keep]
+    inside = float(a["reference_contact_start"]) + a["collision_time"][-len(ground) :]
+    order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
+    return np.concatenate([time[keep], inside])[order], np.concatenate([a["reference_ground"][keep], ground])[
+        order
+    ]
+
+
+def planned_torque(record: Record) -> tuple[Array, Array]:
+    """Time (k,) [s] and the plan's torques (k, n) [N m]."""
+    a = record.arrays
+    time, torque, phase = a["reference_time"], a["reference_torque"], a["reference_phase"]
+    hit = a["collision_torque"]
+    if len(hit) != len(a["collision_time"]) or not len(a["collision_ground"]):
+        return time, torque
+    keep = phase != 1
+    inside = float(a["reference_contact_start"]) + a["collision_time"]
+    order = np.argsort(np.concatenate([time[keep], inside]), kind="stable")
+    return np.concatenate([time[keep], inside])[order], np.concatenate([torque[keep], hit])[order]

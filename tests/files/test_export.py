@@ -1,0 +1,572 @@
+"""Exports are read back by code that knows nothing of their writers, and replayed."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from support.fake_solution import still_solution, strike_record
+from support.small_plans import BODILESS
+from typer.testing import CliRunner
+
+import impactopt
+from impactopt.cli.app import app
+from impactopt.cli.export import Target as Choice
+from impactopt.contact import Board, FreeMass, HertzDamped, HuntCrossley, KelvinVoigt, RigidWall, SpringDamper
+from impactopt.contact.laws import LAWS, CustomLaw
+from impactopt.errors import InputError
+from impactopt.files.export import FORMATS, export_planned
+from impactopt.files.export import player as formulas
+from impactopt.files.output import record_of, save_record
+from impactopt.files.problem_file import load_problem
+from impactopt.files.problem_file.names import problem_file
+from impactopt.files.replay import Planned
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.robot import Robot
+from impactopt.simulation import Perturbation, Simulation, scene_of, simulate_mujoco
+from impactopt.simulation.mujoco_world import MujocoOptions, build_world
+from impactopt.solvers.program import Status
+
+Array = np.ndarray
+SERVO = Perturbation(period=1e-3)  # a servo at 1 kHz
+NEAR = 5e-3  # of an impulse
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def arm() -> Solution:
+    return solve(load_problem("arm_planar"))
+
+
+@pytest.fixture(scope="module")
+def planned(arm: Solution) -> Planned:
+    return Planned(record=record_of(arm), problem=arm.problem, reference=arm.trajectory)
+
+
+@pytest.fixture(scope="module")
+def still() -> Solution:
+    return still_solution()
+
+
+def replayed(
+    problem: ImpactProblem, reference: Any, *, step: float = 2e-4, settle: float = 0.0
+) -> Simulation:
+    return simulate_mujoco(
+        problem.robot, reference, scene_of(problem), step=step, settle=settle, perturbation=SERVO
+    )
+
+
+def reference_of(
+    robot: Robot,
+    time: Array,
+    joints: list[str],
+    position: Array,
+    velocity: Array,
+    effort: Array,
+    base: Array | None = None,
+) -> Any:
+    """What an engine follows, from columns in any order; base (k, 13): place, w, x, y, z, twist."""
+    order = [joints.index(name) for name in robot.joint_names]
+    position, velocity, effort = (table[:, order] for table in (position, velocity, effort))
+    if base is not None:  # a servo does not see the base, but a replay begins there
+        position = np.hstack([base[:, :3], base[:, [4, 5, 6, 3]], position])
+        velocity = np.hstack([base[:, 7:], velocity])
+    return SimpleNamespace(time=time, q=position, v=velocity, torque=effort, end=float(time[-1]))
+
+
+# ---------------------------------------------------------------- readers
+def read_csv(path: Path) -> dict[str, Array]:
+    with open(path, newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    return dict(zip(header, np.array(rows, dtype=float).T, strict=True))
+
+
+def table(columns: dict[str, Array], what: str) -> tuple[list[str], Array]:
+    """Names and values (k, n) of the columns `what NAME [unit]`."""
+    named = {
+        m[1]: values
+        for key, values in columns.items()
+        if (m := re.fullmatch(rf"{what} (\S+)(?: \[.+\])?", key))
+    }
+    return list(named), np.stack(list(named.values()), axis=1)
+
+
+def from_csv(path: Path, robot: Robot) -> Any:
+    columns = read_csv(path)
+    joints, position = table(columns, "position")
+    base = None
+    if robot.floating:
+        whats = ("base position", "base quaternion", "base linear velocity", "base angular velocity")
+        base = np.hstack([table(columns, what)[1] for what in whats])
+    velocity, effort = (table(columns, what)[1] for what in ("velocity", "effort"))
+    return reference_of(robot, columns["time [s]"], joints, position, velocity, effort, base)
+
+
+def from_points(robot: Robot, joints: list[str], points: list[Any]) -> Any:
+    """Of a JointTrajectory, as dictionaries or messages."""
+
+    def of(thing: Any, name: str) -> Any:
+        return thing[name] if isinstance(thing, dict) else getattr(thing, name)
+
+    stamps = [of(point, "time_from_start") for point in points]
+    nanoseconds = [1_000_000_000 * of(stamp, "sec") + of(stamp, "nanosec") for stamp in stamps]
+    assert all(0 <= of(stamp, "nanosec") < 1_000_000_000 for stamp in stamps)
+    assert (np.diff(nanoseconds) > 0).all(), "ROS refuses times that do not ascend"
+    names = ("positions", "velocities", "effort")
+    tables = [np.array([of(point, name) for point in points], dtype=float) for name in names]
+    return reference_of(robot, 1e-9 * np.array(nanoseconds), joints, *tables)
+
+
+def play(directory: Path, *options: str) -> list[float]:
+    """The numbers that play.py prints, run by Python alone, elsewhere."""
+    done = subprocess.run(
+        [sys.executable, "-I", str(directory / "play.py"), *options],
+        capture_output=True,
+        text=True,
+        cwd=directory.parent,
+        check=False,
+    )
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    return [float(number) for number in re.findall(r"-?\d+\.\d+", done.stdout)]
+
+
+# ---------------------------------------------------------------- an arm
+def test_csv_replays_as_the_plan_does(arm: Solution, tmp_path: Path) -> None:
+    files = arm.export("csv", tmp_path / "new" / "csv", joints=["wrist", "shoulder", "elbow"])
+    assert [path.name for path in files] == ["meta.json", "motion.csv"] and all(p.is_file() for p in files)
+    read = from_csv(files[1], arm.problem.robot)
+    memory = replayed(arm.problem, arm.trajectory)
+    assert replayed(arm.problem, read).impulse == pytest.approx(memory.impulse, rel=NEAR)
+    columns = read_csv(files[1])
+    assert table(columns, "effort")[0] == ["wrist", "shoulder", "elbow"]
+    assert np.trapezoid(columns["force [N]"], columns["time [s]"]) == pytest.approx(arm.impulse, rel=0.02)
+    meta = json.loads(files[0].read_text(encoding="utf-8"))
+    robot = arm.problem.robot
+    for joint in meta["joints"]:
+        k = robot.joint_index(joint["name"])
+        told = [joint["kp"], joint["kd"], joint["effort_limit"]]
+        assert told == [robot.kp[k], robot.kd[k], robot.torque_limit[k]]
+    assert meta["contact_s"] == [arm.plan.contact_start, arm.plan.contact_end] and meta["missed"] is None
+    assert meta["target"]["resistance_N"] == 600.0 and meta["contact_law"]["stiffness_N_m"] == 5e5
+    assert meta["expected"]["impulse_Ns"] == pytest.approx(arm.impulse)
+
+
+def test_rows_are_at_the_rate_and_at_both_sides_of_a_jump(arm: Solution, tmp_path: Path) -> None:
+    start, end = arm.plan.contact_start, arm.plan.contact_end
+    columns = read_csv(arm.export("csv", tmp_path / "csv", rate=500.0)[1])
+    time, inside = columns["time [s]"], columns["contact"]
+    assert (np.diff(time) > 0).all() and time[0] == 0 and time[-1] == pytest.approx(arm.plan.duration)
+    for instant, step in ((start, 1), (end, -1)):
+        before, after = np.flatnonzero(np.abs(time - instant) < 1.5e-6)
+        assert after == before + 1 and inside[after] - inside[before] == step
+        assert time[after] - time[before] == pytest.approx(1e-6, abs=1e-9)
+    others = np.abs(np.round(500 * time) / 500 - time) < 1e-9
+    assert others.sum() >= len(time) - 5 and np.diff(time[others]).max() == pytest.approx(0.002)
+    # the reference coasts in contact, and goes on from the predicted state after it
+    after = np.flatnonzero(inside == 1)[-1] + 1
+    jump = [table(columns, "velocity")[1][k] for k in (after - 1, after)]
+    assert np.abs(jump[1] - jump[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("which", ["position", "velocity"])
+def test_rates_are_those_of_the_curve(arm: Solution, tmp_path: Path, which: str) -> None:
+    """Central differences of dense rows, where the curve has no break."""
+    columns = read_csv(arm.export("csv", tmp_path / "csv", rate=1e4)[1])
+    time = columns["time [s]"]
+    rate = table(columns, {"position": "velocity", "velocity": "acceleration"}[which])[1]
+    values = table(columns, which)[1]
+    steps = np.diff(time)
+    even = np.flatnonzero((np.abs(steps[1:] - 1e-4) < 1e-9) & (np.abs(steps[:-1] - 1e-4) < 1e-9)) + 1
+    even = even[(columns["phase"][even - 1] == columns["phase"][even + 1])]
+    found = (values[even + 1] - values[even - 1]) / 2e-4
+    # differences err by the third rate, and twelve digits by 1e-12 / 1e-4
+    np.testing.assert_allclose(found, rate[even], atol={"position": 1e-5, "velocity": 0.05}[which])
+
+
+def test_ros2_is_a_goal_that_replays_as_the_plan_does(arm: Solution, tmp_path: Path) -> None:
+    _, path = arm.export("ros2", tmp_path / "goal")
+    goal = yaml.safe_load(path.read_text(encoding="utf-8"))
+    trajectory = goal["trajectory"]
+    assert set(goal) == {"trajectory"} and set(trajectory) == {"joint_names", "points"}
+    fields = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
+    for point in trajectory["points"]:
+        assert set(point) == fields
+        assert all(isinstance(x, float) for name in fields - {"time_from_start"} for x in point[name])
+    read = from_points(arm.problem.robot, trajectory["joint_names"], trajectory["points"])
+    memory = replayed(arm.problem, arm.trajectory)
+    assert replayed(arm.problem, read).impulse == pytest.approx(memory.impulse, rel=NEAR)
+    # controllers refuse goals that do not end at rest
+    np.testing.assert_allclose(trajectory["points"][-1]["velocities"], 0.0, atol=1e-9)
+
+
+def test_mcap_is_what_ros_reads(arm: Solution, tmp_path: Path) -> None:
+    _, path = arm.export("mcap", tmp_path / "bag")
+    messages = read_mcap(path)
+    ((_, trajectory),) = messages["/motion"]
+    read = from_points(arm.problem.robot, list(trajectory.joint_names), trajectory.points)
+    memory = replayed(arm.problem, arm.trajectory)
+    assert replayed(arm.problem, read).impulse == pytest.approx(memory.impulse, rel=NEAR)
+    time = np.array([t for t, _ in messages["/expected_force"]])
+    force = np.array(
+        [[m.wrench.force.x, m.wrench.force.y, m.wrench.force.z] for _, m in messages["/expected_force"]]
+    )
+    impulse = np.trapezoid(force, 1e-9 * time, axis=0)
+    np.testing.assert_allclose(impulse, arm.impulse * arm.problem.normal, atol=0.02 * arm.impulse)
+    assert {m.data for _, m in messages["/phase"]} == {0, 1, 2} and "/zmp" not in messages
+    with open(path, "rb") as file:
+        (attached,) = make_reader(file).iter_attachments()
+    assert attached.name == "meta.json"
+    assert json.loads(attached.data)["contact_s"] == [arm.plan.contact_start, arm.plan.contact_end]
+
+
+def read_mcap(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Times [ns] and messages by topic, with the definitions that rosbags has of ROS 2's messages."""
+    store, found = get_typestore(Stores.ROS2_JAZZY), dict[str, list[tuple[int, Any]]]()
+    with AnyReader([path], default_typestore=store) as bag:
+        for connection, time, raw in bag.messages():
+            found.setdefault(connection.topic, []).append(
+                (time, store.deserialize_cdr(raw, connection.msgtype))
+            )
+    return found
+
+
+def test_a_humanoids_base_and_zmp_are_told(still: Solution, tmp_path: Path) -> None:
+    """It stands: nothing moves, and the ZMP is below the centre of mass until the made-up collision."""
+    messages = read_mcap(still.export("mcap", tmp_path / "bag", rate=200.0)[1])
+    columns = read_csv(still.export("csv", tmp_path / "csv", rate=200.0)[1])
+    q = still.problem.start_posture
+    for k in (0, -1):
+        pose, zmp = messages["/base_pose"][k][1].pose, messages["/zmp"][k][1].point
+        told = [pose.position.x, pose.position.y, pose.position.z]
+        np.testing.assert_allclose(told, q[:3], atol=1e-12)
+        told = [pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w]
+        np.testing.assert_allclose(told, q[3:7], atol=1e-12)
+        assert [zmp.x, zmp.y] == pytest.approx(table(columns, "zmp")[1][k])
+    inside = columns["contact"] == 1
+    np.testing.assert_allclose(table(columns, "zmp")[1][inside][-1], [8 / 400, 0.0], atol=1e-9)
+    assert columns["force [N]"][inside].max() == pytest.approx(700.0)
+    assert not columns["force [N]"][~inside].any()
+
+
+def test_an_impact_without_duration_is_one_jump(still: Solution, tmp_path: Path) -> None:
+    hit = still.plan.collision
+    short = dataclasses.replace(
+        hit, **{name: getattr(hit, name)[:1] for name in ("time", "force", "target_speed", "torque")}
+    )
+    short = dataclasses.replace(short, ground=hit.ground[:0], sole_wrench=hit.sole_wrench[:0])
+    plan = dataclasses.replace(still.plan, compression=0.0, restitution=0.0, collision=short)
+    columns = read_csv(dataclasses.replace(still, plan=plan).export("csv", tmp_path / "csv")[1])
+    assert set(columns["phase"]) == {0.0, 2.0} and not columns["force [N]"].any()
+    steps = np.diff(columns["time [s]"])
+    assert (steps > 0).all() and (steps < 1.5e-6).sum() == 1
+    assert np.isfinite(table(columns, "zmp")[1]).all()
+
+
+def test_mujoco_plays_the_scene(arm: Solution, tmp_path: Path) -> None:
+    directory = tmp_path / "scene"
+    arm.export("mujoco", directory, joints=["elbow", "wrist", "shoulder"])
+    impulse, told = play(directory)
+    memory = simulate_mujoco(arm.problem.robot, arm.trajectory, scene_of(arm.problem), settle=0.0)
+    assert impulse == pytest.approx(memory.impulse, rel=NEAR)
+    assert told == pytest.approx(arm.impulse, abs=1e-3)
+    model = mujoco.MjModel.from_xml_path(str(directory / "scene.xml"))
+    limits = dict(zip(arm.problem.robot.joint_names, arm.problem.robot.torque_limit, strict=True))
+    for k, name in enumerate(("elbow", "wrist", "shoulder")):
+        assert model.actuator(k).name == name
+        np.testing.assert_allclose(model.actuator(k).forcerange, [-limits[name], limits[name]])
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("contact").id)
+    mujoco.mj_forward(model, data)
+    depth, rate = data.actuator("contact").length[0], data.actuator("contact").velocity[0]
+    assert depth == pytest.approx(0.0, abs=1e-5) and rate == pytest.approx(arm.plan.hand_speed, rel=1e-3)
+    assert play(directory, "missing")[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("law", "target"),
+    [
+        (SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)),
+        (HuntCrossley(stiffness=2e6, dissipation=0.1), RigidWall()),
+        (
+            HertzDamped(stiffness=2e6, damping=500.0),
+            Board(mass=0.5, stiffness=4e4, breaking_force=150.0, damping=5.0),
+        ),
+        (KelvinVoigt(stiffness=1e4, damping=50.0), Board(mass=0.5, stiffness=2e5, breaking_force=1e6)),
+    ],
+    ids=["mass", "wall", "board", "strong board"],
+)
+def test_every_law_and_target_plays(planned: Planned, law: Any, target: Any, tmp_path: Path) -> None:
+    """The arm's motion against other things than it was planned for."""
+    problem = dataclasses.replace(planned.problem, law=law, target=target, terms=BODILESS)
+    export_planned(dataclasses.replace(planned, problem=problem), "mujoco", tmp_path / "scene")
+    fine = simulate_mujoco(
+        problem.robot,
+        planned.reference,
+        scene_of(problem),
+        step=5e-5,
+        settle=0.0,
+        until=planned.reference.contact_end + 0.2,
+    )
+    assert play(tmp_path / "scene")[0] == pytest.approx(fine.impulse, rel=NEAR)
+
+
+def test_formulas_are_the_laws() -> None:
+    assert set(formulas.LAWS) == set(LAWS)
+    numbers = {"stiffness": 3e4, "damping": 70.0, "dissipation": 0.3, "exponent": 1.7}
+    for law, formula in formulas.LAWS.items():
+        made = law(**{f.name: numbers[f.name] for f in dataclasses.fields(law)})
+        for x in (1e-4, 0.003, 0.02):
+            for rate in (-1.0, -0.1, 0.0, 0.2, 2.0):
+                told = max(0.0, eval(formula, {}, {**numbers, "x": x, "rate": rate}))
+                assert told == pytest.approx(float(made.force(x, rate)), rel=1e-9, abs=1e-9), formula
+
+
+def test_a_law_of_ones_own_has_no_scene(planned: Planned, tmp_path: Path) -> None:
+    law = CustomLaw(compression=lambda x, rate, k: k * x, k=1e4)
+    problem = dataclasses.replace(planned.problem, law=law)
+    own = dataclasses.replace(planned, problem=problem)
+    with pytest.raises(InputError, match="no formula for CustomLaw"):
+        export_planned(own, "mujoco", tmp_path / "scene")
+    export_planned(own, "csv", tmp_path / "csv")
+    assert json.loads((tmp_path / "csv" / "meta.json").read_text())["contact_law"]["k"] == 1e4
+    assert [p.name for p in tmp_path.iterdir()] == ["csv"]
+
+
+def test_a_scene_that_mujoco_refuses_is_said(planned: Planned, tmp_path: Path) -> None:
+    robot = planned.problem.robot
+    model = robot.model.copy()
+    model.names[1] = "target"  # as the scene's own joint
+    other = dataclasses.replace(robot, model=model)
+    problem = dataclasses.replace(planned.problem, robot=other)
+    with pytest.raises(InputError, match="MuJoCo refuses the scene"):
+        export_planned(dataclasses.replace(planned, problem=problem), "mujoco", tmp_path / "scene")
+    assert list(tmp_path.iterdir()) == []
+
+
+def frames_in_mujoco(robot: Robot, problem: ImpactProblem, motion: Any) -> list[dict[str, Array]]:
+    """Places and velocities of the file's bodies at some frames, by MuJoCo's kinematics of its joints."""
+    model = build_world(robot, scene_of(problem), Perturbation(), MujocoOptions())
+    data, found = mujoco.MjData(model), []
+    names = [str(name) for name in motion["joint_names"]]
+    root = [model.joint(str(robot.model.names[1])).bodyid[0]] if robot.floating else [0]
+    bodies = [*root, *(model.joint(name).bodyid[0] for name in names)]
+    for k in range(0, len(motion["joint_pos"]), 7):
+        for column, name in enumerate(names):
+            data.qpos[model.joint(name).qposadr[0]] = motion["joint_pos"][k, column]
+            data.qvel[model.joint(name).dofadr[0]] = motion["joint_vel"][k, column]
+        if robot.floating:
+            data.qpos[:3], data.qpos[3:7] = motion["body_pos_w"][k, 0], motion["body_quat_w"][k, 0]
+            turn = np.zeros(9)
+            mujoco.mju_quat2Mat(turn, data.qpos[3:7])
+            data.qvel[:3] = motion["body_lin_vel_w"][k, 0]
+            data.qvel[3:6] = turn.reshape(3, 3).T @ motion["body_ang_vel_w"][k, 0]
+        mujoco.mj_forward(model, data)
+        velocity = np.zeros((len(bodies), 6))
+        for row, body in zip(velocity, bodies, strict=True):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, row, 0)
+        found.append({"k": k, "place": data.xpos[bodies], "turn": data.xquat[bodies], "velocity": velocity})
+        found[-1] = {key: np.array(value) for key, value in found[-1].items()}
+    return found
+
+
+def check_mjlab(solution: Solution, path: Path) -> Any:
+    motion = np.load(path)
+    for frame in frames_in_mujoco(solution.problem.robot, solution.problem, motion):
+        k = int(frame["k"])
+        np.testing.assert_allclose(motion["body_pos_w"][k], frame["place"], atol=1e-6)
+        same = np.abs((motion["body_quat_w"][k] * frame["turn"]).sum(axis=1))
+        np.testing.assert_allclose(same, 1.0, atol=1e-9)
+        np.testing.assert_allclose(motion["body_ang_vel_w"][k], frame["velocity"][:, :3], atol=1e-6)
+        np.testing.assert_allclose(motion["body_lin_vel_w"][k], frame["velocity"][:, 3:], atol=1e-6)
+    return motion
+
+
+def test_mjlab_has_the_kinematics_of_mujoco(arm: Solution, tmp_path: Path) -> None:
+    arm.export("mjlab", tmp_path / "m", joints=["elbow", "shoulder", "wrist"])
+    motion = check_mjlab(arm, tmp_path / "m" / "motion.npz")
+    assert motion["fps"].tolist() == [50.0] and list(motion["joint_names"]) == ["elbow", "shoulder", "wrist"]
+    frames = int(np.ceil(arm.plan.duration * 50)) + 1
+    assert motion["joint_pos"].shape == (frames, 3) and motion["body_quat_w"].shape == (frames, 4, 4)
+    k = 5  # in the swing: the plan's own curve, to the last digit that a step of 1 ms leaves
+    swing = arm.plan.coordinates
+    y, rate, _ = arm.plan.swing.sample(np.array([k / 50]))
+    assert swing is not None
+    order = [1, 0, 2]
+    np.testing.assert_allclose(motion["joint_pos"][k], y[0][order], atol=1e-9)
+    np.testing.assert_allclose(motion["joint_vel"][k], rate[0][order], atol=1e-6)
+
+
+# ---------------------------------------------------------------- a humanoid
+def test_a_punch_replays_from_csv_and_stands(punch: Solution, tmp_path: Path) -> None:
+    files = punch.export("csv", tmp_path / "csv")
+    assert [path.name for path in files] == ["meta.json", "missed.csv", "motion.csv"]
+    read = from_csv(files[2], punch.problem.robot)
+    memory = replayed(punch.problem, punch.trajectory, step=5e-4, settle=1.0)
+    found = replayed(punch.problem, read, step=5e-4, settle=1.0)
+    assert (
+        found.impulse == pytest.approx(memory.impulse, rel=NEAR) and found.standing is memory.standing is True
+    )
+    # the motion of a missed blow is the planned one until that is noticed
+    whole, missed = (read_csv(path) for path in (files[2], files[1]))
+    noticed = json.loads(files[0].read_text())["missed"]["from_s"]
+    start = punch.plan.contact_start
+    assert noticed == pytest.approx(start + punch.problem.abort_after)
+    early = whole["time [s]"] < start
+    np.testing.assert_array_equal(
+        table(whole, "position")[1][early], table(missed, "position")[1][missed["time [s]"] < start]
+    )
+    assert not missed["force [N]"].any() and missed["time [s]"][-1] == pytest.approx(
+        punch.missed_trajectory.end
+    )
+    polygon = punch.plan.polygon
+    zmp = table(whole, "zmp")[1]
+    low, high = polygon.min(axis=0), polygon.max(axis=0)
+    assert ((zmp > low) & (zmp < high)).all()
+
+
+def test_a_punch_plays_in_plain_mujoco(punch: Solution, tmp_path: Path) -> None:
+    punch.export("mujoco", tmp_path / "scene")
+    impulse, _, height, planned = play(tmp_path / "scene")
+    memory = simulate_mujoco(punch.problem.robot, punch.trajectory, scene_of(punch.problem), settle=0.0)
+    assert impulse == pytest.approx(memory.impulse, rel=NEAR) and height == pytest.approx(planned, abs=0.01)
+    impulse, _, height, planned = play(tmp_path / "scene", "missing")
+    assert impulse == 0.0 and height == pytest.approx(planned, abs=0.01)
+
+
+def test_a_punch_for_mjlab_has_the_kinematics_of_mujoco(punch: Solution, tmp_path: Path) -> None:
+    punch.export("mjlab", tmp_path / "m", joints=punch.problem.robot.joint_names[::-1])
+    motion = check_mjlab(punch, tmp_path / "m" / "motion.npz")
+    assert motion["body_names"][0] == "base_link"
+    check_mjlab(punch, tmp_path / "m" / "missed.npz")
+
+
+# ---------------------------------------------------------------- what is refused
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"to": "cvs"}, "did you mean 'csv'"),
+        ({"joints": ["shoulder", "elbo", "wrist"]}, "did you mean 'elbow'"),
+        ({"joints": ["shoulder", "elbow", "elbow", "wrist"]}, "elbow named twice"),
+        ({"joints": ["shoulder", "elbow"]}, "wrist left out"),
+        ({"rate": 0.0}, "rate"),
+        ({"rate": np.nan}, "rate"),
+        ({"rate": 1e9}, "rate"),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_is_made(
+    planned: Planned, options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        export_planned(planned, **{"to": "csv", **options}, directory=tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_plan_that_is_not_finished_is_not_exported(to: str, still: Solution, tmp_path: Path) -> None:
+    result = dataclasses.replace(still.result, status=Status.ITERATION_LIMIT)
+    with pytest.raises(InputError, match="not finished"):
+        dataclasses.replace(still, result=result).export(to, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_strike_has_no_motion(arm: Solution, tmp_path: Path) -> None:
+    robot = arm.problem.robot
+    made = strike_record(robot, robot.posture("ready"), np.zeros(robot.nv), np.zeros(robot.n))
+    save_record(made, tmp_path / "strike")
+    done = runner.invoke(app, ["export", str(tmp_path / "strike"), "--to", "csv"])
+    assert (
+        done.exit_code == 2 and "strike, the blow alone" in done.stderr and done.stderr.count("error:") == 1
+    )
+
+
+def test_only_an_export_of_the_same_kind_is_replaced(planned: Planned, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    export_planned(planned, "csv", out)  # an empty one is taken
+    export_planned(planned, "csv", out, rate=100.0)
+    assert json.loads((out / "meta.json").read_text())["rate_Hz"] == 100.0
+    with pytest.raises(InputError, match="holds an export to csv"):
+        export_planned(planned, "ros2", out)
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        export_planned(planned, "csv", out)
+    (out / "meta.json").write_text("{}")
+    with pytest.raises(InputError, match="something else"):
+        export_planned(planned, "csv", out)
+    (tmp_path / "file").write_text("mine")
+    for place in ("file", "file/below"):
+        with pytest.raises(InputError):
+            export_planned(planned, "csv", tmp_path / place)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "out"]
+    assert sorted(p.name for p in out.iterdir()) == ["meta.json", "motion.csv", "notes.txt"]
+
+
+def test_what_fails_midway_leaves_the_old_files(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    export_planned(planned, "csv", out)
+    before = (out / "motion.csv").read_bytes()
+
+    def fail(_export: Any, directory: Path) -> None:
+        (directory / "half").write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("impactopt.files.export.csv_files.write", fail)
+    with pytest.raises(InputError, match="No space left"):
+        export_planned(planned, "csv", out, rate=10.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["out"] and (out / "motion.csv").read_bytes() == before
+
+
+def test_a_missing_package_says_how_to_get_it(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
+    with pytest.raises(InputError, match=r"pip install 'impactopt\[mcap\]'"):
+        export_planned(planned, "mcap", tmp_path / "some" / "where" / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------------------------------------------------- the command
+def test_the_command_writes_and_lists_files(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = problem_file("arm_planar")
+    text = path.read_text(encoding="utf-8")
+    save_record(dataclasses.replace(planned.record, problem=text, problem_path=path), tmp_path / "arm")
+    done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "csv", "--rate", "100", "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert told["to"] == "csv" and told["directory"] == str(tmp_path / "arm_csv")
+    assert [Path(p).name for p in told["files"]] == ["meta.json", "motion.csv"]
+    assert all(Path(p).is_file() for p in told["files"])
+    done = runner.invoke(
+        app, ["export", str(tmp_path / "arm"), "--to", "mujoco", "--out", str(tmp_path / "m")]
+    )
+    assert (tmp_path / "m" / "play.py").read_text() in done.stdout
+    monkeypatch.chdir(tmp_path / "arm")
+    done = runner.invoke(app, ["export", ".", "--to", "mjlab", "--json"])
+    assert json.loads(done.stdout)["directory"] == str(tmp_path / "arm_mjlab")
+    done = runner.invoke(app, ["export", str(tmp_path / "arm"), "--to", "csv", "--joints", "a,b"])
+    assert done.exit_code == 2 and done.stderr.count("error:") == 1 and "'a'" in done.stderr
+
+
+def test_the_command_knows_all_formats() -> None:
+    assert [choice.value for choice in Choice] == list(FORMATS)
+    assert callable(impactopt.export)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near, spots_of
+from impactopt.planning.keeping_apart import Margins, missing_rows, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     Budget,
@@ -37,9 +37,10 @@ from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
 ROUNDS = 6  # of more rows between bodies
-# first barriers: of a start, and of a solve that goes on with rows which its start breaks, as bodies are in
-# each other there, or only too near
-BARRIER, BARRIER_DEEP, BARRIER_NEAR = 0.1, 1e-2, 1e-3
+NEARBY = 0.3  # [m] nearer bodies get a row from the start on; what comes near on the way gets one then
+# first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
+# solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
+BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.1, 1e-2, 1e-3
 # where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
 ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
@@ -195,11 +196,11 @@ def clear_strike(
     """
     x0 = start.x if isinstance(start, SolverResult) else start
     interior = budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
-    if interior:
-        budget = replace(budget, options={"barrier": BARRIER, **(budget.options or {})})
+    if interior and not t.coordinates.soles:
+        budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
         return _settled(budget, t, budget.run(t.program, x0))
-    t = t.with_apart(rows_near(t, x0, margins, FAR))
+    t = t.with_apart(rows_near(t, x0, margins, NEARBY))
     t, result = _settled(budget, t, budget.run(t.program, x0))
     rough = False  # whether the result is one
     for again in reversed(range(ROUNDS)):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
+from support.small_plans import changed
 
+from impactopt.bodies.shapes import Obstacle
 from impactopt.planning import strike as strikes
 from impactopt.planning.keeping_apart import Margins, missing_rows, rows_near
 from impactopt.planning.multistart import Budget
@@ -119,13 +122,22 @@ def test_a_rough_result_is_never_told_as_a_solution(rounds: Any) -> None:
 
 
 def test_it_ends_with_bodies_apart_though_it_began_with_no_row_for_them(
-    strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+    arm_transcription: Transcription, strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(strikes, "NEARBY", -1.0)
-    margins = Margins(strike.problem)
+    """A box stands where the elbow is when the arm hits hardest."""
     budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
-    t, result = strikes.clear_strike(budget, margins, strike, strike_iterate(strike))
+    free = budget.run(strike.program, strike_iterate(strike))
+    model = strike.robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, strike.decode(free.x).posture)
+    elbow = data.oMi[model.getJointId("elbow")]
+    box = Obstacle(name="box", size=(0.06, 0.06, 0.06), position=elbow.act(np.array([0.0, 0.07, 0.0])))
+    of_box = changed(arm_transcription, obstacles=(box,))
+    t = StrikeTranscription(of_box.problem, of_box.coordinates, of_box.functions)
+    margins = Margins(t.problem)
+    assert missing_rows(t, free.x, margins)
+    monkeypatch.setattr(strikes, "NEARBY", -1.0)
+    t, result = strikes.clear_strike(budget, margins, t, strike_iterate(t))
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
-    assert t.apart_rows, "without rows bodies are too near"
-    assert not missing_rows(t, result.x, margins)
-    assert replace(result, history=()).iterations == result.history[-1].iteration
+    assert t.apart_rows and not missing_rows(t, result.x, margins)
+    assert result.iterations == result.history[-1].iteration

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.keeping_apart import Margins, missing_rows, rows_near, spots_of
+from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
+    EFFORT,
     Budget,
     Starts,
     check_starts,
@@ -37,7 +38,6 @@ from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
 ROUNDS = 6  # of more rows between bodies
-NEARBY = 0.3  # [m] nearer bodies get a row from the start on; what comes near on the way gets one then
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
 # solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
 BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.1, 1e-2, 1e-3
@@ -200,11 +200,12 @@ def clear_strike(
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
         return _settled(budget, t, budget.run(t.program, x0))
-    t = t.with_apart(rows_near(t, x0, margins, NEARBY))
+    t = t.with_apart(rows_near(t, x0, margins, FAR))
     t, result = _settled(budget, t, budget.run(t.program, x0))
-    rough = False  # whether the result is one
+    exact = t, result  # the last one that is solved to its end; the others lead there
     for again in reversed(range(ROUNDS)):
-        if not result.status.usable or budget.left == 0:
+        rough = result is not exact[1]
+        if not result.status.usable or (budget.left == 0 and not rough):
             break
         more = missing_rows(t, result.x, margins)
         if not more and not rough:
@@ -216,9 +217,16 @@ def clear_strike(
         new = solving.run(finer.program, _carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
         if new.status in _STUCK and budget.left != 0:
             roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
-        if not new.status.usable and not rough:
-            break  # what is too near stays so
-        t, result, rough = finer, one_after_the_other(result, new), roughly
+        steps, t, result = new.iterations, finer, one_after_the_other(result, new)
+        if new.status is Status.INTERRUPTED:
+            break
+        if not new.status.usable:  # what is too near stays so
+            t, kept = exact
+            return t, replace(kept, history=result.history, **{k: getattr(result, k) for k in EFFORT})
+        if not roughly:
+            exact = t, result
+            if not steps:
+                break  # new rows are met, as they are rounded: the next ones would be the same
     return t, result
 
 

@@ -118,7 +118,10 @@ def test_what_no_round_mends_is_a_result_of_its_own_program(rounds: Any) -> None
 
 def test_a_rough_result_is_never_told_as_a_solution(rounds: Any) -> None:
     t, result, _ = rounds(Status.SOLVED, Status.SOLVED, Status.TIME_LIMIT, deep=(True,))
-    assert result.status is Status.TIME_LIMIT and result.multipliers.size == t.program.m
+    assert not t.apart_rows and result.multipliers.size == t.program.m, "but the one before it"
+    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS
+    t, result, _ = rounds(Status.SOLVED, Status.SOLVED, Status.INTERRUPTED, deep=(True,))
+    assert result.status is Status.INTERRUPTED and result.multipliers.size == t.program.m
 
 
 def test_it_ends_with_bodies_apart_though_it_began_with_no_row_for_them(
@@ -136,7 +139,7 @@ def test_it_ends_with_bodies_apart_though_it_began_with_no_row_for_them(
     t = StrikeTranscription(of_box.problem, of_box.coordinates, of_box.functions)
     margins = Margins(t.problem)
     assert missing_rows(t, free.x, margins)
-    monkeypatch.setattr(strikes, "NEARBY", -1.0)
+    monkeypatch.setattr(strikes, "FAR", -1.0)
     t, result = strikes.clear_strike(budget, margins, t, strike_iterate(t))
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
     assert t.apart_rows and not missing_rows(t, result.x, margins)

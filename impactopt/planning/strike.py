@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near
+from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
+    EFFORT,
     Budget,
     Starts,
     check_starts,
@@ -26,7 +27,8 @@ from impactopt.planning.multistart import (
 from impactopt.planning.solution import Solved, blow_numbers, versions
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import Callback, SolverResult
+from impactopt.solvers.program import Callback, SolverResult, Status
+from impactopt.transcription.apart import ApartRow
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import rattle
@@ -35,7 +37,13 @@ from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-ROUNDS = 5  # of more rows between bodies
+ROUNDS = 6  # of more rows between bodies
+# first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
+# solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
+BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.1, 1e-2, 1e-3
+# where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
+ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
+_STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 METHODS = {"collocation": StrikeTranscription, "shooting": ShootingStrike}
 
 
@@ -183,23 +191,63 @@ def clear_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
-    not.
+    not, and on from there; its result has the effort of all.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
+    interior = budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
+    if interior and not t.coordinates.soles:
+        budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
         return _settled(budget, t, budget.run(t.program, x0))
     t = t.with_apart(rows_near(t, x0, margins, FAR))
     t, result = _settled(budget, t, budget.run(t.program, x0))
-    for _ in range(ROUNDS):
-        more = missing_rows(t, result.x, margins) if result.status.usable and budget.left != 0 else {}
-        if not more:
+    exact = t, result  # the last one that is solved to its end; the others lead there
+    for again in reversed(range(ROUNDS)):
+        rough = result is not exact[1]
+        if not result.status.usable or (budget.left == 0 and not rough):
             break
-        t = t.with_apart({**t.apart_rows, **more})
-        new = budget.run(t.program, result.x)
-        if not new.status.usable:
+        more = missing_rows(t, result.x, margins)
+        if not more and not rough:
             break
-        result = new
+        deep = bool(more) and _in_each_other(t, result.x, margins, more)
+        finer = t.with_apart({**t.apart_rows, **more}) if more else t
+        roughly = interior and deep and again > 0
+        solving = _roughly(budget) if roughly else budget
+        new = solving.run(finer.program, _carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
+        if new.status in _STUCK and budget.left != 0:
+            roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
+        steps, t, result = new.iterations, finer, one_after_the_other(result, new)
+        if new.status is Status.INTERRUPTED:
+            break
+        if not new.status.usable:  # what is too near stays so
+            t, kept = exact
+            return t, replace(kept, history=result.history, **{k: getattr(result, k) for k in EFFORT})
+        if not roughly:
+            exact = t, result
+            if not steps:
+                break  # new rows are met, as they are rounded: the next ones would be the same
     return t, result
+
+
+def _roughly(budget: Budget) -> Budget:
+    """The same, content with what is nearly solved."""
+    given = budget.options or {}
+    return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in ROUGHLY.items()}})
+
+
+def _carried(new: StrikeTranscription, old: StrikeTranscription, result: SolverResult) -> SolverResult:
+    """A program's result as the start of one with more rows."""
+    if new is old:
+        return result
+    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    return replace(result, x=x, multipliers=y, bound_multipliers=z)
+
+
+def _in_each_other(t: StrikeTranscription, x: Array, margins: Margins, rows: Iterable[ApartRow]) -> bool:
+    """Whether any two of these bodies are."""
+    spots = spots_of(t, x)
+    places = ((spots.names.index(row.place), (row.joint, row.other)) for row in rows)
+    return any(margins.bodies.exact(spots.at, k, pair) < 0 for k, pair in places)
 
 
 def _settled(

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -21,6 +22,7 @@ from impactopt.bodies.fit import PLANES
 from impactopt.codegen.cache import cached
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.terms import KeepOut, SelfCollision
+from impactopt.robots.robot import Robot
 from impactopt.transcription.blocks import BlockExpression, make_block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, stack
@@ -49,7 +51,7 @@ class Chain:
     places: tuple[Any, ...]
     base: bool = False
 
-    @property
+    @cached_property
     def length(self) -> int:
         """To which it is filled up."""
         return next((n for n in LENGTHS if n >= len(self.columns)), len(self.columns))
@@ -135,6 +137,17 @@ def chain_between(model: Any, one: int, other: int) -> Chain:
     return Chain(tuple(columns), tuple(signs), tuple(turns), (*places, place), base)
 
 
+_chains: WeakKeyDictionary[Robot, dict[tuple[int, int], Chain]] = WeakKeyDictionary()
+
+
+def _chain(robot: Robot, one: int, other: int) -> Chain:
+    """`chain_between`, found once for a robot: hundreds of pairs have one, in every program anew."""
+    known = _chains.setdefault(robot, {})
+    if (one, other) not in known:
+        known[one, other] = chain_between(robot.model, one, other)
+    return known[one, other]
+
+
 def _joint(model: Any, j: int) -> tuple[int, Any, float]:
     """Column, placement whose z axis is the joint's, and whether it turns."""
     data = model.joints[j].createData()
@@ -147,7 +160,7 @@ def _joint(model: Any, j: int) -> tuple[int, Any, float]:
 def _turned(direction: Array) -> Any:
     """A placement at the origin whose z axis has this direction."""
     up = np.array([0.0, 0.0, 1.0])
-    if np.allclose(direction, -up):
+    if np.abs(direction + up).max() < 1e-8:
         return pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     return pin.SE3(pin.Quaternion.FromTwoVectors(up, direction).matrix(), np.zeros(3))
 
@@ -262,7 +275,7 @@ def add_apart_rows(
     for row, held in rows.items():
         body = bodies.world[-1 - row.other] if row.other < 0 else None
         if (row.joint, row.other) not in chains:
-            chain = chain_between(b.robot.model, row.joint, max(row.other, 0))
+            chain = _chain(b.robot, row.joint, max(row.other, 0))
             pattern = chain.pattern(b.coordinates, None if body is None else body.rotation)
             chains[row.joint, row.other] = chain, pattern
         chain, pattern = chains[row.joint, row.other]

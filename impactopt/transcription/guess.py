@@ -210,16 +210,21 @@ def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
 def _histories(law: ContactLaw, target: Target, mass: float, speed: float) -> tuple[Array, Array]:
     """Instants (k,) [s], and rows of the mass's position and speed, the target's travel and state, force."""
 
+    of_law, of_target = law.parameters, target.parameters
+
+    def moves(y: Array) -> float:
+        return float(target.velocity(y[3:], of_target))
+
     def force(y: Array) -> float:
-        return float(law.force(float(y[0] - y[2]), float(y[1] - target.velocity(y[3:]))))
+        return float(law.force(float(y[0] - y[2]), float(y[1] - moves(y)), of_law))
 
     def flow(_: float, y: Array) -> list[float]:
         f = force(y)
-        return [y[1], -f / mass, float(target.velocity(y[3:])), *map(float, target.derivative(y[3:], f))]
+        return [y[1], -f / mass, moves(y), *map(float, target.derivative(y[3:], f, of_target))]
 
     def apart(_: float, y: Array) -> float:
-        rate = float(y[1] - target.velocity(y[3:]))
-        return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate))
+        rate = float(y[1] - moves(y))
+        return 1.0 if rate > 0 else float(law.separation(float(y[0] - y[2]), rate, of_law))
 
     apart.terminal, apart.direction = True, -1.0  # type: ignore[attr-defined]
     start = [0.0, speed, 0.0, *np.zeros(target.n_states)]

@@ -62,6 +62,23 @@ def test_rows_far_off_are_not_bent():
     assert "bent" not in result.history[1].note
 
 
+@pytest.mark.parametrize(("barrier", "follows"), [(1e-2, True), (1e-3, False)])
+def test_a_start_with_multipliers_keeps_to_the_path_from_a_high_barrier_only(barrier, follows):
+    """From multipliers of another optimum: a barrier that is low is given up at once, for what is near."""
+    old = solve_sqp(projection(np.full(12, -1.0)), np.ones(12))
+    program = projection(np.linspace(-2.0, 2.0, 12))
+    result = solve_sqp(
+        program,
+        old.x,
+        options=SQPOptions(barrier_warm=barrier),
+        multipliers=old.multipliers,
+        bound_multipliers=old.bound_multipliers,
+    )
+    assert result.status is Status.SOLVED
+    assert (f"barrier {barrier:.0e}" in result.history[1].note) is follows
+    np.testing.assert_allclose(result.x, np.maximum(np.linspace(-2.0, 2.0, 12), 0.0), atol=1e-3)
+
+
 def test_steps_that_crawl_give_way(monkeypatch):
     """Every step counts as a crawl here: after a few of them the rows become elastic."""
     monkeypatch.setattr(search, "_CRAWL", 2.0)

@@ -24,9 +24,9 @@ from impactopt.solvers.sqp.point import Point, TimedProgram
 
 _FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
 # the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and
-# loosely. From multipliers given it falls at once: the point is near, and there is no path to keep to. Where
-# elastic rows have to show that no point meets them, as in the paper.
-_CLOSE, _POWER, _CLOSE_WARM = 30.0, 1.3, 1e4
+# loosely. From multipliers given it falls at once, as the point is near and there is no path to keep to, but
+# from a first barrier so high. Where elastic rows have to show that no point meets them, as in the paper.
+_CLOSE, _POWER, _CLOSE_WARM, _HIGH = 30.0, 1.3, 1e4, 5e-3
 _CLOSE_ELASTIC, _POWER_ELASTIC = 10.0, 1.5
 _FINE, _FINEST = 0.6, 0.3  # times the tolerance: a mu that is small enough, and the least
 _PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing decides does not wander
@@ -180,7 +180,7 @@ class BarrierProblem:
         """Let mu fall as far as the iterate is good enough for; whether it has."""
         tolerance, hard, before = self.options.complementarity_tolerance, self.elastic is None, self.mu
         close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
-        if hard and self.warm:
+        if hard and self.warm and self.options.barrier_warm < _HIGH:
             close = _CLOSE_WARM
         while self.mu > _FINE * tolerance and self.error(self.mu, residual) <= close * self.mu:
             self.mu = max(_FINEST * tolerance, min(_FASTER * self.mu, self.mu**power))

@@ -41,6 +41,7 @@ class SQPOptions:
         convex by its eigenvalues rather than by a shift, QPs solved by the dense active-set method.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
     barrier, barrier_warm : of "interior", first barrier parameter, of starts without and with multipliers.
+        The latter, if below 5e-3, falls at once where the start is near a solution.
     push : of "interior", how far the start is moved inside its bounds.
 
     With QP solvers, levenberg, augmentation, curvature_floor and dense_limit are for programs that do not say

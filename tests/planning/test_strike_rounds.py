@@ -1,0 +1,146 @@
+"""The rounds of a strike: on with more rows between bodies, from where it is, until none are too near."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+from support.small_plans import changed
+
+from impactopt.bodies.shapes import Obstacle
+from impactopt.planning import strike as strikes
+from impactopt.planning.keeping_apart import Margins, missing_rows, rows_near
+from impactopt.planning.multistart import Budget
+from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription
+
+Array = NDArray[np.float64]
+ITERATIONS = 7
+
+
+@pytest.fixture(scope="module")
+def strike(arm_transcription: Transcription) -> StrikeTranscription:
+    t = arm_transcription
+    return StrikeTranscription(t.problem, t.coordinates, t.functions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scripted(Budget):
+    """Solves nothing: it ends as it is told to, where it starts, and keeps what it was asked for."""
+
+    ends: tuple[Status, ...] = ()
+    asked: list[dict[str, Any]] = field(default_factory=list)
+
+    def run(self, program: Any, start: Array | SolverResult, barrier: float | None = None) -> SolverResult:
+        status = self.ends[len(self.asked)]
+        given = start if isinstance(start, SolverResult) else None
+        self.asked.append({**(self.options or {}), "given": given, "from": barrier})
+        return SolverResult(
+            x=start if given is None else given.x,
+            multipliers=np.arange(1.0, program.m + 1),
+            bound_multipliers=np.ones(program.n),
+            objective=0.0,
+            status=status,
+            iterations=ITERATIONS,
+            seconds=0.0,
+            seconds_functions=0.0,
+            seconds_qp=0.0,
+            max_violation=0.0,
+            kkt=0.0,
+            message="",
+        )
+
+
+@pytest.fixture
+def rounds(
+    strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[StrikeTranscription, SolverResult, list[dict[str, Any]]]]:
+    """A strike with scripted solves, one row more after each of the first; ``deep``: which are of bodies in
+    each other. The rows are those of near bodies, which its first program is kept from having.
+    """
+
+    def run(*ends: Status, deep: tuple[bool, ...]) -> Any:
+        margins = Margins(strike.problem)
+        x = strike_iterate(strike)
+        rows = list(rows_near(strike, x, margins, 1.0).items())
+        left = [dict([row]) for row, _ in zip(rows, deep, strict=False)]
+        how = list(deep)
+        monkeypatch.setattr(strikes, "rows_near", lambda *_: {})
+        monkeypatch.setattr(strikes, "missing_rows", lambda *_: left.pop(0) if left else {})
+        monkeypatch.setattr(strikes, "_in_each_other", lambda *_: how.pop(0))
+        budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
+        t, result = strikes.clear_strike(budget, margins, strike, x)
+        return t, result, budget.asked
+
+    return run
+
+
+def test_a_round_goes_on_with_the_multipliers_and_none_for_its_new_row(rounds: Any) -> None:
+    t, result, (first, second) = rounds(Status.SOLVED, Status.SOLVED, deep=(False,))
+    assert first["given"] is None
+    before = t.program.m - 1
+    np.testing.assert_array_equal(second["given"].multipliers, [*np.arange(1.0, before + 1), 0.0])
+    assert second["from"] == strikes.BARRIER_NEAR
+    assert result.iterations == 2 * ITERATIONS, "the effort of all is told"
+
+
+def test_bodies_in_each_other_are_led_out_roughly_and_the_end_is_exact(rounds: Any) -> None:
+    _, _, (_, out, end) = rounds(*[Status.SOLVED] * 3, deep=(True,))
+    assert out["from"] == strikes.BARRIER_DEEP
+    assert out["kkt_tolerance"] == strikes.ROUGHLY["kkt_tolerance"]
+    assert "kkt_tolerance" not in end and end["given"] is not None
+
+
+def test_the_last_round_is_exact_however_deep_bodies_are(rounds: Any) -> None:
+    n = strikes.ROUNDS
+    _, _, asked = rounds(*[Status.SOLVED] * (n + 1), deep=(True,) * n)
+    assert ["kkt_tolerance" in each for each in asked] == [False, *[True] * (n - 1), False]
+
+
+def test_a_round_that_is_stuck_begins_again_without_multipliers(rounds: Any) -> None:
+    _, result, (*_, again) = rounds(Status.SOLVED, Status.FAILED, Status.SOLVED, deep=(True,))
+    assert again["given"] is None and "kkt_tolerance" not in again
+    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS
+
+
+def test_what_no_round_mends_is_a_result_of_its_own_program(rounds: Any) -> None:
+    t, result, _ = rounds(Status.SOLVED, Status.FAILED, Status.INFEASIBLE, deep=(False,))
+    assert result.status is Status.SOLVED
+    assert result.multipliers.size == t.program.m and not t.apart_rows
+
+
+def test_a_rough_result_is_never_told_as_a_solution(rounds: Any) -> None:
+    t, result, _ = rounds(Status.SOLVED, Status.SOLVED, Status.TIME_LIMIT, deep=(True,))
+    assert not t.apart_rows and result.multipliers.size == t.program.m, "but the one before it"
+    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS
+    t, result, _ = rounds(Status.SOLVED, Status.SOLVED, Status.INTERRUPTED, deep=(True,))
+    assert result.status is Status.INTERRUPTED and result.multipliers.size == t.program.m
+
+
+def test_it_ends_with_bodies_apart_though_it_began_with_no_row_for_them(
+    arm_transcription: Transcription, strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A box stands where the elbow is when the arm hits hardest."""
+    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    free = budget.run(strike.program, strike_iterate(strike))
+    model = strike.robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, strike.decode(free.x).posture)
+    elbow = data.oMi[model.getJointId("elbow")]
+    box = Obstacle(name="box", size=(0.06, 0.06, 0.06), position=elbow.act(np.array([0.0, 0.07, 0.0])))
+    of_box = changed(arm_transcription, obstacles=(box,))
+    t = StrikeTranscription(of_box.problem, of_box.coordinates, of_box.functions)
+    margins = Margins(t.problem)
+    assert missing_rows(t, free.x, margins)
+    monkeypatch.setattr(strikes, "FAR", -1.0)
+    t, result = strikes.clear_strike(budget, margins, t, strike_iterate(t))
+    assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
+    assert t.apart_rows and not missing_rows(t, result.x, margins)
+    assert result.iterations == result.history[-1].iteration

@@ -30,8 +30,9 @@ _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a 
 _ROUNDING = 1e-11
 # radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
-_ATTEMPTS = (0.5, False), (1.5, False), (0.5, True), (1.5, True)
+_ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
 _PATIENCE = 40  # iterations without less violation
+_WIDER = 3.0  # times that radius near points that meet the rows
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
 
@@ -205,13 +206,19 @@ class ReducedRun(Run):
             elif taken.point.max_violation <= self.options.violation_tolerance:
                 self._filter = []
                 self._begin_anew()
-        if taken.length == 1.0:
-            self._radius = min(2.0 * self._radius, self._widest)
-        elif taken.length < _TRIED:
-            self._radius = max(0.5 * self._radius, 1e-3)
+        self._trust(taken)
         rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
         words = f"step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
         return words if self._start is None else f"{words}, violation only"
+
+    def _trust(self, taken: Taken) -> None:
+        """Longer steps where full ones are taken, shorter ones where these are shortened."""
+        widest = self._widest * (_WIDER if self.point.violation < _NEAR else 1.0)
+        if taken.length == 1.0:
+            self._radius = min(2.0 * self._radius, widest)
+        else:
+            least = 0.5 * self._radius if taken.length < _TRIED else self._radius
+            self._radius = min(max(least, 1e-3), widest)
 
     def _give_way(self) -> Status | None:
         """Where no step is taken: only the violation counts from now on; or it is the end."""

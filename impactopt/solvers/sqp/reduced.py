@@ -32,6 +32,7 @@ _ROUNDING = 1e-11
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
 _PATIENCE = 40  # iterations without less violation
+_GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
 _WIDER = 3.0  # times that radius near points that meet the rows
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
@@ -174,7 +175,7 @@ class ReducedRun(Run):
             enough = relief > 1e-10 * before.violation and h <= before.violation - _ARMIJO * length * relief
             return False if enough else None
         if h > self._most or any(
-            h > 0.999 * p.violation and f > p.objective - 1e-4 * h for p in self._filter
+            h > 0.999 * p.violation and f > p.objective - _GAIN * h for p in self._filter
         ):
             return None
         slope = float(before.gradient @ solved.d)
@@ -182,7 +183,7 @@ class ReducedRun(Run):
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None
-        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - 1e-5 * h
+        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - _GAIN * h
         met = h <= self.options.violation_tolerance and f <= before.objective + noise
         return False if less or met else None
 

@@ -73,7 +73,8 @@ class ReducedRun(Run):
         start, y, z = self.point, self.y.copy(), self.z.copy()
         self.program.weigh(start)
         self._most = max(1.5 * start.violation, 1.0)
-        self._reduction = Reduction(self.program, start.jacobian, self._determined)
+        dense = self.options.hessian == "bfgs"
+        self._reduction = Reduction(self.program, start.jacobian, self._determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
         status = Status.INFEASIBLE
@@ -250,8 +251,8 @@ class ReducedRun(Run):
 
     def _settle_price(self, k: int, solved: Solved) -> None:
         """Rows that stay elastic, and cost all that they can, cost more."""
-        unequal = self._reduction.unequal
-        largest = float(np.max(np.abs(solved.y[unequal]) / self.program.weights[unequal], initial=0.0))
+        rows = self._reduction.rows
+        largest = float(np.max(np.abs(solved.y[rows]) / self.program.weights[rows], initial=0.0))
         if self._excess() and self._price < 1.5 * largest and k >= self._raised + _DEARER:
             self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
 

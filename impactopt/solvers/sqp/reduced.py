@@ -33,6 +33,7 @@ _ROUNDING = 1e-11
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
 _PATIENCE = 40  # iterations without less violation
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
+_BACK = 3  # steps back to the equalities, of a trial point
 _WIDER = 3.0  # times that radius near points that meet the rows
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
@@ -151,7 +152,7 @@ class ReducedRun(Run):
         """Shorten the step until it is taken; a full one is corrected for the rows' curvature first."""
         length = 1.0
         for attempt in range(_HALVINGS):
-            trial = self.program.point(self._inside(self.point.x + length * solved.d))
+            trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
             verdict = self._judge(trial, length, solved, model)
             if verdict is not None:
                 return Taken(trial, length, verdict, solved, "")
@@ -159,12 +160,27 @@ class ReducedRun(Run):
                 bent = trial.g - self.point.jacobian @ (trial.x - self.point.x)
                 again = self._solve(model, bent)
                 if again is not None:
-                    other = self.program.point(self._inside(self.point.x + again.d))
+                    other = self._back(self.program.point(self._inside(self.point.x + again.d)))
                     verdict = self._judge(other, 1.0, solved, model)
                     if verdict is not None:
                         return Taken(other, 1.0, verdict, again, ", corrected")
             length *= 0.5
         return None
+
+    def _back(self, trial: Point) -> Point:
+        """The trial point after steps back to the equalities, with the slopes of the point, while they help:
+        what rows determine is followed on its curve, and not along its tangent.
+        """
+        for _ in range(_BACK):
+            if not trial.finite or trial.violation < _ROUNDING:
+                break
+            other = self.program.point(self._inside(trial.x + self._reduction.normal(trial.g)))
+            if not other.violation < trial.violation:
+                break
+            enough, trial = other.violation > 0.5 * trial.violation, other
+            if enough:
+                break
+        return trial
 
     def _judge(self, trial: Point, length: float, solved: Solved, model: ReducedModel) -> bool | None:
         """Whether a point is taken, and then whether for the objective's sake; None: it is not."""

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from support.textbook import INF, Textbook, assert_optimal
 
+import impactopt.solvers.sqp.reduction as reduction_module
+from impactopt.files.problem_file.names import problem_file
 from impactopt.solvers.program import Determined, Status
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.solvers.sqp.point import TimedProgram
 from impactopt.solvers.sqp.reduction import Reduction
+from impactopt.studies.bench.attempts import judged
+from impactopt.studies.bench.solve import planning_program, strike_program
 
 WAYS = {
     "osqp": SQPOptions(qp_solver="osqp"),
@@ -28,8 +34,6 @@ class Chain(Textbook):
 
 
 def chain(bound: float = 3.0) -> Chain:
-    import casadi as ca
-
     return Chain(
         4,
         lambda a, b, c, d: -c + (d - 1) ** 2 + 0.1 * a**2,
@@ -52,6 +56,66 @@ def test_optima_are_those_of_the_whole_program(way: str) -> None:
     assert_optimal(program, result)
     assert result.objective == pytest.approx(solve_sqp(chain(), start).objective, abs=1e-5)
     assert (program.evaluations["hessian"] == 0) == (way == "bfgs")
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_matrices_are_sparse_where_many_variables_are_free(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction_module, "_LARGE", 1)
+    program = chain()
+    result = solve_sqp(program, [0.5, 0.0, 0.0, 0.5], options=WAYS[way])
+    assert result.status is Status.SOLVED
+    assert_optimal(program, result)
+    point = TimedProgram(program).point(result.x)
+    reduction = Reduction(TimedProgram(program), point.jacobian, Chain.determined)
+    reduction.load(point)
+    assert sp.issparse(reduction.T)
+    assert reduction.T.shape == (4, 2)  # the equality left is a row of the QP
+    assert not reduction.left.size
+    np.testing.assert_allclose((point.jacobian @ reduction.T).toarray()[:2], 0, atol=1e-12)
+
+
+def test_a_hessian_that_is_not_convex_is_lifted_and_stays_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction_module, "_LARGE", 1)
+    bent = Chain(
+        4,
+        lambda a, b, c, d: ca.cos(3 * a) - 2 * (d - 0.2) ** 2 + c,
+        lambda a, b, c, d: [(0, b - ca.sin(a), 0), (0, c - b**2 - a, 0), (-INF, a + d, 1)],
+        lower=-1,
+        upper=1,
+    )
+    result = solve_sqp(bent, [0.1, 0.0, 0.0, 0.2], options=WAYS["osqp"])
+    assert result.status is Status.SOLVED
+    assert_optimal(bent, result)
+
+
+def test_iterates_follow_the_curve_of_what_rows_determine() -> None:
+    curve = lambda a: 0.3 * a**2  # noqa: E731
+
+    class Curve(Textbook):
+        determined = (Determined((0,), np.array([1])),)
+
+    program = Curve(2, lambda a, b: (a - 2) ** 2 + b, lambda a, b: [(0, b - curve(a), 0)], lower=-9, upper=9)
+    violations: list[float] = []
+    result = solve_sqp(
+        program,
+        [-1.0, curve(-1.0)],
+        options=WAYS["osqp"],
+        callback=lambda record: violations.append(record.max_violation),
+    )
+    assert result.status is Status.SOLVED
+    # the tangent leaves it by 0.3 step^2
+    assert max(violations) < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["strike", "motion"])
+def test_osqp_solves_an_arm(kind: str) -> None:
+    make = strike_program if kind == "strike" else planning_program
+    program, start = make(problem_file("arm_planar"), seed=0, start=1)
+    result = solve_sqp(program, start, options=WAYS["osqp"])
+    found = judged(program, result)
+    assert result.status is Status.SOLVED
+    assert found.max_violation < 1e-6
+    assert found.kkt < 1e-4
 
 
 def test_rows_that_cannot_be_met_are_said_so() -> None:

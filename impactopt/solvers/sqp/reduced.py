@@ -30,8 +30,11 @@ _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a 
 _ROUNDING = 1e-11
 # radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
-_ATTEMPTS = (0.5, False), (1.5, False), (0.5, True), (1.5, True)
+_ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
 _PATIENCE = 40  # iterations without less violation
+_GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
+_BACK = 3  # steps back to the equalities, of a trial point
+_WIDER = 3.0  # times that radius near points that meet the rows
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
 
@@ -71,7 +74,8 @@ class ReducedRun(Run):
         start, y, z = self.point, self.y.copy(), self.z.copy()
         self.program.weigh(start)
         self._most = max(1.5 * start.violation, 1.0)
-        self._reduction = Reduction(self.program, start.jacobian, self._determined)
+        dense = self.options.hessian == "bfgs"
+        self._reduction = Reduction(self.program, start.jacobian, self._determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
         status = Status.INFEASIBLE
@@ -148,7 +152,7 @@ class ReducedRun(Run):
         """Shorten the step until it is taken; a full one is corrected for the rows' curvature first."""
         length = 1.0
         for attempt in range(_HALVINGS):
-            trial = self.program.point(self._inside(self.point.x + length * solved.d))
+            trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
             verdict = self._judge(trial, length, solved, model)
             if verdict is not None:
                 return Taken(trial, length, verdict, solved, "")
@@ -156,12 +160,27 @@ class ReducedRun(Run):
                 bent = trial.g - self.point.jacobian @ (trial.x - self.point.x)
                 again = self._solve(model, bent)
                 if again is not None:
-                    other = self.program.point(self._inside(self.point.x + again.d))
+                    other = self._back(self.program.point(self._inside(self.point.x + again.d)))
                     verdict = self._judge(other, 1.0, solved, model)
                     if verdict is not None:
                         return Taken(other, 1.0, verdict, again, ", corrected")
             length *= 0.5
         return None
+
+    def _back(self, trial: Point) -> Point:
+        """The trial point after steps back to the equalities, with the slopes of the point, while they help:
+        what rows determine is followed on its curve, and not along its tangent.
+        """
+        for _ in range(_BACK):
+            if not trial.finite or trial.violation < _ROUNDING:
+                break
+            other = self.program.point(self._inside(trial.x + self._reduction.normal(trial.g)))
+            if not other.violation < trial.violation:
+                break
+            enough, trial = other.violation > 0.5 * trial.violation, other
+            if enough:
+                break
+        return trial
 
     def _judge(self, trial: Point, length: float, solved: Solved, model: ReducedModel) -> bool | None:
         """Whether a point is taken, and then whether for the objective's sake; None: it is not."""
@@ -173,7 +192,7 @@ class ReducedRun(Run):
             enough = relief > 1e-10 * before.violation and h <= before.violation - _ARMIJO * length * relief
             return False if enough else None
         if h > self._most or any(
-            h > 0.999 * p.violation and f > p.objective - 1e-4 * h for p in self._filter
+            h > 0.999 * p.violation and f > p.objective - _GAIN * h for p in self._filter
         ):
             return None
         slope = float(before.gradient @ solved.d)
@@ -181,7 +200,7 @@ class ReducedRun(Run):
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None
-        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - 1e-5 * h
+        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - _GAIN * h
         met = h <= self.options.violation_tolerance and f <= before.objective + noise
         return False if less or met else None
 
@@ -205,13 +224,19 @@ class ReducedRun(Run):
             elif taken.point.max_violation <= self.options.violation_tolerance:
                 self._filter = []
                 self._begin_anew()
-        if taken.length == 1.0:
-            self._radius = min(2.0 * self._radius, self._widest)
-        elif taken.length < _TRIED:
-            self._radius = max(0.5 * self._radius, 1e-3)
+        self._trust(taken)
         rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
         words = f"step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
         return words if self._start is None else f"{words}, violation only"
+
+    def _trust(self, taken: Taken) -> None:
+        """Longer steps where full ones are taken, shorter ones where these are shortened."""
+        widest = self._widest * (_WIDER if self.point.violation < _NEAR else 1.0)
+        if taken.length == 1.0:
+            self._radius = min(2.0 * self._radius, widest)
+        else:
+            least = 0.5 * self._radius if taken.length < _TRIED else self._radius
+            self._radius = min(max(least, 1e-3), widest)
 
     def _give_way(self) -> Status | None:
         """Where no step is taken: only the violation counts from now on; or it is the end."""
@@ -242,8 +267,8 @@ class ReducedRun(Run):
 
     def _settle_price(self, k: int, solved: Solved) -> None:
         """Rows that stay elastic, and cost all that they can, cost more."""
-        unequal = self._reduction.unequal
-        largest = float(np.max(np.abs(solved.y[unequal]) / self.program.weights[unequal], initial=0.0))
+        rows = self._reduction.rows
+        largest = float(np.max(np.abs(solved.y[rows]) / self.program.weights[rows], initial=0.0))
         if self._excess() and self._price < 1.5 * largest and k >= self._raised + _DEARER:
             self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
 

@@ -8,8 +8,9 @@ from typing import Protocol
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
-from impactopt.solvers.program import Vector
+from impactopt.solvers.program import Matrix, Vector
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.point import Point, TimedProgram
 from impactopt.solvers.sqp.reduction import Reduction
@@ -19,6 +20,7 @@ _FLOOR = 1e-5  # least eigenvalue
 _ACTIVE = (0.0, 10.0, 1e2, 1e3, 1e4)
 _LEARNED = 1e-3  # least eigenvalue of what BFGS has learned
 _FIRST = 1e-2  # curvature that BFGS begins with
+_SHIFT = 1e-4  # least of a sparse Hessian that is not convex
 _STEEP = 0.1  # curvature where only the violation counts
 
 
@@ -29,22 +31,22 @@ class ReducedModel:
     leads : whether it is of the objective; else of the violation alone.
     """
 
-    B: np.ndarray
+    B: Matrix  # it, T and of_start are dense or sparse, as the reduction is
     gradient: Vector
-    T: np.ndarray
-    of_start: np.ndarray | None  # T' H (r, n): what d0 adds to the gradient
+    T: Matrix
+    of_start: Matrix | None  # T' H (r, n): what d0 adds to the gradient
     leads: bool = True
 
     def slope(self, d0: Vector) -> Vector:
         """Gradient by t where the step d0 is made already."""
         out = self.T.T @ self.gradient
-        return out if self.of_start is None else out + self.of_start @ d0
+        return np.asarray(out if self.of_start is None else out + self.of_start @ d0)
 
 
 class ModelRule(Protocol):
     """Makes the model at a point."""
 
-    def at(self, point: Point, y: Vector, active: np.ndarray, objective: bool) -> ReducedModel:
+    def at(self, point: Point, y: Vector, active: Matrix, objective: bool) -> ReducedModel:
         """Of the Lagrangian with multipliers y (m,); active (a, r): unit rows that hold; objective: whether
         it counts, or the violation alone."""
         ...
@@ -59,8 +61,9 @@ class ExactModel:
 
     def __init__(self, program: TimedProgram, reduction: Reduction):
         self._program, self._reduction = program, reduction
+        self._shift = 0.0
 
-    def at(self, point: Point, y: Vector, active: np.ndarray, objective: bool) -> ReducedModel:
+    def at(self, point: Point, y: Vector, active: Matrix, objective: bool) -> ReducedModel:
         T = self._reduction.T
         if not objective:
             return _steep(point, T)
@@ -68,10 +71,25 @@ class ExactModel:
         H = self._program.hessian(point.x, 1.0, y)
         of_start = T.T @ H
         B = of_start @ T
+        if self._reduction.sparse:
+            return ReducedModel(self._lifted(0.5 * (B + B.T), active), point.gradient, T, of_start)
         return ReducedModel(_convex(0.5 * (B + B.T), active), point.gradient, T, of_start)
 
     def forget(self) -> None:
-        return None
+        self._shift = 0.0
+
+    def _lifted(self, B: Matrix, active: Matrix) -> Matrix:
+        """B with a weight of active rows, and a multiple of the identity, that make it convex and keep it
+        sparse."""
+        rows, identity = active.T @ active, sp.eye_array(B.shape[0], format="csc")
+        for weight in _ACTIVE[:2]:
+            if _is_convex(made := B + weight * rows):
+                self._shift /= 3.0
+                return made
+        self._shift = max(self._shift / 3.0, _SHIFT)
+        while not _is_convex(lifted := made + self._shift * identity):
+            self._shift *= 4.0
+        return lifted
 
 
 class BFGSModel:
@@ -85,7 +103,7 @@ class BFGSModel:
         self._B = _FIRST * np.eye(self._reduction.free.size)
         self._last: tuple[Point, np.ndarray] | None = None
 
-    def at(self, point: Point, y: Vector, active: np.ndarray, objective: bool) -> ReducedModel:
+    def at(self, point: Point, y: Vector, active: Matrix, objective: bool) -> ReducedModel:
         reduction = self._reduction
         if not objective:
             return _steep(point, reduction.T)
@@ -107,7 +125,7 @@ class BFGSModel:
         before, basis = self._last
         reduction = self._reduction
         only = np.zeros_like(y)
-        only[reduction.unequal] = y[reduction.unequal]
+        only[reduction.rows] = y[reduction.rows]
         step = (point.x - before.x)[reduction.free]
         change = reduction.gradient(point.gradient + point.jacobian.T @ only)
         change = change - basis.T @ (before.gradient + before.jacobian.T @ only)
@@ -118,6 +136,14 @@ class BFGSModel:
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
+
+
+def _is_convex(B: Matrix) -> bool:
+    try:
+        la.cholesky(B.toarray() - _FLOOR * np.eye(B.shape[0]), overwrite_a=True, check_finite=False)
+    except la.LinAlgError:
+        return False
+    return True
 
 
 def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
@@ -132,8 +158,9 @@ def _convex(B: np.ndarray, active: np.ndarray) -> np.ndarray:
     return np.asarray((vectors * np.maximum(values, _FLOOR)) @ vectors.T)
 
 
-def _steep(point: Point, T: np.ndarray) -> ReducedModel:
-    return ReducedModel(_STEEP * np.eye(T.shape[1]), np.zeros_like(point.gradient), T, None, leads=False)
+def _steep(point: Point, T: Matrix) -> ReducedModel:
+    B = _STEEP * (sp.eye_array(T.shape[1], format="csc") if sp.issparse(T) else np.eye(T.shape[1]))
+    return ReducedModel(B, np.zeros_like(point.gradient), T, None, leads=False)
 
 
 def make_model(program: TimedProgram, options: SQPOptions, reduction: Reduction) -> ModelRule:

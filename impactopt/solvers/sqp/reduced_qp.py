@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as la
 import scipy.sparse as sp
 
-from impactopt.solvers.program import Vector, row_violations
+from impactopt.solvers.program import Matrix, Vector, row_violations
 from impactopt.solvers.sqp.point import Point, TimedProgram
 from impactopt.solvers.sqp.qp import QPSolver, QuadraticProgram
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel
@@ -52,19 +51,20 @@ class ReducedQP:
     def start_from(self, y: Vector, z: Vector) -> None:
         """Take multipliers from elsewhere as the guess of the active set."""
         reduction = self._reduction
-        self._unit = np.concatenate([y[reduction.unequal], z[reduction.bounded]])
+        self._unit = np.concatenate([y[reduction.rows], z[reduction.bounded]])
 
-    def active(self, point: Point) -> np.ndarray:
+    def active(self, point: Point) -> Matrix:
         """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
         return self._rows(point, np.flatnonzero(np.abs(self._unit) > _ACTIVE))
 
-    def _rows(self, point: Point, which: np.ndarray) -> np.ndarray:
-        """Rows (k, r) of these numbers: of the rows that are no equalities, then of the bounds."""
+    def _rows(self, point: Point, which: np.ndarray) -> Matrix:
+        """Rows (k, r) of these numbers: of the rows that are not eliminated, then of the bounds."""
         reduction, T = self._reduction, self._reduction.T
-        count = reduction.unequal.size
-        rows = reduction.unequal[which[which < count]]
-        own = (point.jacobian.tocsr()[rows] @ T) / point.row_norms[rows][:, None]
-        return np.vstack([own, T[reduction.bounded[which[which >= count] - count]]])
+        count = reduction.rows.size
+        rows = reduction.rows[which[which < count]]
+        own = sp.diags_array(1.0 / point.row_norms[rows]) @ (point.jacobian.tocsr()[rows] @ T)
+        bounds = T[reduction.bounded[which[which >= count] - count]]
+        return sp.vstack([own, bounds]) if reduction.sparse else np.vstack([own, bounds])
 
     def solve(
         self,
@@ -78,15 +78,15 @@ class ReducedQP:
     ) -> Solved | None:
         """The step where rows are g (m,) and have the point's slopes; None if the QP solver fails."""
         p, reduction, norms = self._program, self._reduction, point.row_norms
-        unequal, bounded, T = reduction.unequal, reduction.bounded, reduction.T
+        rows, bounded, T = reduction.rows, reduction.bounded, reduction.T
         d0 = reduction.normal(g)
         longest = (_CAREFUL if self.careful or not model.leads else _LARGEST) * radius
         d0 *= min(1.0, longest / max(float(np.abs(d0).max(initial=0.0)), 1e-300))
-        after, scale = g + point.jacobian @ d0, norms[unequal]
+        after, scale = g + point.jacobian @ d0, norms[rows]
         x = point.x + d0
-        lower = np.concatenate([(p.g_lower - after)[unequal] / scale, (p.x_lower - x)[bounded]])
-        upper = np.concatenate([(p.g_upper - after)[unequal] / scale, (p.x_upper - x)[bounded]])
-        prices = price * np.concatenate([(p.weights * norms)[unequal], np.ones(bounded.size)])
+        lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
+        upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
+        prices = price * np.concatenate([(p.weights * norms)[rows], np.ones(bounded.size)])
         working = (np.abs(self._unit) > 1e-9) | (np.minimum(-lower, upper) < _NEAR)
         slope, unit, iterations = model.slope(d0), self._unit, 0
         guess = np.zeros(T.shape[1])
@@ -105,7 +105,7 @@ class ReducedQP:
             step = T @ guess
             unit = np.zeros(lower.size)
             unit[which] = found.y
-            values = np.concatenate([(point.jacobian @ step)[unequal] / scale, step[bounded]])
+            values = np.concatenate([(point.jacobian @ step)[rows] / scale, step[bounded]])
             missed = np.where(working, 0.0, np.maximum(lower - values, values - upper))
             if missed.max(initial=0.0) <= _MISSED:
                 break
@@ -113,13 +113,13 @@ class ReducedQP:
             working[worst[missed[worst] > 0]] = True
         self._unit = unit
         d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
-        y[unequal], z[bounded] = unit[: unequal.size] / scale, unit[unequal.size :]
+        y[rows], z[bounded] = unit[: rows.size] / scale, unit[rows.size :]
         linear = float(p.weights @ row_violations(p, g + point.jacobian @ d))
         return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations)
 
 
 def _elastic(
-    B: np.ndarray, c: Vector, A: np.ndarray, lower: Vector, upper: Vector, radius: float, prices: Vector
+    B: Matrix, c: Vector, A: Matrix, lower: Vector, upper: Vector, radius: float, prices: Vector
 ) -> QuadraticProgram:
     """The QP in (t, s), s >= 0 at a price: A t + s >= lower where t = 0 is below, A t - s <= upper above."""
     below, above = np.flatnonzero(lower > 1e-9), np.flatnonzero(upper < -1e-9)
@@ -127,10 +127,10 @@ def _elastic(
     k, n = elastic.size, c.size
     box = np.full(n, radius)
     if k:
-        S = np.zeros((lower.size, k))
-        S[elastic, np.arange(k)] = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        A, c = np.hstack([A, S]), np.concatenate([c, prices[elastic]])
-        B = la.block_diag(B, np.diag(_SLACK_CURVATURE * prices[elastic]))
+        sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
+        S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
+        A, c = sp.hstack([sp.csc_array(A), S]), np.concatenate([c, prices[elastic]])
+        B = sp.block_diag([B, sp.diags_array(_SLACK_CURVATURE * prices[elastic])])
     return QuadraticProgram(
         P=sp.csc_array(B),
         q=c,

@@ -22,6 +22,8 @@ from impactopt.solvers.sqp.condense import find_eliminations
 from impactopt.solvers.sqp.point import Point, TimedProgram
 
 Index = npt.NDArray[np.intp]
+_LARGE = 300  # free variables: beyond, QPs stay sparse, with the equalities that are left as rows
+_NOTHING = 1e-13  # what rounding leaves of a zero
 _RANK = 1e-9  # of the equalities left: what is this much smaller than the largest depends on the others
 
 
@@ -31,13 +33,22 @@ class Reduction:
     Attributes
     ----------
     gone, variables : rows that are eliminated, and the variables that they determine.
-    free : the other variables.  left : equalities that are left.  unequal : rows that are none.
+    free : the other variables.  sparse : whether they are many.
+    left : equalities that are left, none where it is sparse.  rows : all others that are not gone.
     bounded : variables with a bound, whichever they are.
-    T : (n, r) steps of all variables, one a column, that keep all equalities; r is the size of the QPs.
+    T : (n, r) steps of all variables, one a column, that keep the equalities but those in `rows`; r is the
+        size of the QPs; sparse or dense.
     """
 
-    def __init__(self, program: TimedProgram, jacobian: Matrix, determined: Sequence[Determined]):
-        """jacobian : (m, n) csc, at any point."""
+    def __init__(
+        self,
+        program: TimedProgram,
+        jacobian: Matrix,
+        determined: Sequence[Determined],
+        *,
+        dense: bool = False,
+    ):
+        """jacobian : (m, n) csc, at any point.  dense : never sparse, however many variables are free."""
         equal = program.g_lower == program.g_upper
         found = find_eliminations(jacobian, equal, determined)
         none = np.zeros(0, dtype=np.intp)
@@ -47,7 +58,9 @@ class Reduction:
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
         here = np.ones(program.m, dtype=bool)
         here[self.gone] = False
-        self.left, self.unequal = np.flatnonzero(here & equal), np.flatnonzero(here & ~equal)
+        self.sparse = not dense and self.free.size > _LARGE
+        apart = here & equal & (not self.sparse)
+        self.left, self.rows = np.flatnonzero(apart), np.flatnonzero(here & ~apart)
         self.bounded = np.flatnonzero(np.isfinite(program.x_lower) | np.isfinite(program.x_upper))
         self._n = program.n
 
@@ -61,14 +74,14 @@ class Reduction:
         rows = point.jacobian.tocsr()
         of_gone, self._of_left = rows[self.gone].tocsc(), rows[self.left]
         self._factors: Any = None
-        Z = np.zeros((self._n, self.free.size))
-        Z[self.free, np.arange(self.free.size)] = 1.0
+        determined = np.zeros((0, self.free.size))
         if self.gone.size:
             try:
                 self._factors = spla.splu(sp.csc_matrix(of_gone[:, self.variables]))
             except RuntimeError as error:
                 raise np.linalg.LinAlgError(str(error)) from None
-            Z[self.variables] = -self._factors.solve(of_gone[:, self.free].toarray())
+            determined = -self._factors.solve(of_gone[:, self.free].toarray())
+        Z = self._placed(determined)
         self._Z = Z
         A = self._of_left @ Z
         if not self.left.size:
@@ -80,6 +93,18 @@ class Reduction:
         rank = int((sizes > _RANK * max(float(sizes.max(initial=0.0)), 1e-300)).sum())
         self._Y, self._R = Q[:, :rank], R[:rank]
         self.T = Z @ Q[:, rank:]
+
+    def _placed(self, determined: np.ndarray) -> Any:
+        """(n, f) from what the variables that are determined do with each of the free ones."""
+        every = np.arange(self.free.size)
+        if not self.sparse:
+            Z = np.zeros((self._n, self.free.size))
+            Z[self.free, every], Z[self.variables] = 1.0, determined
+            return Z
+        i, j = np.nonzero(np.abs(determined) > _NOTHING)
+        rows, columns = np.concatenate([self.free, self.variables[i]]), np.concatenate([every, j])
+        values = np.concatenate([np.ones(every.size), determined[i, j]])
+        return sp.csr_array((values, (rows, columns)), shape=(self._n, self.free.size))
 
     def normal(self, g: Vector) -> Vector:
         """The step (n,) that meets the linearized equalities, as well as they can be, whose values are g
@@ -110,7 +135,7 @@ class Reduction:
         return y
 
     @property
-    def basis(self) -> np.ndarray:
+    def basis(self) -> Any:
         """(n, f) what all variables do with each of the free ones."""
         return self._Z
 

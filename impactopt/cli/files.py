@@ -39,8 +39,25 @@ def check(
             typer.echo(json.dumps(found, indent=2))
             return
         typer.echo(printable(f"{file} is sound:"))
-        for name, value in problem.describe().items():
-            typer.echo(printable(f"  {name:<8} {value}"))
+        plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
+        for name, value in (problem.describe() | plain).items():
+            typer.echo(printable(f"  {name:<10} {_in_words(value)}"))
+
+
+def _with_units(thing: Any) -> str:
+    """`SpringDamper, stiffness 10000 N/m, damping 300 N s/m` of a law or target."""
+    from impactopt.contact.fields import abouts
+
+    numbers = [(field.name, getattr(thing, field.name), told.unit) for field, told in abouts(type(thing))]
+    parts = [f"{name} {value:g} {unit}".rstrip() for name, value, unit in numbers if isinstance(value, float)]
+    return ", ".join([type(thing).__name__, *parts]) if parts else repr(thing)
+
+
+def _in_words(value: Any) -> str:
+    """A value of `ImpactProblem.describe` as a person writes it."""
+    if isinstance(value, list):
+        return ("; " if value and isinstance(value[0], str) else ", ").join(_in_words(one) for one in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def new(

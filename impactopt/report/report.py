@@ -12,7 +12,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
-from impactopt.report.result_rows import result_columns, result_rows
+from impactopt.report.result_rows import result_columns, result_rows, worst_rows
 from impactopt.report.stage import stage_of
 
 __all__ = ["Report", "report_of"]
@@ -127,8 +127,8 @@ def _violations(s: Mapping[str, Any]) -> str:
     if not s.get("violations"):
         return ""
     rows = "".join(
-        f'<tr><th scope="row">{escape(str(v["row"]))}</th><td>{escape(str(v["by"]))}</td></tr>'
-        for v in s["violations"]
+        f'<tr><th scope="row">{escape(row)}</th><td>{escape(by)}</td></tr>'
+        for row, by in worst_rows(s["violations"])
     )
     table = f'<div class="card scroll"><table><tbody>{rows}</tbody></table></div>'
     return f"<h2>What is not met, worst first</h2>{table}"

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.solvers.program import MINOR
+
 __all__ = [
     "Cell",
     "Row",
@@ -16,6 +18,7 @@ __all__ = [
     "replay_columns",
     "result_columns",
     "result_rows",
+    "worst_rows",
 ]
 
 PHASES = ("swing", "collision", "follow")
@@ -111,6 +114,23 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     return [row for row in rows if row is not None]
 
 
+def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """What is not met, and by how much, worst first: the worst row of each term, and how many more it has.
+
+    violations : as in ``summary.json``. What is off by less than `MINOR` of the worst only follows from it.
+    """
+    worst = max((v.get("amount") or 0.0 for v in violations), default=0.0)
+    terms: dict[str, list[Mapping[str, Any]]] = {}
+    for v in violations:
+        if v.get("amount") is None or v["amount"] >= MINOR * worst:
+            terms.setdefault(str(v["row"]).partition(",")[0], []).append(v)
+
+    def more(count: int) -> str:
+        return f" (and {count} more row{'s' if count > 1 else ''})" if count else ""
+
+    return [(f"{rows[0]['row']}{more(len(rows) - 1)}", str(rows[0]["by"])) for rows in terms.values()]
+
+
 def _target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
@@ -144,8 +164,16 @@ def number_row(
     """None where no column has a number; what is not between `least` and `most` is not good."""
     if all(value is None for value in values):
         return None
-    cells = [Cell("-") if v is None else Cell(f"{scale * v:.{digits}f}", least <= v <= most) for v in values]
+    cells = [
+        Cell("-") if v is None else Cell(_rounded(scale * v, digits), least <= v <= most) for v in values
+    ]
     return Row(label, tuple(cells))
+
+
+def _rounded(value: float, digits: int) -> str:
+    """As text; what rounds to zero has no sign."""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if float(text) == 0 else text
 
 
 def _word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> Row | None:

@@ -427,7 +427,7 @@ def test_every_condition_has_its_range_and_the_defaults_are_the_plan() -> None:
 def test_without_mujoco_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     still = reference([0.0, 1.0], np.zeros(1), nv=1, n=1)
-    with pytest.raises(InputError, match=r"pip install 'impactopt\[validate\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[validate\]'"):
         simulate_mujoco(slider(6.0), still, scene())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -16,17 +17,22 @@ __all__ = ["drive_nail", "optimize_strike", "solve"]
 
 R = TypeVar("R")
 
+_log = logging.getLogger("impactopt")  # its lines are seen by who asks for level INFO
+
 _ABOUT = """
 
     problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one that
         comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else is
         given.
+    report : where it is None, its lines go to the logger "impactopt", with level INFO.
 """
 
 
 def _or_file(run: Callable[..., R]) -> Callable[..., R]:
     @functools.wraps(run)
     def of_either(problem: ImpactProblem | str | os.PathLike[str], *args: Any, **options: Any) -> R:
+        if options.get("report") is None:
+            options["report"] = _log.info
         if isinstance(problem, ImpactProblem):
             return run(problem, *args, **options)
         if not isinstance(problem, (str, os.PathLike)):

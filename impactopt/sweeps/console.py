@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 __all__ = ["SweepConsole", "told", "words_for_time"]
 
 BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewritten
+
+_log = logging.getLogger("impactopt")
 
 Say = Callable[[str], None]
 Progress = Callable[[SweepProgress], None]
@@ -74,7 +77,7 @@ def told(report: Say | None, progress: Progress | bool | None) -> Iterator[tuple
     if progress is True or (progress is None and report is None):
         console = _console(always=progress is True)
     if console is None:
-        yield report or _ignore, progress if callable(progress) else _ignore
+        yield report or _log.info, progress if callable(progress) else _ignore
         return
     with SweepConsole(console) as shown:
         yield report or shown.say, shown.progress
@@ -100,5 +103,5 @@ def _console(*, always: bool) -> Console | None:
     return terminal if terminal.is_terminal or always else None
 
 
-def _ignore(_: object) -> None:
+def _ignore(_: SweepProgress) -> None:
     pass

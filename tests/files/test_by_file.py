@@ -53,6 +53,18 @@ def test_a_file_brings_its_solver_and_arguments_go_before_it(
     assert second["time_limit"] == 3.0 and second["options"] == {"max_iterations": 9}
 
 
+def test_what_is_said_goes_to_the_log_or_to_who_asks(
+    asked: list[tuple[Any, dict[str, Any]]], caplog: pytest.LogCaptureFixture
+) -> None:
+    said = list[str]()
+    by_file.solve("arm_planar")
+    by_file.solve(load_problem("arm_planar"), report=said.append)
+    with caplog.at_level("INFO", logger="impactopt"):
+        for _, options in asked:
+            options["report"]("building: 100 % done")
+    assert caplog.messages == said == ["building: 100 % done"]
+
+
 @pytest.mark.parametrize("given", [3, None, {}])
 def test_what_is_no_problem_is_refused(given: Any) -> None:
     with pytest.raises(InputError, match="give an ImpactProblem"):

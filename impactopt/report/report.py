@@ -93,7 +93,7 @@ def _cards(s: Mapping[str, Any]) -> str:
     card(str(s.get("status", "?")), spent, "good" if s.get("status") == "solved" else "bad")
     if s.get("impulse_Ns") is not None:
         error = replay.get("impulse_error_pct")
-        beside = "" if error is None else f", {error:+.1f}{NARROW}% when replayed"
+        beside = "" if error is None else f", {round(error, 1) + 0.0:+.1f}{NARROW}% when replayed"
         card(f"{s['impulse_Ns']:.2f} N s", f"planned impulse{beside}")
     if s.get("peak_force_N") is not None:
         card(f"{s['peak_force_N']:.0f} N", f"planned peak force, over {s['contact_ms']:.0f}{NARROW}ms")

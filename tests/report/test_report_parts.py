@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -310,6 +311,22 @@ def test_a_track_says_what_the_record_says(record: Record, solution: Solution) -
     assert planned.travel[-1] == pytest.approx(min(2.0 * (0.02 + end), FAR), abs=1e-3)
 
 
+def test_the_motion_for_a_missing_target_is_there_without_the_target(
+    record: Record, solution: Solution
+) -> None:
+    a = record.arrays
+    missed = {f"missed_{n.removeprefix('reference_')}": a[n] for n in a if n.startswith("reference_")}
+    missed["missed_ground"] = np.tile([0.0, 0.0, 500.0, 0.0, -5.0, 0.0], (len(a["reference_time"]), 1))
+    both = dataclasses.replace(record, arrays={**a, **missed})
+    *others, track = tracks_of(both, solution.problem)
+    assert track.name == "planned, target missing" and track.missing
+    assert not any(other.missing for other in others) and others[0].name == "planned"
+    assert np.isnan(track.contact_start) and not track.force.any() and not track.travel.any()
+    np.testing.assert_allclose(track.zmp, np.tile([0.01, 0.0], (len(track.time), 1)))
+    header, _ = stage_of(both, solution.problem)
+    assert [t["missing"] for t in header["tracks"]] == [False, False, False, True]
+
+
 def test_in_contact_the_planned_robot_moves_on_between_its_planned_states(biped_plan: Any) -> None:
     """The reference coasts and jumps back; what is drawn has the plan's states and rates at both ends."""
     plan, problem = biped_plan.plan, biped_plan.problem
@@ -378,7 +395,9 @@ def test_charts_hold_the_records_numbers(record: Record) -> None:
             assert np.nanmin(arrays[s["y"]]) == pytest.approx(1e3 * min(key["zmp_margin_m"].values()))
     for chart in charts:
         for s in chart["series"]:
-            assert {s[key] for key in ("x", "y", "xy", "time", "margin") if key in s} <= set(arrays)
+            assert {s[key] for key in ("x", "y", "xy", "time") if key in s} <= set(arrays)
+    joints = next(chart["joints"] for chart in charts if "joints" in chart)
+    assert joints == list(record.arrays["joints"]), "by the names that a file takes"
 
 
 def test_the_planned_hand_is_as_fast_as_the_plan_says(biped_plan: Any) -> None:

@@ -34,6 +34,7 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
 )
 
 PLANNED, SIMULATED, OVER = BLUE, VERMILION, VERMILION
+RIGHT = "-y, to the right [m]"  # an axis of what is seen from above or from behind: y is to the left
 PHASES = ("swing", "collision", "follow-through")
 
 # [in] what a paper's column and its page are wide; a picture of that width needs no scaling in print

@@ -12,8 +12,8 @@ from impactopt.collision import Collision
 from impactopt.errors import InputError
 from impactopt.report.pictures.style import MODELS, PAGE, Array, Picture, styled
 
-# in turn, from the coarsest model to the finest: a virtual mass, the paper's SDC, ours, and ours frozen again in
-# shades of one colour; what is beside the reference is drawn thin
+# in turn, from the coarsest model to the finest: a virtual mass, the paper's SDC, ours, and ours frozen again
+# in shades of one colour; what is beside the reference is drawn thin
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": MODELS["virtual-mass"], "linestyle": ":", "linewidth": 1.8},
     {"color": MODELS["sdc-paper"], "linestyle": "--"},

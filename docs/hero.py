@@ -26,12 +26,18 @@ from impactopt.report.animation import animation_of  # noqa: E402
 PANEL = (560, 780)  # [px], which are drawn twice as large, for smooth edges
 LETTERS = 22  # [px]
 SKY = ((246, 248, 251), (221, 227, 234))  # from above to below, as on the page
-BEGIN = (
-    "(() => { const p = page.clock, v = p.view; p.play(false); document.documentElement.dataset.theme = 'light';"
-    f" Object.assign(v.shown, {{com: false}}); Object.assign(v.canvas, {{width: {2 * PANEL[0]},"
-    f" height: {2 * PANEL[1]}}}); v.look('3/4'); v.yaw += 0.3; v.distance = 3.6 * v.size; v.centre[2] += 0.02;"
-    " v.centre[0] += 0.02; return true; })()"
-)
+BEGIN = f"""(() => {{
+  const p = page.clock, v = p.view;
+  p.play(false);
+  document.documentElement.dataset.theme = "light";
+  v.shown.com = false;
+  [v.canvas.width, v.canvas.height] = [{2 * PANEL[0]}, {2 * PANEL[1]}];
+  v.look("3/4");
+  v.yaw += 0.3;
+  v.distance = 3.6 * v.size;
+  for (const k of [0, 2]) v.centre[k] += 0.02;
+  return true;
+}})()"""
 # drawn and read at once: a canvas keeps nothing until later
 DRAW = "(page.clock.view.draw(0, %.5f), page.clock.view.canvas.toDataURL('image/png'))"
 

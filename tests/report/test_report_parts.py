@@ -15,6 +15,7 @@ from support.fake_solution import still_problem, still_solution
 
 from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.meshes import find_mesh, read_mesh
+from impactopt.bodies.pieces import pieces_of
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
 from impactopt.bodies.surroundings import surroundings_of
@@ -152,6 +153,28 @@ def test_locked_and_floating_joints_keep_shapes_in_place(lamp: Path) -> None:
     assert [v.joint for v in visuals_of(robot)] == [1, 2, 2]
     with pytest.raises(FileNotFoundError):
         find_mesh("package://lamp_description/meshes/gone.stl", lamp)
+
+
+def test_what_has_lost_its_meshes_is_a_box_and_bones(
+    lamp: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot.from_urdf(lamp, floating=False)
+    assert [piece.joint for piece in pieces_of(robot)[0]] == [0, 1, 1] and "lost" not in pieces_of(robot)[1]
+    alone = tmp_path_factory.mktemp("elsewhere") / "alone.urdf"  # its meshes are not beside it
+    shade = URDF.index('<link name="shade">')
+    no_cylinder = '<geometry><mesh filename="package://lamp_description/meshes/tip.stl"/></geometry>'
+    alone.write_text(
+        URDF[:shade]
+        + URDF[shade:].replace('<geometry><cylinder radius="0.1" length="0.4"/></geometry>', no_cylinder)
+    )
+    robot = Robot.from_urdf(alone, floating=False)
+    base, *rest = visuals_of(robot)
+    assert base.joint == 0 and {visual.joint for visual in rest} == {1}, "the shade is drawn all the same"
+    pieces, source = pieces_of(robot)
+    assert [piece.joint for piece in pieces] == [0, 1], "and kept apart"
+    assert "inertia of 1 that have lost" in source
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(lamp.parents[2]))
+    assert "lost" not in pieces_of(robot)[1], "ROS knows where its packages are"
 
 
 def test_mesh_files_of_other_kinds_are_read_too(tmp_path: Path) -> None:

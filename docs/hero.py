@@ -34,8 +34,8 @@ BEGIN = f"""(() => {{
   [v.canvas.width, v.canvas.height] = [{2 * PANEL[0]}, {2 * PANEL[1]}];
   v.look("3/4");
   v.yaw += 0.3;
-  v.distance = 3.6 * v.size;
-  for (const k of [0, 2]) v.centre[k] += 0.02;
+  v.distance = 3.2 * v.size;
+  v.centre[0] += 0.04;
   return true;
 }})()"""
 # drawn and read at once: a canvas keeps nothing until later

@@ -114,7 +114,7 @@ class View {
     return { array, count: data.length / 6 };
   }
 
-  // what the camera looks at: all joints and hands of the first motion, or all of a robot that stands still
+  // what the camera looks at: all joints and hands of the first motion, and all bodies at its start
   frame() {
     const { arrays, header } = this, { name } = header.tracks[0];
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
@@ -124,7 +124,14 @@ class View {
     for (let k = 0; k < places.length / 7; k++) if (k % joints) take([...places.slice(7 * k, 7 * k + 3)]);
     for (let k = 0; k < hand.length / 3; k++) take([...hand.slice(3 * k, 3 * k + 3)]);
     take(header.point);
-    const still = header.hulls && this.instant(header.tracks[0], 0);
+    const still = this.instant(header.tracks[0], 0);
+    for (const { joint, low: from, step } of header.bodies) {
+      const m = this.pose(still, joint), span = step.map((x) => 65535 * x);
+      for (let corner = 0; corner < 8; corner++) {
+        const [x, y, z] = from.map((v, k) => v + ((corner >> k) & 1) * span[k]);
+        take([0, 1, 2].map((k) => m[k] * x + m[4 + k] * y + m[8 + k] * z + m[12 + k]));
+      }
+    }
     arrays.spheres_joint?.forEach((joint, k) => {
       const m = times(this.pose(still, joint), scaled([...arrays.spheres_centre.slice(3 * k, 3 * k + 3)], 1));
       for (const r of [-arrays.spheres_radius[k], arrays.spheres_radius[k]]) take([m[12] + r, m[13] + r, m[14] + r]);

@@ -89,19 +89,19 @@ class Simulation:
     """
 
     engine: str
-    time: Array
-    q: Array
-    v: Array
-    force: Array
-    target_speed: Array
-    hand_speed: Array
-    demand: Array
-    torque: Array
-    sole_ground: Array
+    time: Array = field(repr=False)
+    q: Array = field(repr=False)
+    v: Array = field(repr=False)
+    force: Array = field(repr=False)
+    target_speed: Array = field(repr=False)
+    hand_speed: Array = field(repr=False)
+    demand: Array = field(repr=False)
+    torque: Array = field(repr=False)
+    sole_ground: Array = field(repr=False)
     soles: tuple[str, ...]
-    cop_margin: Array
-    slip: Array
-    lift: Array
+    cop_margin: Array = field(repr=False)
+    slip: Array = field(repr=False)
+    lift: Array = field(repr=False)
     contact_start: float
     contact_end: float
     impulse: float

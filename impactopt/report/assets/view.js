@@ -50,7 +50,8 @@ const MARKS = [
 class View {
   constructor(canvas, header, arrays) {
     Object.assign(this, { canvas, header, arrays });
-    this.gl = canvas.getContext("webgl2", { antialias: true, alpha: true, stencil: true, premultipliedAlpha: true });
+    // the last picture is kept, for printing
+    this.gl = canvas.getContext("webgl2", { antialias: true, alpha: true, stencil: true, premultipliedAlpha: true, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error("no WebGL 2");
     this.shown = Object.fromEntries(MARKS.map(([name, , , on = true]) => [name, on]));
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());

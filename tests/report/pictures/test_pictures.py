@@ -30,7 +30,7 @@ from impactopt.report.pictures.style import DPI, PAGE, Picture
 from impactopt.simulation.reference.poses import inverse_mass, poses_of
 from impactopt.studies.figures import FIGURES, chosen, drawn
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 DRAWS: dict[str, Callable[[Record], Picture | None]] = {"overview": overview, **PICTURES}
 LABELLED = re.compile(r"\[[^\]]+\]|/ limit")
 

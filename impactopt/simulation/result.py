@@ -166,7 +166,7 @@ class Simulation:
             "target": self.outcome if hit else {},
             "step_error_pct": None if np.isnan(self.step_error) else 100 * self.step_error,
             "peak_force_N": self.peak_force,
-            "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else None,
+            "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
             # a target that comes early may touch at once
             "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]) if hit else None,
             "saturated_ms": 1e3 * self.saturated,

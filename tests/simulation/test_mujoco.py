@@ -239,6 +239,7 @@ def test_a_summary_of_a_fall_and_a_report() -> None:
     summary, report = sim.summary(**known), sim.report(**known)
     assert summary["standing"] is False and summary["reason"] == sim.fall
     assert summary["impulse_Ns"] == summary["contact_ms"] == 0.0
+    assert summary["impulse_error_pct"] is summary["hand_speed_m_s"] is None, "nothing was hit"
     assert report["zmp_margin_m"] == summary["zmp_margin_m"]["swing"]
     assert report["torque_ratio_by_phase"] == summary["torque_ratio"]
     assert set(report["sole_cop_margin_m"]) <= {"left", "right"}

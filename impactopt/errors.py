@@ -19,6 +19,7 @@ __all__ = [
     "NoCompilerWarning",
     "check_array",
     "did_you_mean",
+    "missing_package",
     "printable",
 ]
 
@@ -80,6 +81,17 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     candidates = {str(option).casefold(): str(option) for option in options}
     near = difflib.get_close_matches(str(name).casefold(), list(candidates), n=1, cutoff=0.6)
     return f" (did you mean {candidates[near[0]]!r}?)" if near else ""
+
+
+def missing_package(what: str, package: str, extra: str) -> InputError:
+    """The error for a package that is not installed, and how to get it: this one is on no index.
+
+    what : that needs it, as "a sweep's table".  extra : of ours that brings it.
+    """
+    return InputError(
+        f"{what} needs the package {package}; "
+        f"in the folder of impactopt's clone run: pip install -e '.[{extra}]'"
+    )
 
 
 def printable(text: str) -> str:

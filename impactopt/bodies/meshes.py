@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import coal
@@ -18,6 +22,9 @@ Array = NDArray[np.float64]
 def find_mesh(name: str, urdf: Path) -> Path:
     """The file of a mesh: a path from the URDF, or package://NAME/..., where a folder above it holds NAME.
 
+    Packages are looked for in ROS's own folders too (ROS_PACKAGE_PATH, AMENT_PREFIX_PATH), and where
+    example-robot-data is installed.
+
     Raises
     ------
     FileNotFoundError : there is none.
@@ -27,10 +34,22 @@ def find_mesh(name: str, urdf: Path) -> Path:
     places = [folder / path for folder in above]
     if name.startswith("package://"):  # the folder may be called otherwise than the package
         places += [folder.joinpath(*path.parts[1:]) for folder in above]
+        places += [folder / path for folder in _package_folders()]
     for place in places if not path.is_absolute() else [path]:
         if place.is_file():
             return place
     raise FileNotFoundError(name)
+
+
+def _package_folders() -> Iterator[Path]:
+    """Where packages of meshes may be, beside a URDF's own folders."""
+    for place in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
+        yield from (Path(place), Path(place).parent)  # it holds packages, or it is one
+    for place in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        yield Path(place) / "share"
+    with contextlib.suppress(PackageNotFoundError):
+        share = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share")))
+        yield from (share, share / "example-robot-data" / "robots")
 
 
 def read_mesh(path: Path, scale: Array) -> Solid:

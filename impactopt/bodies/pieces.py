@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies.solids import Solid, cylinder, rounded_box
-from impactopt.bodies.urdf import shapes_of, urdf_root
+from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
 from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot, Tool
 
-__all__ = ["Piece", "convex", "inertia_box", "pieces_of"]
+__all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of"]
 
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
@@ -58,14 +58,27 @@ def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
 def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
     """The pieces of a robot, and in words where they are from.
 
-    They are hulls of its URDF's collision shapes, or of the visual ones of a link that has no others; for a
-    robot without any, rounded boxes of its links' inertia. Tools are rods to their heads.
+    They are hulls of its URDF's collision shapes, or of the visual ones of a link that has no others. A robot
+    without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools are rods to their
+    heads.
     """
     found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
     if not found:
         found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
+    else:
+        bare = bare_joints(robot, {piece.joint for piece in found})
+        found += [piece for piece in _from_inertia(robot) if piece.joint in bare]
+        source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
     found += [_rod(robot, tool) for tool in robot.tools]
     return tuple(found), source
+
+
+def bare_joints(robot: Robot, shown: Collection[int]) -> set[int]:
+    """Joints whose bodies are not known, as all their meshes are nowhere; shown : those of which some are."""
+    urdf = Path(robot.urdf) if robot.urdf is not None else None
+    root = urdf_root(urdf) if urdf is not None else None
+    lost = lost_meshes(robot.model, root, urdf) if root is not None and urdf is not None else {}
+    return {joint for joint in lost if joint not in shown}
 
 
 def _from_urdf(robot: Robot) -> Iterator[Piece]:

@@ -17,7 +17,7 @@ from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.bodies.solids import Solid, box, cylinder, sphere
 from impactopt.errors import FARTHEST
 
-__all__ = ["LinkShape", "numbers", "shapes_of", "urdf_root"]
+__all__ = ["LinkShape", "lost_meshes", "numbers", "shapes_of", "urdf_root"]
 
 Array = NDArray[np.float64]
 
@@ -61,6 +61,22 @@ def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> I
                 if not (np.abs(moved.vertices) <= FARTHEST).all():
                     continue  # it is nowhere, or no part of a robot
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
+
+
+def lost_meshes(model: Any, root: ElementTree.Element, urdf: Path) -> dict[int, list[str]]:
+    """By the joint that moves their link, the names of meshes that are nowhere."""
+    lost: dict[int, list[str]] = {}
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if not model.existFrame(name, pin.FrameType.BODY):
+            continue
+        frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
+        for mesh in link.iterfind("*/geometry/mesh"):
+            try:
+                find_mesh(mesh.get("filename", ""), urdf)
+            except (OSError, ValueError):
+                lost.setdefault(int(frame.parentJoint), []).append(mesh.get("filename", ""))
+    return lost
 
 
 def numbers(text: str, count: int = 3) -> Array:

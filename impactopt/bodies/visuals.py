@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.pieces import ROD, inertia_box
+from impactopt.bodies.pieces import ROD, bare_joints, inertia_box
 from impactopt.bodies.solids import Solid, cylinder, sphere
 from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
 from impactopt.robots.robot import Robot, Striker
@@ -34,13 +34,18 @@ class Visual:
 
 
 def visuals_of(robot: Robot) -> list[Visual]:
-    """The robot's visual shapes; links whose mesh files are missing or damaged are left out.
+    """The robot's visual shapes; tools are rods.
 
-    Tools are rods. If nothing is left, boxes of the links' inertia, and bones between the joints.
+    What has lost its meshes is drawn by boxes of the links' inertia and bones between the joints, and so is a
+    robot without shapes.
     """
     found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
+    if not found:
+        return _from_inertia(robot)
+    bare = bare_joints(robot, {visual.joint for visual in found})
+    found += [visual for visual in _from_inertia(robot) if visual.joint in bare] if bare else []
     tools = robot.source.tools if robot.source is not None else ()
-    return [*found, *_bones_to(robot, [tool.striker for tool in tools])] if found else _from_inertia(robot)
+    return [*found, *_bones_to(robot, [tool.striker for tool in tools])]
 
 
 def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:

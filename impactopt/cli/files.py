@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_problem
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
+
+if TYPE_CHECKING:
+    from impactopt.robots.robot import Robot
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
@@ -39,8 +43,42 @@ def check(
             typer.echo(json.dumps(found, indent=2))
             return
         typer.echo(printable(f"{file} is sound:"))
-        for name, value in problem.describe().items():
-            typer.echo(printable(f"  {name:<8} {value}"))
+        plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
+        for name, value in (problem.describe() | plain).items():
+            typer.echo(printable(f"  {name:<10} {_in_words(value)}"))
+        if lost := _lost_meshes(problem.robot):
+            typer.echo(printable(f"  {'meshes':<10} {lost}"))
+
+
+def _lost_meshes(robot: Robot) -> str:
+    """Which meshes of a robot are nowhere, and what that means; "" if all are there."""
+    from impactopt.bodies.urdf import lost_meshes, urdf_root
+
+    root = None if robot.urdf is None else urdf_root(Path(robot.urdf))
+    found = {} if root is None or robot.urdf is None else lost_meshes(robot.model, root, Path(robot.urdf))
+    names = sorted({name for several in found.values() for name in several})
+    if not names:
+        return ""
+    return (
+        f"{len(names)} are not found, such as {names[0]}: boxes of inertia stand for links without any; put "
+        "them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
+    )
+
+
+def _with_units(thing: Any) -> str:
+    """`SpringDamper, stiffness 10000 N/m, damping 300 N s/m` of a law or target."""
+    from impactopt.contact.fields import abouts
+
+    numbers = [(field.name, getattr(thing, field.name), told.unit) for field, told in abouts(type(thing))]
+    parts = [f"{name} {value:g} {unit}".rstrip() for name, value, unit in numbers if isinstance(value, float)]
+    return ", ".join([type(thing).__name__, *parts]) if parts else repr(thing)
+
+
+def _in_words(value: Any) -> str:
+    """A value of `ImpactProblem.describe` as a person writes it."""
+    if isinstance(value, list):
+        return ("; " if value and isinstance(value[0], str) else ", ").join(_in_words(one) for one in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def new(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,6 +36,21 @@ def _complete(incomplete: str, folder: str) -> list[str]:
     return [name for name in (*named_files(folder), *fit) if name.startswith(incomplete)]
 
 
+def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
+    """Keys of the problem that the command names, or of any, that begin like this."""
+    from impactopt.errors import InputError
+    from impactopt.files.problem_file.changes import key_paths
+    from impactopt.files.problem_file.names import problem_file
+    from impactopt.files.problem_file.toml import TOMLError, read_toml
+
+    data: dict[str, Any] = {}
+    with contextlib.suppress(InputError, OSError, UnicodeDecodeError, TOMLError):
+        # where the option's value is still to come, click has not made arguments of the words before it
+        name = context.params.get("file") or next(iter(context.args), "")
+        data = read_toml(problem_file(name).read_text(encoding="utf-8"))
+    return [f"{path}=" for path in key_paths(data) if path.startswith(incomplete)]
+
+
 ProblemPath = Annotated[
     Path,
     typer.Argument(
@@ -49,6 +65,7 @@ Settings = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Change a key of the problem file, as target.mass=8; may be repeated.",
+        autocompletion=complete_setting,
     ),
 ]
 

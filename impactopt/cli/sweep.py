@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,11 +12,7 @@ from impactopt.cli.options import NOT_SOLVED, AsJson, Quiet, check_loudness, com
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from impactopt.sweeps import SweepProgress, SweepResult
-
-BETWEEN = 2.0  # seconds between lines about progress where lines cannot be rewritten
+    from impactopt.sweeps import SweepResult
 
 
 def sweep(
@@ -71,10 +66,11 @@ def sweep(
         from impactopt.files.problem_file import parse_settings
         from impactopt.sweeps import read_sweep_file
         from impactopt.sweeps import sweep as run
+        from impactopt.sweeps.console import SweepConsole
 
         check_loudness(quiet, verbose)
         chosen = read_sweep_file(file, parse_settings(settings or ()))
-        with _SweepConsole(console, quiet=quiet, verbose=verbose) as shown:
+        with SweepConsole(console, quiet=quiet, verbose=verbose) as shown:
             told: dict[str, Any] = {"report": shown.say, "progress": shown.progress}
             result = run(chosen, out, workers=workers, scheduler=scheduler, again=again, **told)
         if as_json:
@@ -91,60 +87,18 @@ def sweep(
                 console.print(str(picture), markup=False, highlight=False, soft_wrap=True)
 
 
-class _SweepConsole:
-    """Lines about what is going on, and a live bar; where there is no terminal, a line now and then."""
-
-    def __init__(self, console: Console, *, quiet: bool, verbose: bool) -> None:
-        self._console, self._quiet, self._last = console, quiet, -BETWEEN
-        self._between = 0.0 if verbose else BETWEEN
-        self._live = None
-        if console.is_terminal and not (quiet or verbose):
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
-            from rich.progress import Progress as Bar
-
-            parts = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-            self._live = Bar(*parts, console=console, transient=True)
-            self._task = self._live.add_task("starting", total=None)
-
-    def __enter__(self) -> _SweepConsole:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def say(self, text: str) -> None:
-        if not self._quiet:
-            from impactopt.errors import printable
-
-            self._console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
-
-    def progress(self, now: SweepProgress) -> None:
-        text = f"{now.rate:.3g} a second, {_time(now.remaining)} left"
-        if now.failed:
-            text += f", {now.failed} failed"
-        if now.best is not None:
-            text += f", best {now.best:.2f} N s (case {now.best_case})"
-        if self._live is not None:
-            self._live.update(self._task, completed=now.done, total=now.cases, description=text)
-        elif time.perf_counter() - self._last >= self._between:
-            self._last = time.perf_counter()
-            self.say(f"{now.done} of {now.cases}, {text}")
-
-
 def _show(result: SweepResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from impactopt.errors import printable
+    from impactopt.sweeps.console import words_for_time
 
     table = Table(title=f"{result.done} of {result.cases} cases", title_justify="left", show_header=False)
     rows = {
         "without a usable result": str(result.failed),
         "there from before": str(result.resumed),
-        "this run": f"{_time(result.seconds)}, {result.rate_per_second:.3g} cases a second",
+        "this run": f"{words_for_time(result.seconds)}, {result.rate_per_second:.3g} cases a second",
         "most memory of a worker": f"{result.peak_worker_mb:.0f} MB",
     }
     if result.best is not None:
@@ -156,12 +110,3 @@ def _show(result: SweepResult) -> None:
     for reason, count in result.reasons.items():
         console.print(printable(f"{count} x {reason}"), markup=False, highlight=False)
     console.print(str(result.table), markup=False, highlight=False, soft_wrap=True)
-
-
-def _time(seconds: float) -> str:
-    if not seconds < float("inf"):
-        return "?"
-    hours, rest = divmod(round(seconds), 3600)
-    if not hours and rest < 60:
-        return f"{seconds:.3g} s"
-    return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60} min {rest % 60} s"

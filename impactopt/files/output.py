@@ -60,7 +60,7 @@ DERIVED = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Record:
     """A solution as numbers and text only: what is kept, drawn and compared.
 
@@ -78,8 +78,15 @@ class Record:
 
     summary: dict[str, Any]
     problem: str = ""
-    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict, repr=False)
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     problem_path: Path | None = None
+
+    def __repr__(self) -> str:
+        """One line: its numbers would fill pages."""
+        told = self.summary
+        name, impulse = told.get("problem", {}).get("name", ""), told.get("impulse_Ns")
+        much = "" if impulse is None else f", {impulse:.2f} N s"
+        return f"<Record of {name!r}: {told.get('status')}{much}>"
 
     @property
     def completed(self) -> bool:

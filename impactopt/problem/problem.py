@@ -65,7 +65,7 @@ LONGEST_CONTACT = 100.0  # [s]
 MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ImpactProblem:
     """Maximize what ``robot`` does to ``target`` with ``striker``: by default the impulse.
 
@@ -138,6 +138,10 @@ class ImpactProblem:
     wrench_price: float = 1e-3
     return_price: float = 0.1
     name: str = "impact"
+
+    def __repr__(self) -> str:
+        """One line; `describe` has more."""
+        return f"<ImpactProblem {self.name!r}: {self.striker} of {self.robot.name} on {self.target!r}>"
 
     def __post_init__(self) -> None:
         found = Mistakes()

@@ -135,16 +135,16 @@ def _zmp_path(record: Record, arrays: Arrays, present: list[Any]) -> dict[str, A
         time, wrench = ground_wrenches(record, prefix)
         t, x, y = thinned(time, *centre_of_pressure(wrench).T, whole=_close_up(record))
         points, name = np.column_stack([x, y]), f"zmp_{style}"
-        arrays |= {name: points, f"{name}_time": t, f"{name}_margin": 1e3 * margin(polygon, points)}
-        series.append(
-            {"label": label, "style": style, "xy": name, "time": f"{name}_time", "margin": f"{name}_margin"}
-        )
+        arrays |= {name: points, f"{name}_time": t}
+        # its number is the margin that the chart beside it draws
+        beside = {"x": f"margin_{style}_x", "y": f"margin_{style}_y"}
+        series.append({"label": label, "style": style, "xy": name, "time": f"{name}_time", **beside})
     soles = [name for name in record.arrays if name.startswith("sole_")]
     arrays |= {f"ground_{name}": record.arrays[name] for name in ("polygon", *soles)}
     return {
         "kind": "ground",
         "title": "ZMP in the support polygon",
-        "x": "y, to the right [m]",
+        "x": "-y, to the right [m]",
         "y": "x, forward [m]",
         "series": series,
         "polygon": "ground_polygon",
@@ -204,7 +204,7 @@ def _joint(record: Record, arrays: Arrays, which: str, title: str, unit: str) ->
         series,
         kind="joint",
         bands=_bands(record),
-        joints=[str(name).removesuffix("_joint").replace("_", " ") for name in a["joints"]],
+        joints=[str(name) for name in a["joints"]],
         joint=int(worst),
         lines=lines,
     )
@@ -221,7 +221,7 @@ def _soles(record: Record, arrays: Arrays) -> dict[str, Any] | None:
             record,
             arrays,
             f"load_{k}",
-            str(name).replace("_", " "),
+            str(name),
             OTHERS[k % len(OTHERS)],
             a[f"{prefix}_time"],
             a[f"{prefix}_sole_ground"][:, k, 2],

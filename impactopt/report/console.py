@@ -21,6 +21,7 @@ from impactopt.report.result_rows import (
     replay_columns,
     result_columns,
     result_rows,
+    worst_rows,
 )
 from impactopt.solvers.program import IterationRecord
 
@@ -216,12 +217,12 @@ def told_touches(summary: Mapping[str, Any]) -> str:
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:
-    """What is not met, worst first."""
+    """What is not met, worst first: a row for each term."""
     table = Table(title="what is not met, worst first", title_justify="left")
     table.add_column("row", overflow="fold")
     table.add_column("by how much", overflow="fold")
-    for violation in violations:
-        table.add_row(_plain(str(violation["row"])), _plain(str(violation["by"])))
+    for row, by in worst_rows(violations):
+        table.add_row(_plain(row), _plain(by))
     return table
 
 

@@ -12,7 +12,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.animation import Page
 from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
-from impactopt.report.result_rows import result_columns, result_rows
+from impactopt.report.result_rows import result_columns, result_rows, worst_rows
 from impactopt.report.stage import stage_of
 
 __all__ = ["Report", "report_of"]
@@ -93,7 +93,7 @@ def _cards(s: Mapping[str, Any]) -> str:
     card(str(s.get("status", "?")), spent, "good" if s.get("status") == "solved" else "bad")
     if s.get("impulse_Ns") is not None:
         error = replay.get("impulse_error_pct")
-        beside = "" if error is None else f", {error:+.1f}{NARROW}% when replayed"
+        beside = "" if error is None else f", {round(error, 1) + 0.0:+.1f}{NARROW}% when replayed"
         card(f"{s['impulse_Ns']:.2f} N s", f"planned impulse{beside}")
     if s.get("peak_force_N") is not None:
         card(f"{s['peak_force_N']:.0f} N", f"planned peak force, over {s['contact_ms']:.0f}{NARROW}ms")
@@ -127,8 +127,8 @@ def _violations(s: Mapping[str, Any]) -> str:
     if not s.get("violations"):
         return ""
     rows = "".join(
-        f'<tr><th scope="row">{escape(str(v["row"]))}</th><td>{escape(str(v["by"]))}</td></tr>'
-        for v in s["violations"]
+        f'<tr><th scope="row">{escape(row)}</th><td>{escape(by)}</td></tr>'
+        for row, by in worst_rows(s["violations"])
     )
     table = f'<div class="card scroll"><table><tbody>{rows}</tbody></table></div>'
     return f"<h2>What is not met, worst first</h2>{table}"

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.solvers.program import MINOR
+
 __all__ = [
     "Cell",
     "Row",
@@ -18,6 +20,7 @@ __all__ = [
     "result_rows",
     "target_rows",
     "word_row",
+    "worst_rows",
 ]
 
 PHASES = ("swing", "collision", "follow")
@@ -113,6 +116,23 @@ def collision_rows(found: Mapping[str, Any]) -> list[Row]:
     return [row for row in rows if row is not None]
 
 
+def worst_rows(violations: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """What is not met, and by how much, worst first: the worst row of each term, and how many more it has.
+
+    violations : as in ``summary.json``. What is off by less than `MINOR` of the worst only follows from it.
+    """
+    worst = max((v.get("amount") or 0.0 for v in violations), default=0.0)
+    terms: dict[str, list[Mapping[str, Any]]] = {}
+    for v in violations:
+        if v.get("amount") is None or v["amount"] >= MINOR * worst:
+            terms.setdefault(str(v["row"]).partition(",")[0], []).append(v)
+
+    def more(count: int) -> str:
+        return f" (and {count} more row{'s' if count > 1 else ''})" if count else ""
+
+    return [(f"{rows[0]['row']}{more(len(rows) - 1)}", str(rows[0]["by"])) for rows in terms.values()]
+
+
 def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     """What the blows have brought their targets."""
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
@@ -147,8 +167,16 @@ def number_row(
     """None where no column has a number; what is not between `least` and `most` is not good."""
     if all(value is None for value in values):
         return None
-    cells = [Cell("-") if v is None else Cell(f"{scale * v:.{digits}f}", least <= v <= most) for v in values]
+    cells = [
+        Cell("-") if v is None else Cell(_rounded(scale * v, digits), least <= v <= most) for v in values
+    ]
     return Row(label, tuple(cells))
+
+
+def _rounded(value: float, digits: int) -> str:
+    """As text; what rounds to zero has no sign."""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if float(text) == 0 else text
 
 
 def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> Row | None:

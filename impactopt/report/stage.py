@@ -128,4 +128,5 @@ def pack_track(name: str, track: Track, arrays: Arrays) -> dict[str, Any]:
         "label": track.name,
         "contact_start": track.contact_start,
         "contact_end": track.contact_end,
+        "missing": track.missing,
     }

@@ -22,7 +22,13 @@ AFTER = 1.0  # [s] shown beyond the end of the planned motion
 FAR = 3.0  # [m] that a target that flies off is followed; it fades on the second half of that
 
 # name of each motion in a record, and the prefix of its arrays
-MOTIONS = (("planned", "reference"), ("simulated", "simulated"), ("free soles", "replayed"))
+MISSED = "missed"
+MOTIONS = (
+    ("planned", "reference"),
+    ("simulated", "simulated"),
+    ("free soles", "replayed"),
+    ("planned, target missing", MISSED),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +39,7 @@ class Track:
     x, y, z, w, the universe first; hand, mass (k, 3) [m]: striking point and centre of mass; force (k,) [N]
     on the target, along its normal; travel (k,) [m] of the target along it, at most FAR; zmp (k, 2) [m] and
     ground (k, 3) [N], the ground's force on the robot, nan where nothing presses or nothing is known of it.
-    contact_start, contact_end [s], nan without contact.
+    contact_start, contact_end [s], nan without contact.  missing : whether the target is not there.
     """
 
     name: str
@@ -47,10 +53,11 @@ class Track:
     ground: Array
     contact_start: float
     contact_end: float
+    missing: bool = False
 
 
 def tracks_of(record: Record, problem: ImpactProblem) -> list[Track]:
-    """The planned motion, and those that the record has of engines.
+    """The planned motion, those that the record has of engines, and the planned one if there is no target.
 
     The servo's reference coasts through contact; the planned robot does not. In contact it is drawn on the
     cubic between the planned states before and after, whose ends and velocities are the plan's.
@@ -69,6 +76,9 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     if prefix == "reference":
         q = _planned(problem, record)(chosen)
         wrench, force, speed = _predicted(record, chosen)
+    elif prefix == MISSED:
+        q, wrench, start, end = a["missed_q"][chosen], a["missed_ground"][chosen], np.nan, np.nan
+        force, speed = np.zeros(len(chosen)), np.zeros(len(time))
     else:
         q, force = a[f"{prefix}_q"][chosen], a[f"{prefix}_force"][chosen]
         wrench, speed = a[f"{prefix}_sole_ground"].sum(axis=1)[chosen], a[f"{prefix}_target_speed"]
@@ -98,6 +108,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
         ground=wrench[:, :3] if legged else np.full((len(shown), 3), np.nan),
         contact_start=start,
         contact_end=end,
+        missing=prefix == MISSED,
     )
 
 

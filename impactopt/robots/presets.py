@@ -1,7 +1,7 @@
 """Robots ready to use: humanoids, and arms on a fixed base.
 
 The stand-in for HRP-2 and the arms need no files; TALOS and G1 are on the URDFs of the package
-example-robot-data, which `pip install 'impactopt[robots]'` brings.
+example-robot-data, which the extra `robots` brings.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, ParamSpec
 import numpy as np
 import pinocchio as pin
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.robots import arms as _arms
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.parts import Source
@@ -270,8 +270,5 @@ def _robots() -> Path:
     try:
         package = distribution("example-robot-data")
     except PackageNotFoundError as error:
-        raise InputError(
-            "this robot needs the package example-robot-data; run: pip install 'impactopt[robots]'; "
-            "robot 'standin' needs nothing"
-        ) from error
+        raise missing_package("this robot (not 'standin')", "example-robot-data", "robots") from error
     return Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 PerJoint = float | Mapping[str, float] | ArrayLike | None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Robot:
     """A robot ready to strike; checked when built. Arrays are read-only; `dataclasses.replace` makes a
     changed copy.
@@ -194,6 +194,10 @@ class Robot:
         )
         build.by_name("sole", soles)
         return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))
+
+    def __repr__(self) -> str:
+        """One line: its model and arrays would fill pages."""
+        return f"<Robot {self.name!r}: {self.n} joints, strikes with {', '.join(self.strikers) or 'nothing'}>"
 
     @property
     def floating(self) -> bool:

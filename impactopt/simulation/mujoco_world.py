@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError
+from impactopt.errors import missing_package
 from impactopt.robots.robot import Robot
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene
@@ -35,9 +35,7 @@ def mujoco_module() -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise InputError(
-            "the engine 'mujoco' needs the package mujoco; run: pip install 'impactopt[validate]'"
-        ) from error
+        raise missing_package("the engine 'mujoco'", "mujoco", "validate") from error
     return mujoco
 
 

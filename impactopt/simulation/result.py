@@ -89,19 +89,19 @@ class Simulation:
     """
 
     engine: str
-    time: Array
-    q: Array
-    v: Array
-    force: Array
-    target_speed: Array
-    hand_speed: Array
-    demand: Array
-    torque: Array
-    sole_ground: Array
+    time: Array = field(repr=False)
+    q: Array = field(repr=False)
+    v: Array = field(repr=False)
+    force: Array = field(repr=False)
+    target_speed: Array = field(repr=False)
+    hand_speed: Array = field(repr=False)
+    demand: Array = field(repr=False)
+    torque: Array = field(repr=False)
+    sole_ground: Array = field(repr=False)
     soles: tuple[str, ...]
-    cop_margin: Array
-    slip: Array
-    lift: Array
+    cop_margin: Array = field(repr=False)
+    slip: Array = field(repr=False)
+    lift: Array = field(repr=False)
     contact_start: float
     contact_end: float
     impulse: float
@@ -147,7 +147,10 @@ class Simulation:
         return np.asarray((self.time >= start).astype(int) + (self.time >= end).astype(int))
 
     def summary(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
-        """Impulse, force, margins and demand by phase, soles, standing; keys as in ``summary.json``."""
+        """Impulse, force, margins and demand by phase, soles, standing; keys as in ``summary.json``.
+
+        Without contact there is no speed at contact and no error of its impulse: None.
+        """
         hit = bool(np.isfinite(self.contact_start))
         if not hit and self.fall is None:
             raise InputError("the simulated motion never touched the target")
@@ -159,13 +162,13 @@ class Simulation:
             if self.fall is None
             else self.fall,
             "impulse_Ns": self.impulse,
-            "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1),
-            "target": self.outcome,
+            "impulse_error_pct": 100 * (self.impulse / planned_impulse - 1) if hit else None,
+            "target": self.outcome if hit else {},
             "step_error_pct": None if np.isnan(self.step_error) else 100 * self.step_error,
             "peak_force_N": self.peak_force,
             "contact_ms": 1e3 * (self.contact_end - self.contact_start) if hit else 0.0,
             # a target that comes early may touch at once
-            "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]),
+            "hand_speed_m_s": float(self.hand_speed[max(int((phase == 0).sum()) - 1, 0)]) if hit else None,
             "saturated_ms": 1e3 * self.saturated,
             "final_posture_error_rad": self.posture_error,
             "clearance_mm": 1e3 * self.clearance if known else None,

@@ -190,9 +190,9 @@ class SolverResult:
     history : one record an iteration.
     """
 
-    x: Vector
-    multipliers: Vector
-    bound_multipliers: Vector
+    x: Vector = field(repr=False)
+    multipliers: Vector = field(repr=False)
+    bound_multipliers: Vector = field(repr=False)
     objective: float
     status: Status
     iterations: int

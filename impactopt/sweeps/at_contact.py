@@ -18,7 +18,7 @@ from impactopt.kinematics.stance import Stance
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 
-__all__ = ["AtContact", "check_at_contact", "collision_model"]
+__all__ = ["AtContact", "check_at_contact", "collision_model", "full_names"]
 
 _FIRST_STEP = 1e-4  # [s] of the full dynamics, which halve it
 
@@ -47,27 +47,29 @@ class AtContact(Section):
     horizon: Positive = Field(default=0.2, alias="horizon_s")
 
 
-class _Holder(Section):
-    at_contact: AtContact
+def full_names(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The table with the units that its keys may leave out: `speed` is `speed_m_s`."""
+    names = {name: info.alias for name, info in AtContact.model_fields.items() if info.alias}
+    return {names[k] if k in names and names[k] not in given else k: value for k, value in given.items()}
 
 
-def check_at_contact(given: Mapping[str, Any], where: str) -> AtContact:
-    """The section from its table.
+def check_at_contact(given: Mapping[str, Any]) -> AtContact:
+    """The section from its table, whose keys may leave out their units.
 
     Raises
     ------
-    InputError : one message with all mistakes; `where` is what it calls the file.
+    InputError : one message with all mistakes. It names no file: the table may be a sweep's, or from a call.
     """
     try:
-        section = _Holder.model_validate({"at_contact": dict(given)}).at_contact
+        section = AtContact.model_validate(full_names(given))
     except ValidationError as error:
-        raise InputError(report_mistakes(where, {}, mistakes_of(error, _Holder))) from None
+        raise InputError(report_mistakes("[at_contact]", {}, mistakes_of(error, AtContact))) from None
     if section.result is not None and "posture" in section.model_fields_set:
-        raise InputError(f"{where}: [at_contact] posture, result: give one of them")
+        raise InputError("[at_contact] posture, result: give one of them")
     if section.result is None and section.speed is None:
-        raise InputError(f"{where}: [at_contact] speed_m_s: missing; only a result has a speed of its own")
+        raise InputError("[at_contact] speed_m_s: missing; only a result has a speed of its own")
     if section.freezes and section.model != "sdc":
-        raise InputError(f"{where}: [at_contact] freezes: only of the model 'sdc', not of {section.model!r}")
+        raise InputError(f"[at_contact] freezes: only of the model 'sdc', not of {section.model!r}")
     return section
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, missing_package
 from impactopt.sweeps.evaluate import evaluate
 from impactopt.sweeps.units import Found, Unit, Work, failed_columns
 
@@ -152,5 +152,5 @@ def _distributed() -> Any:
     try:
         import distributed
     except ImportError as error:
-        raise InputError("a Dask cluster needs distributed: run `pip install impactopt[cluster]`") from error
+        raise missing_package("a Dask cluster", "distributed", "cluster") from error
     return distributed

@@ -20,7 +20,7 @@ from impactopt.errors import InputError, raw_array
 from impactopt.files.problem_file import ProblemFile, read_problem_file
 from impactopt.files.problem_file.toml import plain_value
 from impactopt.sweeps.alike import AlikeCollisions
-from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model
+from impactopt.sweeps.at_contact import AtContact, check_at_contact, collision_model, full_names
 from impactopt.sweeps.collision_keys import role_of, sweep_place
 from impactopt.sweeps.measures import chosen
 from impactopt.sweeps.states import ContactStates
@@ -92,7 +92,7 @@ class Collisions:
         folder: Path = Path(),
     ) -> None:
         self.folder = folder
-        self.file, self.at_contact, self.outputs = file, dict(at_contact), tuple(outputs)
+        self.file, self.at_contact, self.outputs = file, full_names(at_contact), tuple(outputs)
         self.places = {key: sweep_place(file.data, key) for key in keys}
         if len({*self.places.values()}) < len(self.places):
             raise InputError(f"two columns are of one key: {', '.join(keys)}")
@@ -137,7 +137,7 @@ class Collisions:
             if place == ("at_contact", "speed_m_s") and key not in values:
                 section.setdefault("speed_m_s", 1.0)  # each row has its own
         file = self.file.changed(changes)
-        return file, check_at_contact(section, str(self.file.path))
+        return file, check_at_contact(section)
 
     # ------------------------------------------------------------ rows
     def __call__(self, columns: Mapping[str, Any], *, threads: int | None = None) -> dict[str, NDArray[Any]]:

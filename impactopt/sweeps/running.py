@@ -14,6 +14,7 @@ from impactopt.errors import InputError
 from impactopt.planning.solution import versions
 from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.cluster import connected, on_cluster
+from impactopt.sweeps.console import told
 from impactopt.sweeps.definition import Sweep, read_sweep_file, sweep_from_data
 from impactopt.sweeps.engines import on_processes
 from impactopt.sweeps.evaluate import evaluate
@@ -69,7 +70,7 @@ def sweep(
     client: Any = None,
     again: bool = False,
     report: Callable[[str], None] | None = None,
-    progress: Callable[[SweepProgress], None] | None = None,
+    progress: Callable[[SweepProgress], None] | bool | None = None,
 ) -> SweepResult:
     """Do every case of a sweep and write one table. If it is called again, it resumes what was not finished.
 
@@ -80,7 +81,9 @@ def sweep(
         `distributed.Client`. Workers need this version of impactopt, one thread each, and to see the files
         that the problem's file names.
     again : do cases once more that crashed, met an error of ours or ran out of time in an earlier run.
-    report : told in words what is going on.  progress : told after every unit.
+    report : told in words what is going on.  progress : told after every unit; True: both are shown, False:
+        not; None: where a person looks, on a terminal or in a notebook, unless `report` is given.
+        Words that nobody is told go to the logger "impactopt".
 
     A case that fails is a row with its reason. Ctrl-C ends the processes, writes the table of what is
     finished, and is raised.
@@ -90,7 +93,6 @@ def sweep(
     InputError : the sweep or its problem is wrong; another process is at work in the directory, or it holds
         another sweep; the disk is full; pyarrow is not installed.
     """
-    tell = report if report is not None else _ignore
     if sum(x is not None for x in (workers, scheduler, client)) > 1:
         raise InputError("give one of workers, scheduler and client: a cluster brings its own workers")
     if workers is not None and workers < 1:
@@ -100,14 +102,17 @@ def sweep(
     problem = chosen.problem.build()
     store = Store(chosen, Path(out))
     try:
-        with contextlib.nullcontext(client) if scheduler is None else connected(scheduler) as cluster:
+        with (
+            told(report, progress) as (tell, count),
+            contextlib.nullcontext(client) if scheduler is None else connected(scheduler) as cluster,
+        ):
 
             def engine(work: Work, units: Iterator[Unit]) -> Engine:
                 if cluster is not None:
                     return on_cluster(work, units, cluster, tell)
                 return on_processes(work, units, workers=_cores() if workers is None else workers)
 
-            return _run(chosen, problem, store, engine, again, tell, progress)
+            return _run(chosen, problem, store, engine, again, tell, count)
     finally:
         store.close()
 
@@ -119,7 +124,7 @@ def _run(
     engine: Callable[[Work, Iterator[Unit]], Engine],
     again: bool,
     tell: Callable[[str], None],
-    progress: Callable[[SweepProgress], None] | None,
+    progress: Callable[[SweepProgress], None],
 ) -> SweepResult:
     journal = store.journal
     together = min(TOGETHER.get(chosen.case_kind, 1), -(-chosen.design.cases // UNITS))
@@ -143,8 +148,7 @@ def _run(
             for unit, result in found:
                 store.keep(unit.index, result)
                 counter.add(unit.first, result.columns, result.peak_mb)
-                if progress is not None:
-                    progress(counter.progress())
+                progress(counter.progress())
         except KeyboardInterrupt:
             found.close()
             _write(chosen, problem, store, together, counter)
@@ -238,7 +242,3 @@ def _write(
 def _cores() -> int:
     """Those that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _ignore(text: str) -> None:
-    pass

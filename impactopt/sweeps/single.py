@@ -102,7 +102,7 @@ def collide_once(
     ------
     InputError : a value that the problem file or [at_contact] refuses.
     """
-    section, content = check_at_contact(at_contact, str(file.path)), file.content
+    section, content = check_at_contact(at_contact), file.content
     record = None if section.result is None else load_record(section.result)
     if record is not None and "horizon" not in section.model_fields_set:
         section = section.model_copy(update={"horizon": _horizon(record, section.horizon)})

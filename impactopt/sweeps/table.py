@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.files.output import write_file
 from impactopt.sweeps.units import Columns
 
@@ -55,7 +55,7 @@ def pyarrow() -> Any:
     try:
         import pyarrow.parquet
     except ImportError as error:
-        raise InputError("a sweep's table needs pyarrow: run `pip install impactopt[sweep]`") from error
+        raise missing_package("a sweep's table", "pyarrow", "sweep") from error
     return pyarrow
 
 

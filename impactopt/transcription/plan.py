@@ -5,7 +5,7 @@ This is the border to everything that checks, draws or executes a plan: arrays o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -33,13 +33,13 @@ class Trajectory:
     and the motion to be over.
     """
 
-    time: Array
-    phase: NDArray[np.intp]
-    q: Array
-    v: Array
-    a: Array
-    torque: Array
-    ground: Array
+    time: Array = field(repr=False)
+    phase: NDArray[np.intp] = field(repr=False)
+    q: Array = field(repr=False)
+    v: Array = field(repr=False)
+    a: Array = field(repr=False)
+    torque: Array = field(repr=False)
+    ground: Array = field(repr=False)
     contact_start: float
     contact_end: float
     end: float
@@ -53,10 +53,10 @@ class Motion:
     travel (k,) [m] : of the target along its normal.
     """
 
-    time: Array
-    phase: NDArray[np.intp]
-    q: Array
-    travel: Array
+    time: Array = field(repr=False)
+    phase: NDArray[np.intp] = field(repr=False)
+    q: Array = field(repr=False)
+    travel: Array = field(repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +70,13 @@ class PlannedCollision:
     sole's frame.
     """
 
-    time: Array
-    force: Array
-    target_speed: Array
+    time: Array = field(repr=False)
+    force: Array = field(repr=False)
+    target_speed: Array = field(repr=False)
     outcome: dict[str, float]
-    torque: Array
-    ground: Array
-    sole_wrench: Array
+    torque: Array = field(repr=False)
+    ground: Array = field(repr=False)
+    sole_wrench: Array = field(repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,15 @@ import impactopt
 from impactopt.cli.app import app
 from impactopt.cli.options import complete_problem
 from impactopt.files.output import save_record
-from impactopt.files.problem_file import load_problem, problem_names, read_problem_file, write_toml
+from impactopt.files.problem_file import (
+    key_place,
+    load_problem,
+    problem_names,
+    read_problem_file,
+    read_toml,
+    write_toml,
+)
+from impactopt.files.problem_file.names import problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import FullDynamics
 from impactopt.sweeps.single import collide_once
@@ -254,6 +262,23 @@ def test_completion_offers_names_and_files(tmp_path: Path, monkeypatch: pytest.M
     assert complete_problem("puns/") == complete_problem("puns/mi") == ["puns/mine.toml"]
     assert complete_problem("nowhere/x") == []
     assert "completion" in run("--help")[0]
+
+
+def test_completion_offers_the_keys_of_the_problem_that_is_named() -> None:
+    def offered(problem: str, incomplete: str) -> list[str]:
+        line = f"impactopt solve {problem} --set {incomplete}"
+        at = len(line.split()) - bool(incomplete)
+        shell = {"_IMPACTOPT_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(at)}
+        return runner.invoke(app, [], prog_name="impactopt", env=shell).stdout.split()
+
+    assert offered("nailing", "target.res") == ["target.resistance_N="], "only a nail has one"
+    assert offered("punch", "target.res") == [] and "target.mass_kg=" in offered("punch", "target.")
+    assert "scenarios.missing.abort_after_s=" in offered("punch", "scenarios.")
+    assert "swing.duration_s=" in offered("", "swing.") and "swing.duration_s=" in offered(
+        "nowhere", "swing."
+    )
+    for key in offered("punch", ""):
+        assert key_place(read_toml(problem_file("punch").read_text()), key.removesuffix("=")), key
 
 
 def test_python_m_impactopt_is_the_command_line() -> None:

@@ -78,6 +78,7 @@ def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
 def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
     out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", code=1)
     assert "stands at the end" in out and "! no" in out
+    assert "-100" not in out and "impulse error" not in out, "nothing is hit, so nothing is wrong about it"
     out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", "--json", code=1)
     report = json.loads(out)
     assert report["reason"].startswith("fell: ") and " at t = " in report["reason"]

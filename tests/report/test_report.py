@@ -185,7 +185,11 @@ SCRIPTS = {
     "document.querySelector('.label').textContent)",
     "readout": "document.querySelector('.readout').textContent",
     "legend": f"{CHART % 0}.querySelector('.key b').textContent",
-    "hidden": "(document.querySelector('.marks .key').click(), document.querySelector('.label').hidden)",
+    # the number beside the ground's path is the one that the chart of margins draws
+    "margin": "(page.arrays.margin_planned_y.fill(12.34), page.clock.seek(0.1234), [2, 3].map((k) => "
+    "document.querySelectorAll('.chart')[k].querySelector('.key b').textContent))",
+    "hidden": "(page.clock.seek(page.header.tracks[0].contact_start + 0.01), "
+    "document.querySelector('.marks .key').click(), document.querySelector('.label').hidden)",
     "motion": "(() => { const s = document.querySelector('.controls select'); s.value = 1; "
     "s.dispatchEvent(new Event('change')); return page.clock.track; })()",
     "turned": "(() => { const v = page.clock.view, before = v.yaw; "
@@ -249,8 +253,9 @@ def test_the_animation_works(seen: list[dict[str, Any]], record: Record, solutio
     assert wide["play"] in (True, False) and wide["pause"] is False
     share, error = wide["drawn"]
     assert 0.02 < share < 0.9 and error == 0, "the robot covers a part of the view"
-    assert wide["contact"] == "400 N" and wide["legend"] == "400", "the plan's force after 10 ms"
+    assert wide["contact"] == "400 N" and wide["legend"] == "400 N", "the plan's force after 10 ms"
     assert wide["readout"] == "0.110 s · contact · 10 x slower"
+    assert wide["margin"] == ["12.34 mm", "12.3 mm inside"]
     assert wide["hidden"] is True and wide["motion"] == 1
     assert wide["turned"] == pytest.approx(-0.1)
     track = tracks_of(record, solution.problem)[0]
@@ -396,7 +401,9 @@ def test_without_3d_the_plots_still_work(page: Path) -> None:
     assert "cannot be shown here: no WebGL 2" in values["note"] and values["charts"] >= 15
     # the view is from 10 ms before the contact of 40 ms to 30 ms after it, a step a hundredth of that
     assert values["moved"] == pytest.approx(0.08 / 100, abs=1e-6)
-    assert float(values["value"]) == pytest.approx(700 - 300 * values["moved"] / 0.01, rel=1e-3)
+    assert float(values["value"].removesuffix(" N")) == pytest.approx(
+        700 - 300 * values["moved"] / 0.01, rel=1e-3
+    )
 
 
 def test_the_plots_work(seen: list[dict[str, Any]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from support.fake_solution import still_problem, still_solution
 
 from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.meshes import find_mesh, read_mesh
+from impactopt.bodies.pieces import pieces_of
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.bodies.solids import Solid, box, capsule, cylinder, joined, rounded_box, simplified, sphere
 from impactopt.bodies.surroundings import surroundings_of
@@ -151,6 +153,28 @@ def test_locked_and_floating_joints_keep_shapes_in_place(lamp: Path) -> None:
     assert [v.joint for v in visuals_of(robot)] == [1, 2, 2]
     with pytest.raises(FileNotFoundError):
         find_mesh("package://lamp_description/meshes/gone.stl", lamp)
+
+
+def test_what_has_lost_its_meshes_is_a_box_and_bones(
+    lamp: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot.from_urdf(lamp, floating=False)
+    assert [piece.joint for piece in pieces_of(robot)[0]] == [0, 1, 1] and "lost" not in pieces_of(robot)[1]
+    alone = tmp_path_factory.mktemp("elsewhere") / "alone.urdf"  # its meshes are not beside it
+    shade = URDF.index('<link name="shade">')
+    no_cylinder = '<geometry><mesh filename="package://lamp_description/meshes/tip.stl"/></geometry>'
+    alone.write_text(
+        URDF[:shade]
+        + URDF[shade:].replace('<geometry><cylinder radius="0.1" length="0.4"/></geometry>', no_cylinder)
+    )
+    robot = Robot.from_urdf(alone, floating=False)
+    base, *rest = visuals_of(robot)
+    assert base.joint == 0 and {visual.joint for visual in rest} == {1}, "the shade is drawn all the same"
+    pieces, source = pieces_of(robot)
+    assert [piece.joint for piece in pieces] == [0, 1], "and kept apart"
+    assert "inertia of 1 that have lost" in source
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(lamp.parents[2]))
+    assert "lost" not in pieces_of(robot)[1], "ROS knows where its packages are"
 
 
 def test_mesh_files_of_other_kinds_are_read_too(tmp_path: Path) -> None:
@@ -310,6 +334,22 @@ def test_a_track_says_what_the_record_says(record: Record, solution: Solution) -
     assert planned.travel[-1] == pytest.approx(min(2.0 * (0.02 + end), FAR), abs=1e-3)
 
 
+def test_the_motion_for_a_missing_target_is_there_without_the_target(
+    record: Record, solution: Solution
+) -> None:
+    a = record.arrays
+    missed = {f"missed_{n.removeprefix('reference_')}": a[n] for n in a if n.startswith("reference_")}
+    missed["missed_ground"] = np.tile([0.0, 0.0, 500.0, 0.0, -5.0, 0.0], (len(a["reference_time"]), 1))
+    both = dataclasses.replace(record, arrays={**a, **missed})
+    *others, track = tracks_of(both, solution.problem)
+    assert track.name == "planned, target missing" and track.missing
+    assert not any(other.missing for other in others) and others[0].name == "planned"
+    assert np.isnan(track.contact_start) and not track.force.any() and not track.travel.any()
+    np.testing.assert_allclose(track.zmp, np.tile([0.01, 0.0], (len(track.time), 1)))
+    header, _ = stage_of(both, solution.problem)
+    assert [t["missing"] for t in header["tracks"]] == [False, False, False, True]
+
+
 def test_in_contact_the_planned_robot_moves_on_between_its_planned_states(biped_plan: Any) -> None:
     """The reference coasts and jumps back; what is drawn has the plan's states and rates at both ends."""
     plan, problem = biped_plan.plan, biped_plan.problem
@@ -378,7 +418,9 @@ def test_charts_hold_the_records_numbers(record: Record) -> None:
             assert np.nanmin(arrays[s["y"]]) == pytest.approx(1e3 * min(key["zmp_margin_m"].values()))
     for chart in charts:
         for s in chart["series"]:
-            assert {s[key] for key in ("x", "y", "xy", "time", "margin") if key in s} <= set(arrays)
+            assert {s[key] for key in ("x", "y", "xy", "time") if key in s} <= set(arrays)
+    joints = next(chart["joints"] for chart in charts if "joints" in chart)
+    assert joints == list(record.arrays["joints"]), "by the names that a file takes"
 
 
 def test_the_planned_hand_is_as_fast_as_the_plan_says(biped_plan: Any) -> None:

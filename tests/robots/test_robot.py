@@ -154,7 +154,7 @@ def test_missing_robot_files_name_the_extra(monkeypatch: pytest.MonkeyPatch) -> 
         raise PackageNotFoundError(name)
 
     monkeypatch.setattr(presets, "distribution", missing)
-    with pytest.raises(InputError, match=r"pip install 'impactopt\[robots\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[robots\]'"):
         talos()
 
 

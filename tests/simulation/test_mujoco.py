@@ -239,6 +239,7 @@ def test_a_summary_of_a_fall_and_a_report() -> None:
     summary, report = sim.summary(**known), sim.report(**known)
     assert summary["standing"] is False and summary["reason"] == sim.fall
     assert summary["impulse_Ns"] == summary["contact_ms"] == 0.0
+    assert summary["impulse_error_pct"] is summary["hand_speed_m_s"] is None, "nothing was hit"
     assert report["zmp_margin_m"] == summary["zmp_margin_m"]["swing"]
     assert report["torque_ratio_by_phase"] == summary["torque_ratio"]
     assert set(report["sole_cop_margin_m"]) <= {"left", "right"}
@@ -427,7 +428,7 @@ def test_every_condition_has_its_range_and_the_defaults_are_the_plan() -> None:
 def test_without_mujoco_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     still = reference([0.0, 1.0], np.zeros(1), nv=1, n=1)
-    with pytest.raises(InputError, match=r"pip install 'impactopt\[validate\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[validate\]'"):
         simulate_mujoco(slider(6.0), still, scene())
 
 

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from impactopt.cli.app import app
 from impactopt.errors import InputError
+from impactopt.report.pictures.style import model_colour
 from impactopt.report.pictures.sweep import sweep_picture
 from impactopt.report.pictures.sweep_columns import Columns
 from impactopt.sweeps import read_sweep_file, sweep_from_data
@@ -122,6 +123,7 @@ def test_errors_are_against_the_row_with_the_same_rest() -> None:
     np.testing.assert_allclose(one.lines[0].get_xydata(), [[1, 10], [2, -10]])
     np.testing.assert_allclose(four.lines[0].get_xydata(), [[1, -25]])
     assert [axes.get_title(loc="left") for axes in (one, four)] == ["target mass 1 kg", "target mass 4 kg"]
+    assert one.lines[0].get_color() == model_colour("sdc"), "as in all pictures"
     assert len(one.lines) == len(four.lines) == 1  # not the rows that the others are held against
     sizes = picture(columns, **given, log=["y"]).axes[0].lines[0].get_ydata()
     np.testing.assert_allclose(sizes, [10, 10])

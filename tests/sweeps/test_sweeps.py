@@ -248,9 +248,15 @@ def test_what_collisions_do_not_have_is_said() -> None:
         "sweep": {"problem": "arm7", "case_kind": "collision", "starts": 2},
         "grid": {"target.mass": [1.0]},
     }
+    collisions = {**given, "sweep": {"problem": "arm7", "case_kind": "collision"}}
     with pytest.raises(InputError, match=r"\[sweep\] starts: collisions have none"):
         sweep_from_data(given)
     with pytest.raises(InputError, match=r"speed_m_s: missing"):
-        sweep_from_data({**given, "sweep": {"problem": "arm7", "case_kind": "collision"}})
+        sweep_from_data(collisions)
+    with pytest.raises(InputError, match=r"^mine: \[at_contact\]: velocty: unknown key \(did you mean"):
+        sweep_from_data({**collisions, "at_contact": {"speed": 1.0, "velocty": "least rates"}}, where="mine")
+    both = {"speed": 1.0, "speed_m_s": 2.0}
+    with pytest.raises(InputError, match="speed: unknown key"):
+        sweep_from_data({**collisions, "at_contact": both})
     with pytest.raises(InputError, match="of collisions only"):
         sweep_from_data({"sweep": {"problem": "arm7", "outputs": ["impulse_Ns"]}})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, get_args, get_origin
 
 from impactopt.errors import InputError, did_you_mean, shortened
@@ -17,7 +17,7 @@ from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.toml import Place, TOMLError, plain_value, read_toml
 
-__all__ = ["change_data", "key_place", "parse_settings"]
+__all__ = ["change_data", "key_paths", "key_place", "parse_settings"]
 
 LONGEST_KEY = 1000  # characters, dots included
 _WORD = re.compile(r"[A-Za-z_][\w -]*")
@@ -50,6 +50,29 @@ def key_place(data: Mapping[str, Any], key: str) -> Place:
         return _find(with_kinds(File, data), data, key)
     except KeyError as error:
         raise InputError(str(error.args[0])) from None
+
+
+def key_paths(data: Mapping[str, Any]) -> Iterator[str]:
+    """Key paths that a file may have beside these data; entries of lists are those that it has."""
+    yield from _paths(with_kinds(File, data), data, "")
+
+
+def _paths(section: type[Section], value: Any, above: str) -> Iterator[str]:
+    for name, info in section.model_fields.items():
+        key, inner = info.alias or name, info.annotation
+        held = value.get(key) if isinstance(value, Mapping) else None
+        entries = [(f"{above}{key}", held)]
+        if get_origin(inner) is list:
+            (inner,) = get_args(inner)
+            if isinstance(inner, type) and issubclass(inner, Section):
+                rows = enumerate(held if isinstance(held, list) else ())
+                named = ((row.get("name", k) if isinstance(row, Mapping) else k, row) for k, row in rows)
+                entries = [(f"{above}{key}.{entry}", row) for entry, row in named]
+        for path, there in entries:
+            if isinstance(inner, type) and issubclass(inner, Section):
+                yield from _paths(inner, there, f"{path}.")
+            else:
+                yield path
 
 
 def parse_settings(texts: Iterable[str]) -> dict[str, Any]:

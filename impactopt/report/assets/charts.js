@@ -10,6 +10,24 @@ function ticks(low, high, count) {
   return out;
 }
 
+// the entries of ascending x about a place, and how far it is between them; none beyond the ends
+function between(x, at) {
+  if (!x.length || at < x[0] - 1e-6 || at > x[x.length - 1] + 1e-6) return [];
+  const k = findBefore(x, at + 1e-6), next = Math.min(k + 1, x.length - 1);
+  return [k, next, next > k ? Math.max(0, (at - x[k]) / (x[next] - x[k])) : 0];
+}
+
+// y on straight lines between its entries; of rows of n numbers the one at a column
+function valueBetween(x, y, at, n = 1, column = 0) {
+  const [k, next, f] = between(x, at);
+  if (k == null) return NaN;
+  const [a, b] = [y[n * k + column], y[n * next + column]];
+  return f > 1e-3 ? (1 - f) * a + f * b : a;
+}
+
+// of an axis's name: "force [N]"
+function unitOf(name) { return /\[(.*)\]/.exec(name)?.[1] ?? ""; }
+
 function shortNumber(x) {
   if (!Number.isFinite(x)) return "–";
   if (x !== 0 && (Math.abs(x) < 1e-3 || Math.abs(x) >= 1e5)) return x.toExponential(1);
@@ -195,7 +213,7 @@ class Chart extends Frame {
       const there = Number.isFinite(py);
       dot.style.display = there ? "" : "none";
       if (there) { dot.setAttribute("cx", this.x(px)); dot.setAttribute("cy", this.y(py)); }
-      this.values[n].textContent = there ? shortNumber(this.spec.log ? 10 ** py : py) : "";
+      this.values[n].textContent = there ? `${shortNumber(this.spec.log ? 10 ** py : py)} ${unitOf(this.spec.y)}`.trim() : "";
     });
     const unit = this.timed ? " s" : "";
     this.when ??= this.legend.appendChild(make("span", { class: "when" }));
@@ -204,11 +222,9 @@ class Chart extends Frame {
 
   // where the line is: between the entries over time, at the nearest one of what is counted
   valueAt(x, y, at) {
-    if (!x.length || at < x[0] - 1e-6 || at > x[x.length - 1] + 1e-6) return [];
-    const k = findBefore(x, at + 1e-6), next = Math.min(k + 1, x.length - 1);
-    const f = next > k ? Math.max(0, (at - x[k]) / (x[next] - x[k])) : 0;
-    if (!this.timed) return f > 0.5 ? [x[next], y[next]] : [x[k], y[k]];
-    return [at, f > 1e-3 ? (1 - f) * y[k] + f * y[next] : y[k]];
+    if (this.timed) return [at, valueBetween(x, y, at)];
+    const [k, next, f] = between(x, at);
+    return k == null ? [] : f > 0.5 ? [x[next], y[next]] : [x[k], y[k]];
   }
 
   listen() {
@@ -355,11 +371,11 @@ class GroundChart extends Frame {
   point() {
     if (!this.dots || !this.clock) return;
     this.spec.series.forEach((s, n) => {
-      const k = findBefore(this.arrays[s.time], this.clock.time + 1e-6), [y, x] = [-this.arrays[s.xy][2 * k + 1], this.arrays[s.xy][2 * k]];
+      const at = this.clock.time, [x, left] = [0, 1].map((k) => valueBetween(this.column(s.time), this.column(s.xy), at, 2, k)), y = -left;
       const there = Number.isFinite(x) && !this.hidden.has(s.label), dot = this.dots[n];
       dot.style.display = there ? "" : "none";
       if (there) { dot.setAttribute("cx", this.x(y)); dot.setAttribute("cy", this.y(x)); }
-      const margin = this.arrays[s.margin]?.[k];
+      const margin = valueBetween(this.column(s.x), this.column(s.y), at);
       this.values[n].textContent = there && Number.isFinite(margin) ? `${shortNumber(+margin.toFixed(1))} mm inside` : "";
     });
   }

@@ -188,7 +188,7 @@ class Player {
     if (!this.view) return;
     const track = this.header.tracks[this.track], now = this.view.draw(this.track, this.time);
     const { contact_start: start, contact_end: end } = track, slowness = this.slowness(this.time);
-    const phase = start == null || this.time + SOON < start ? "swing" : end == null || this.time + SOON < end ? "contact" : "follow-through";
+    const phase = start == null ? "no contact" : this.time + SOON < start ? "swing" : end == null || this.time + SOON < end ? "contact" : "follow-through";
     const slow = slowness > 1 ? ` · ${slowness} x slower` : "";
     this.readout.textContent = this.still ? track.label : `${this.time.toFixed(3)} s · ${phase}${slow}`;
     this.label.hidden = !(now.force > 0 && this.view.shown.force);

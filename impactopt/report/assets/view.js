@@ -50,7 +50,8 @@ const MARKS = [
 class View {
   constructor(canvas, header, arrays) {
     Object.assign(this, { canvas, header, arrays });
-    this.gl = canvas.getContext("webgl2", { antialias: true, alpha: true, stencil: true, premultipliedAlpha: true });
+    // the last picture is kept, for printing
+    this.gl = canvas.getContext("webgl2", { antialias: true, alpha: true, stencil: true, premultipliedAlpha: true, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error("no WebGL 2");
     this.shown = Object.fromEntries(MARKS.map(([name, , , on = true]) => [name, on]));
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
@@ -114,7 +115,7 @@ class View {
     return { array, count: data.length / 6 };
   }
 
-  // what the camera looks at: all joints and hands of the first motion, or all of a robot that stands still
+  // what the camera looks at: all joints and hands of the first motion, and all bodies at its start
   frame() {
     const { arrays, header } = this, { name } = header.tracks[0];
     const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
@@ -124,7 +125,14 @@ class View {
     for (let k = 0; k < places.length / 7; k++) if (k % joints) take([...places.slice(7 * k, 7 * k + 3)]);
     for (let k = 0; k < hand.length / 3; k++) take([...hand.slice(3 * k, 3 * k + 3)]);
     take(header.point);
-    const still = header.hulls && this.instant(header.tracks[0], 0);
+    const still = this.instant(header.tracks[0], 0);
+    for (const { joint, low: from, step } of header.bodies) {
+      const m = this.pose(still, joint), span = step.map((x) => 65535 * x);
+      for (let corner = 0; corner < 8; corner++) {
+        const [x, y, z] = from.map((v, k) => v + ((corner >> k) & 1) * span[k]);
+        take([0, 1, 2].map((k) => m[k] * x + m[4 + k] * y + m[8 + k] * z + m[12 + k]));
+      }
+    }
     arrays.spheres_joint?.forEach((joint, k) => {
       const m = times(this.pose(still, joint), scaled([...arrays.spheres_centre.slice(3 * k, 3 * k + 3)], 1));
       for (const r of [-arrays.spheres_radius[k], arrays.spheres_radius[k]]) take([m[12] + r, m[13] + r, m[14] + r]);
@@ -238,7 +246,7 @@ class View {
     }
     for (const sole of header.legged ? this.soles : []) this.put(sole, still, themeColour("muted"), 1, 0.6);
     const poses = this.bodies.map((body) => this.pose(now, body.joint));
-    const world = this.surroundings(now.mix("travel", 1)[0]);
+    const world = this.surroundings(now.mix("travel", 1)[0], track.missing);
     if (header.legged) this.shadow(poses, world);
     gl.depthMask(true);
 
@@ -282,11 +290,12 @@ class View {
     });
   }
 
-  // where the bodies of the world are after the target's travel: it moves on, and a board's halves tip over
-  surroundings(travel) {
+  // where the bodies of the world are after the target's travel: it moves on, and a board's halves tip over;
+  // where the target is missing, so is what holds it
+  surroundings(travel, missing) {
     const seen = this.seen(travel), out = [];
     for (const part of this.world) {
-      if (part.kind === "obstacle" && !this.shown.obstacles) continue;
+      if (part.kind === "obstacle" ? !this.shown.obstacles : missing) continue;
       let place = scaled(part.moves ? this.header.normal.map((x) => x * travel) : [0, 0, 0], 1);
       if (part.hinge) {
         const { place: at, axis, arm } = part.hinge, half = Math.atan2(travel, arm) / 2;

@@ -21,7 +21,7 @@ from impactopt.bodies.surroundings import surroundings_of
 from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.files.replay import Replay
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, STYLE, VERMILION, Array
+from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
 from impactopt.simulation import scene_of
 from impactopt.simulation.result import centre_of_pressure
 
@@ -136,7 +136,7 @@ class _Drawing:
         grid = self.figure.add_gridspec(
             1, 3, left=0.07, right=0.99, bottom=0.11, top=0.84, wspace=0.3, width_ratios=[*widths, widths[1]]
         )
-        labels = (("x [m]", "z [m]"), ("y, to the right [m]", "z [m]"), ("y, to the right [m]", "x [m]"))
+        labels = (("x [m]", "z [m]"), (RIGHT, "z [m]"), (RIGHT, "x [m]"))
         names = ("from its right", "from behind", "soles from above")
         for k, ((lowest, highest), name, (across, up)) in enumerate(zip(spans, names, labels, strict=True)):
             axes = self.figure.add_subplot(grid[k])

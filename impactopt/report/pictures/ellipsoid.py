@@ -8,12 +8,23 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
 from impactopt.files.output import Record
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PAGE, VERMILION, Array, Picture, styled, title
+from impactopt.report.pictures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    PAGE,
+    RIGHT,
+    VERMILION,
+    Array,
+    Picture,
+    styled,
+    title,
+)
 
 # what is drawn: axes across and up, from where it is seen
 VIEWS = (
     (np.array([[1.0, 0, 0], [0, 0, 1.0]]), "x [m]", "z [m]", "from its right"),
-    (np.array([[0, -1.0, 0], [1.0, 0, 0]]), "y, to the right [m]", "x [m]", "from above"),
+    (np.array([[0, -1.0, 0], [1.0, 0, 0]]), RIGHT, "x [m]", "from above"),
 )
 REACH = 0.35  # [m] of the largest effective mass in the picture
 MOST = 4.0  # times the mass along the blow that is drawn; beyond it the curve is open

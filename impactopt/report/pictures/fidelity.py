@@ -9,16 +9,17 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, Picture, styled
+from impactopt.report.pictures.style import BLACK, MODELS, Picture, styled
 
 Row = Mapping[str, Any]
 
 # models without freezes on the way: colour of their level, and what they are called
 LEVELS = {
-    ("virtual-mass", None): (ORANGE, "virtual mass"),
-    ("sdc-paper", None): (VERMILION, "the paper's SDC"),
-    ("sdc", 0): (GREEN, "our SDC, frozen at contact"),
+    ("virtual-mass", None): (MODELS["virtual-mass"], "virtual mass"),
+    ("sdc-paper", None): (MODELS["sdc-paper"], "the paper's SDC"),
+    ("sdc", 0): (MODELS["sdc"], "our SDC, frozen at contact"),
 }
+AGAIN = MODELS["freezes"]
 GREY = "#999999"
 WORST, MEDIAN = "worst_impulse_error_pct", "median_impulse_error_pct"
 
@@ -40,8 +41,8 @@ def fidelity_picture(rows: Sequence[Row]) -> Picture:
         counts = np.array([float(r["freezes"]) for r in again])
         if counts.size:
             _slope(axes, counts, again[-1][WORST])
-        axes.loglog(counts, [r[WORST] for r in again], "o-", color=BLUE, markersize=5)
-        axes.loglog(counts, [r[MEDIAN] for r in again], "o--", color=BLUE, markersize=4, linewidth=1.0)
+        axes.loglog(counts, [r[WORST] for r in again], "o-", color=AGAIN, markersize=5)
+        axes.loglog(counts, [r[MEDIAN] for r in again], "o--", color=AGAIN, markersize=4, linewidth=1.0)
         axes.set_xticks(sorted({float(r["freezes"]) for r in rows if r["freezes"]}))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
         axes.xaxis.set_minor_locator(NullLocator())
@@ -51,7 +52,7 @@ def fidelity_picture(rows: Sequence[Row]) -> Picture:
     panels[0].set_ylabel("impulse error against full dynamics [%]")
     handles = [Line2D([], [], color=colour, label=label) for colour, label in LEVELS.values()]
     handles += [
-        Line2D([], [], color=BLUE, marker="o", label="our SDC, frozen again on the way"),
+        Line2D([], [], color=AGAIN, marker="o", label="our SDC, frozen again on the way"),
         Line2D([], [], color=GREY, linestyle=":", label="falls with the square"),
         Line2D([], [], color=BLACK, linestyle="--", linewidth=1.0, label="dashed: median"),
     ]

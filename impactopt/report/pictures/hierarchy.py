@@ -10,32 +10,21 @@ from matplotlib.lines import Line2D
 
 from impactopt.collision import Collision
 from impactopt.errors import InputError
-from impactopt.report.pictures.style import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PAGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    Array,
-    Picture,
-    styled,
-)
+from impactopt.report.pictures.style import MODELS, PAGE, Array, Picture, styled
 
-# in turn, from the coarsest model to the finest; what is beside the reference is drawn thin
+# in turn, from the coarsest model to the finest: a virtual mass, the paper's SDC, ours, and ours frozen again
+# in shades of one colour; what is beside the reference is drawn thin
 STYLES: tuple[dict[str, Any], ...] = (
-    {"color": GREEN, "linestyle": ":", "linewidth": 1.8},
-    {"color": VERMILION, "linestyle": "--"},
-    {"color": BLUE, "linewidth": 1.4},
-    {"color": ORANGE, "linestyle": "-.", "linewidth": 1.2},
-    {"color": PURPLE, "linewidth": 1.2},
-    {"color": SKY, "linestyle": (0, (4, 1)), "linewidth": 1.2},
-    {"color": "#666666", "linestyle": (0, (1, 1)), "linewidth": 1.2},
+    {"color": MODELS["virtual-mass"], "linestyle": ":", "linewidth": 1.8},
+    {"color": MODELS["sdc-paper"], "linestyle": "--"},
+    {"color": MODELS["sdc"], "linewidth": 1.4},
+    {"color": "#003D63", "linestyle": "-.", "linewidth": 1.2},
+    {"color": MODELS["freezes"], "linewidth": 1.2},
+    {"color": "#4DA3D4", "linestyle": (0, (4, 1)), "linewidth": 1.2},
+    {"color": "#8CC4E6", "linestyle": (0, (1, 1)), "linewidth": 1.4},
 )
 LEAST = 1e-4  # of the impulse; what is off by less is off the picture
-REFERENCE: dict[str, Any] = {"color": BLACK, "linewidth": 3.2, "alpha": 0.35}
+REFERENCE: dict[str, Any] = {"color": MODELS["full"], "linewidth": 3.2, "alpha": 0.35}
 
 
 @styled

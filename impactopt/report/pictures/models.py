@@ -8,18 +8,18 @@ from typing import Any
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from impactopt.report.pictures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, Picture, styled
+from impactopt.report.pictures.style import Picture, model_colour, styled
 
 Row = Mapping[str, Any]
 
-# model and freezes: colour, mark, and what it is called
+# model and freezes: mark, and what it is called
 MARKS = {
-    ("virtual-mass", 0): (ORANGE, "v", "virtual mass"),
-    ("sdc-paper", 0): (VERMILION, "s", "the paper's SDC"),
-    ("sdc", 0): (GREEN, "o", "our SDC, frozen at contact"),
-    ("sdc", 4): (GREEN, "D", "our SDC, 4 freezes on the way"),
-    ("full", 0): (BLUE, "o", "full dynamics"),
-    ("auto", 0): (BLACK, "*", "auto"),
+    ("virtual-mass", 0): ("v", "virtual mass"),
+    ("sdc-paper", 0): ("s", "the paper's SDC"),
+    ("sdc", 0): ("o", "our SDC, frozen at contact"),
+    ("sdc", 4): ("D", "our SDC, 4 freezes on the way"),
+    ("full", 0): ("o", "full dynamics"),
+    ("auto", 0): ("*", "auto"),
 }
 LEAST = 1e-3  # [%] an error is not told to be less
 
@@ -34,12 +34,13 @@ def models_picture(rows: Sequence[Row]) -> Picture:
         axes.set_xscale("log")
         axes.set_yscale("log")
         for r in (r for r in rows if r["problem"] == problem):
-            mark = MARKS.get((r["model"], r["freezes"]))
-            if mark is None or r["error_pct"] is None:
+            mark, _ = MARKS.get((r["model"], r["freezes"]), ("", ""))
+            if not mark or r["error_pct"] is None:
                 continue
-            face = "none" if r["stands"] is False else mark[0]
+            colour = model_colour(r["model"], r["freezes"])
+            face = "none" if r["stands"] is False else colour
             error = max(abs(r["error_pct"]), LEAST)
-            axes.plot(r["seconds"], error, mark[1], color=mark[0], markerfacecolor=face, markersize=6)
+            axes.plot(r["seconds"], error, mark, color=colour, markerfacecolor=face, markersize=6)
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -48,8 +49,8 @@ def models_picture(rows: Sequence[Row]) -> Picture:
         axes.set_xlabel("solve [s]")
     panels[0].set_ylabel("impulse: plan against replay [%]")
     handles = [
-        Line2D([], [], color=colour, marker=mark, linestyle="", label=label)
-        for colour, mark, label in MARKS.values()
+        Line2D([], [], color=model_colour(*which), marker=mark, linestyle="", label=label)
+        for which, (mark, label) in MARKS.items()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=7)
     return figure

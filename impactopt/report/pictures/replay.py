@@ -16,6 +16,7 @@ from impactopt.report.pictures.style import (
     ORANGE,
     PAGE,
     PHASES,
+    RIGHT,
     VERMILION,
     Array,
     Picture,
@@ -88,7 +89,7 @@ def _centres(figure: Picture, axes: Any, a: Any) -> None:
             axes.plot(-points[:, 1], points[:, 0], ".", color=colour, markersize=2.5, zorder=3 + (which == 1))
     axes.set_aspect("equal")
     axes.set(
-        xlabel="y, to the right [m]",
+        xlabel=RIGHT,
         ylabel="x, forward [m]",
         title="centre of pressure\n",
     )

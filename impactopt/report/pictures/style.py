@@ -33,7 +33,18 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, BLACK = (
     "#000000",
 )
 
+# collision models, in all pictures: the SDC's equations are green whatever integrates them, frozen again blue
+MODELS = {
+    "virtual-mass": ORANGE,
+    "sdc-paper": VERMILION,
+    "sdc": GREEN,
+    "freezes": BLUE,
+    "full": BLACK,
+    "mujoco": SKY,
+    "auto": PURPLE,
+}
 PLANNED, SIMULATED, OVER = BLUE, VERMILION, VERMILION
+RIGHT = "-y, to the right [m]"  # an axis of what is seen from above or from behind: y is to the left
 PHASES = ("swing", "collision", "follow-through")
 
 # [in] what a paper's column and its page are wide; a picture of that width needs no scaling in print
@@ -112,6 +123,11 @@ def title(record: Record, what: str) -> str:
     """The problem's name, and what is drawn."""
     name = record.summary.get("problem", {}).get("name", "")
     return f"{name}: {what}" if name else what
+
+
+def model_colour(model: str, freezes: float = 0) -> str:
+    """Of a collision model by its name in a file, frozen again on the way so often."""
+    return MODELS["freezes" if freezes else model]
 
 
 def joint_label(name: object) -> str:

@@ -26,6 +26,7 @@ from impactopt.report.pictures.style import (
     SKY,
     VERMILION,
     Picture,
+    model_colour,
     styled,
 )
 from impactopt.report.pictures.sweep_columns import (
@@ -49,6 +50,7 @@ NOWHERE = "#d9d9d9"  # rows that are impossible
 FEW = 25  # points of a line, with marks
 MOST = 20_000  # points of a scatter: more are no clearer
 SCALE = "cividis"
+MODEL, FREEZES = "at_contact.model", "at_contact.freezes"
 DASHES: Any = ("-", "--", ":")  # of contours
 _PLAIN = FuncFormatter(lambda x, _: _number(x))
 
@@ -159,7 +161,7 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
     panel, titles = combined([section.panel] if section.panel else [], data)
     figure = Picture(PAGE, 0.7 + (1.6 if len(section.y) > 1 else 2.2) * len(section.y))
     grid = figure.subplots(len(section.y), len(titles), sharex=True, sharey="row", squeeze=False)
-    scale = _shades(section, data, names)
+    scale = _shades(section, data, groups, names)
     there: dict[str, Any] = {}  # lines by what they are called
     for name, row in zip(section.y, grid, strict=True):
         values, label = data.results(name), data.label(name)
@@ -188,8 +190,14 @@ def _lines(section: Section, data: SweepColumns) -> Picture:
     return figure
 
 
-def _shades(section: Section, data: SweepColumns, names: Sequence[str]) -> list[Any]:
-    """Numbers are shades of one scale, kinds are colours of their own."""
+def _shades(
+    section: Section, data: SweepColumns, groups: NDArray[np.intp], names: Sequence[str]
+) -> list[Any]:
+    """Numbers are shades of one scale, kinds are colours of their own; models have theirs in all pictures."""
+    if MODEL in section.colour:
+        again = data.numbers(FREEZES) if FREEZES in section.colour else np.zeros(len(groups))
+        first = [int(np.argmax(groups == g)) for g in range(len(names))]
+        return [model_colour(data.values(MODEL)[k], again[k]) for k in first]
     one = len(section.colour) == 1 and data.values(section.colour[0]).dtype != object
     if one and len(names) > 2:
         return [colormaps[SCALE](0.9 * k / (len(names) - 1)) for k in range(len(names))]

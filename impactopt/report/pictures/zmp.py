@@ -21,6 +21,7 @@ from impactopt.report.pictures.style import (
     OVER,
     PAGE,
     PHASES,
+    RIGHT,
     Array,
     Picture,
     simulated_phases,
@@ -137,7 +138,7 @@ def _ground(axes: Any, arrays: Mapping[str, Array]) -> None:
     polygon = np.vstack([arrays["polygon"], arrays["polygon"][:1]])
     axes.plot(-polygon[:, 1], polygon[:, 0], "--", color=BLACK, linewidth=1.0)
     axes.set_aspect("equal")
-    axes.set_xlabel("y, to the right [m]")
+    axes.set_xlabel(RIGHT)
     axes.grid(False)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.solvers.sqp.qp import QPSolver
 
 
@@ -60,6 +60,4 @@ def make_qp_solver(name: str, tolerance: float = 1e-6) -> QPSolver:
     try:
         return QP_SOLVERS[name](tolerance)
     except ImportError as error:
-        raise InputError(
-            f"the QP solver '{name}' is not installed: pip install {name}, or impactopt[qp]"
-        ) from error
+        raise missing_package(f"the QP solver {name!r}", name, "qp") from error

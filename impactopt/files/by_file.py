@@ -1,0 +1,53 @@
+"""`solve`, `optimize_strike` and `drive_nail` of a problem, or of the file that describes it."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from impactopt.errors import InputError
+from impactopt.files.problem_file import read_problem_file
+from impactopt.planning import nail_driving, planner, strike
+from impactopt.problem.problem import ImpactProblem
+
+__all__ = ["drive_nail", "optimize_strike", "solve"]
+
+R = TypeVar("R")
+
+_log = logging.getLogger("impactopt")  # its lines are seen by who asks for level INFO
+
+_ABOUT = """
+
+    problem : an :class:`impactopt.ImpactProblem`; or the path of a problem file, or the name of one that
+        comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else is
+        given.
+    report : where it is None, its lines go to the logger "impactopt", with level INFO.
+"""
+
+
+def _or_file(run: Callable[..., R]) -> Callable[..., R]:
+    @functools.wraps(run)
+    def of_either(problem: ImpactProblem | str | os.PathLike[str], *args: Any, **options: Any) -> R:
+        if options.get("report") is None:
+            options["report"] = _log.info
+        if isinstance(problem, ImpactProblem):
+            return run(problem, *args, **options)
+        if not isinstance(problem, (str, os.PathLike)):
+            raise InputError(
+                f"problem: a {type(problem).__name__} is none; give an ImpactProblem, the path of a problem "
+                "file, or the name of one that comes with the package (`impactopt problems`)"
+            )
+        read = read_problem_file(problem)
+        chosen = read.solver.arguments(options.get("solver"), options.get("time_limit"))
+        return run(read.build(), *args, **(chosen | {k: v for k, v in options.items() if v is not None}))
+
+    of_either.__doc__ = (run.__doc__ or "").rstrip() + _ABOUT
+    return of_either
+
+
+solve = _or_file(planner.solve)
+optimize_strike = _or_file(strike.optimize_strike)
+drive_nail = _or_file(nail_driving.drive_nail)

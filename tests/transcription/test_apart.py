@@ -20,8 +20,9 @@ from impactopt.bodies.clearance import Places
 from impactopt.bodies.fit import PLANES, Planes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.planning.keeping_apart import BEAD, Margins, missing_rows, rows_near, rows_to_add, spots_of
+from impactopt.planning.keeping_apart import BEAD, Margins, rows_near, spots_of
 from impactopt.planning.solution import Solution
+from impactopt.planning.too_near import missing_rows, rows_to_add
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos

@@ -28,10 +28,9 @@ Array = NDArray[np.float64]
 _LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
 _BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
 _BARRIER_DEEP = 1e-3  # and breaks by far
-_STUCK = (Status.INFEASIBLE, Status.FAILED, Status.ITERATION_LIMIT)
+_STUCK = (Status.INFEASIBLE, Status.FAILED)
 _NODE_ROUNDS, _DEEP_ROUNDS = 3, 7  # at most: with a finer mesh, from the start again
-_ROUNDS = 12  # and more of them only while
-_PATIENCE, _LESS = 6, 0.9  # so many bring bodies out of each other to this share of how deep they were
+_ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
 _ITERATIONS = 200  # of a start after which there is another
 
 
@@ -88,7 +87,6 @@ class Refining:
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
         self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
         self._refined = 0  # rounds with a finer mesh
-        self._depths: list[float] = []  # [m] that bodies were in each other in each round
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
@@ -120,7 +118,7 @@ class Refining:
         x0 = start.x if isinstance(start, SolverResult) else start
         free = t
         t, result = self.first(free, start)
-        if result.status in _STUCK and t.apart_rows and self.budget.left != 0:
+        if self._stuck(result) and t.apart_rows and self.budget.left != 0:
             t, result = self._led_out(free, t, result, x0)
         else:
             t, result = self._judged(*self.rounds(t, result, x0)[:2])
@@ -128,6 +126,12 @@ class Refining:
         if looked is result or not looked.status.usable:
             return t, looked
         return self._judged(*self.rounds(t, looked, x0)[:2])
+
+    def _stuck(self, result: SolverResult) -> bool:
+        """Whether the solver has ended without a solution, and not at a limit that the caller has set."""
+        if result.status is Status.ITERATION_LIMIT:
+            return "max_iterations" not in (self.budget.options or {})
+        return result.status in _STUCK
 
     def _led_out(
         self, free: Transcription, t: Transcription, stuck: SolverResult, x0: Array
@@ -152,12 +156,13 @@ class Refining:
         round.
         """
         found: list[tuple[Transcription, str, SolverResult]] = []
-        self._tried, self._refined, self._depths, self._apart = frozenset(), 0, [], None
+        self._tried, self._refined, self._apart = frozenset(), 0, None
         while result.status.usable and self.budget.left != 0:
             if self.margins is None and len(found) == _NODE_ROUNDS:
                 break
             following = self._next(t, result, x0, len(found))
-            if following is None or self._stalls:
+            touching = self._apart is None or self._apart[1] is not result
+            if following is None or len(found) >= (_MOST if touching else _ROUNDS):
                 break
             if self.report is not None:
                 self.report(following.why)
@@ -169,14 +174,6 @@ class Refining:
             t, result = following.program, one_after_the_other(result, new)
             found.append((t, following.name, new))
         return t, result, found
-
-    @property
-    def _stalls(self) -> bool:
-        """Whether rounds are many, and the last of them have not brought bodies further out of each other."""
-        depths = self._depths
-        if len(depths) <= _ROUNDS:
-            return False
-        return depths[-1] <= 0 or min(depths[-_PATIENCE:]) > _LESS * min(depths[:-_PATIENCE])
 
     def _judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
         """A result that could not be mended is a solution only if nothing touches anything; else the last one
@@ -210,8 +207,7 @@ class Refining:
         error: ContactError | None = None
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
             violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
-        self._depths.append(-np.inf if violated is None else violated.depth)
-        if self.margins is not None and self._depths[-1] <= 0:
+        if self.margins is not None and (violated is None or violated.depth <= 0):
             self._apart = t, old
         if violated is not None and violated.deep and again < _DEEP_ROUNDS:
             return self._apart_again(t, old, x0, violated)

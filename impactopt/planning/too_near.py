@@ -24,6 +24,7 @@ from impactopt.planning.keeping_apart import (
     AFTER,
     BETWEEN,
     DEEP,
+    EXACT,
     Margins,
     Rows,
     Spots,
@@ -41,7 +42,7 @@ STEP = 8e-3  # [s] at which a plan is looked at
 SHARE = 0.5  # of a margin that may be given up between nodes
 AT_NODES = 0.25  # and at them
 CUT = 0.1  # of a margin that a row asks for more, at least
-SHORTEST = 2e-3  # [s] between two nodes
+SHORTEST = 2e-3  # [s] between two nodes that get another
 INNER = 0.2  # of the time between two nodes: another one is not nearer to them
 
 
@@ -93,9 +94,10 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     for (beside, pair), found in sorted(worst.items(), key=lambda item: item[1].apart):
         if wanted.keep_apart(beside, pair, found.apart):
             at_places[pair] = min(at_places.get(pair, np.inf), found.apart)
-        elif not nodes.add(found):
+        elif not nodes.add(found, wanted.jumps(beside, pair)):
             wanted.ask_more(beside, pair, found.apart)
     deep = frozenset(pair for pair, apart in at_places.items() if apart < -DEEP)
+    wanted.wherever_near({pair for _, pair in worst} - deep)
     rows = wanted.rows
     if deep:
         own = bodies.near(spots.at, -DEEP, BETWEEN, set(deep)).least()
@@ -162,12 +164,28 @@ class _Wanted:
                 self.add(spot, pair, near.get(spot, 0.0))
         return bool(near)
 
+    def jumps(self, beside: Sequence[int], pair: Pair) -> bool:
+        """Whether the one is on two sides of the other at the places beside."""
+        bodies, at = self.margins.bodies, self.spots.at
+        normals = [bodies.closest(at, spot, pair).normal for spot in beside]
+        return bool(normals[0] @ normals[-1] < 0)
+
     def ask_more(self, beside: Sequence[int], pair: Pair, apart: float) -> None:
         """Rows at the places beside for what is missing between them [m], which has none of its own."""
         asked = self.margins.of(pair)
         for spot in beside:
             already = max(self.distance(spot, pair) - asked, 0.0)
             self.add(spot, pair, already + min(asked - apart, DEEP))
+
+    def wherever_near(self, pairs: set[Pair]) -> None:
+        """Rows for these pairs at all places where they are near: bodies that are pushed apart at one come to
+        be too near at the next.
+        """
+        near = self.margins.bodies.near(self.spots.at, EXACT, only=pairs).least()
+        for k, joint, other in zip(near.at, near.joint, near.other, strict=True):
+            pair = self.margins.bodies.known(int(joint), int(other))
+            if not self._known[self.spots.names[int(k)], pair[0], pair[1]]:
+                self.add(int(k), pair)
 
 
 class _Nodes:
@@ -180,9 +198,9 @@ class _Nodes:
     def all(self) -> MoreNodes:
         return MoreNodes(tuple(sorted(self._places[0])), tuple(sorted(self._places[AFTER])))
 
-    def add(self, found: _Between) -> bool:
-        """One at that instant, or as near to it as others are not; False: they are too near to each other, or
-        in contact, which has none.
+    def add(self, found: _Between, jumps: bool) -> bool:
+        """One at that instant, or as near to it as others are not; two beside it, where bodies jump from one
+        side to the other.  False: the others are too near to each other, or it is in contact, which has none.
         """
         for phase, places in self._places.items():
             curve, begin, nodes, _ = self._plan.segment(phase, missed=found.missed)
@@ -195,7 +213,9 @@ class _Nodes:
                 return False
             if not any(first < s < last for s in places):
                 inner = INNER * (last - first)
-                places.add(round(float(np.clip(place, first + inner, last - inner)), 4))
+                place = float(np.clip(place, first + inner, last - inner))
+                beside = [(first + place) / 2, (place + last) / 2] if jumps else []
+                places.update(round(s, 4) for s in (place, *beside))
             return True
         return False
 

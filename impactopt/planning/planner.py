@@ -39,6 +39,7 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
+_MORE = 2  # starts, where all that were asked for end with bodies in each other
 
 
 def solve(
@@ -63,7 +64,8 @@ def solve(
         a reach, which is a program of its own (:func:`impactopt.optimize_strike`); solver variables (n,); or
         the solution of a neighbouring problem, such as the same with its target moved by a few centimetres.
     starts : number of starts. The first one is plain, the others have perturbed postures and other speeds,
-        drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all.
+        drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies
+        in each other, up to two more are tried.
     options : the solver's own.  time_limit [s] : of all starts together, without compiling functions.
     refine : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
         between two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``).
@@ -121,7 +123,7 @@ def solve(
     # limbs that are in each other say nothing of what a start is worth: each is led to its end before they
     # compare
     each = refining.solve if margins is not None and refine else refining.first
-    of_start = _starts(t, given, starts, seed, partial(clear_strike, budget, margins))
+    of_start = _starts(t, given, starts, seed, partial(clear_strike, budget, margins), refining)
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
@@ -174,15 +176,23 @@ def _starts(
     starts: int,
     seed: int,
     hit: Callable[[StrikeTranscription, Array], tuple[StrikeTranscription, SolverResult]],
+    refining: Refining,
 ) -> Starts:
-    """Names of the starts, and what makes them; ``hit`` solves a strike."""
+    """Names of the starts, and what makes them; ``hit`` solves a strike.
+
+    A few more than asked for while each ends with bodies in each other: where a motion passes them on the
+    wrong side, others may not.
+    """
     if not isinstance(start, str):
         yield "given", lambda: start
         return
     strike = None
     if start == "strike":
         strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
-    for k, draw in enumerate(drawn(starts, seed)):
+    blocked = True
+    for k, draw in enumerate(drawn(starts + _MORE, seed)):
+        if k >= starts and not blocked:
+            return
 
         def make(draw: dict[str, Any] = draw) -> Array:
             if strike is None:
@@ -191,3 +201,4 @@ def _starts(
             return iterate_from_strike(t, found, result.x)
 
         yield f"{start} {k + 1}", make
+        blocked &= refining.blocked

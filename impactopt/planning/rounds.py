@@ -31,7 +31,7 @@ _BARRIER_DEEP = 1e-3  # and breaks by far
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 _NODE_ROUNDS, _DEEP_ROUNDS = 3, 7  # at most: with a finer mesh, from the start again
 _ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
-_ITERATIONS = 200  # of a start after which there is another
+_ITERATIONS = 200  # from a solution, where there is another start: it goes on in a few, or hardly at all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,8 @@ class Round:
         """The first result that is a solution, or the last one."""
         *others, last = self.starts
         for start in others:
-            new = budget.run(self.program.program, start, self.barrier, most=_ITERATIONS)
+            most = _ITERATIONS if isinstance(start, SolverResult) else None
+            new = budget.run(self.program.program, start, self.barrier, most)
             if new.status.usable or new.status is Status.INTERRUPTED or budget.left == 0:
                 return new
         return budget.run(self.program.program, last, self.barrier)
@@ -88,6 +89,7 @@ class Refining:
         self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
         self._refined = 0  # rounds with a finer mesh
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
+        self.blocked = False  # whether it ended with bodies in each other: another start may not
 
     def error(self, t: Transcription, x: Array) -> ContactError | None:
         """Of a program's contact at its solution; the last one that was asked for is known."""
@@ -116,7 +118,7 @@ class Refining:
     def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The last program, and its result with the effort of all."""
         x0 = start.x if isinstance(start, SolverResult) else start
-        free = t
+        free, self.blocked = t, False
         t, result = self.first(free, start)
         if self._stuck(result) and t.apart_rows and self.budget.left != 0:
             t, result = self._led_out(free, t, result, x0)
@@ -161,8 +163,7 @@ class Refining:
             if self.margins is None and len(found) == _NODE_ROUNDS:
                 break
             following = self._next(t, result, x0, len(found))
-            touching = self._apart is None or self._apart[1] is not result
-            if following is None or len(found) >= (_MOST if touching else _ROUNDS):
+            if following is None or len(found) >= (_ROUNDS if self._is_apart(result) else _MOST):
                 break
             if self.report is not None:
                 self.report(following.why)
@@ -175,13 +176,17 @@ class Refining:
             found.append((t, following.name, new))
         return t, result, found
 
+    def _is_apart(self, result: SolverResult) -> bool:
+        """Whether a result has been looked at, and nothing touches anything."""
+        return self._apart is not None and self._apart[1] is result
+
     def _judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
         """A result that could not be mended is a solution only if nothing touches anything; else the last one
         is that was, if any.
         """
         if self.margins is None or not result.status.usable:
             return t, result
-        if self._apart is not None and self._apart[1] is result:
+        if self._is_apart(result):
             return t, result
         with contextlib.suppress(InputError):
             left = rows_to_add(t, result.x, self.margins, share=1.0)
@@ -190,6 +195,7 @@ class Refining:
                     before, clean = self._apart
                     effort = {key: getattr(result, key) for key in EFFORT}
                     return before, replace(clean, history=result.history, **effort)
+                self.blocked = True
                 names = sorted({" and ".join(self.margins.bodies.names(row[1:3])) for row in left.rows})
                 message = (
                     f"Bodies are {1e3 * left.depth:.1f} mm in each other, and no solution was found where "
@@ -258,11 +264,12 @@ class Refining:
         program = t.with_apart({**t.apart_rows, **violated.rows})
         words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
         round_of = partial(Round, program=program, name="rows between bodies")
-        if violated.depth > _LOST or violated.deep & self._tried:
-            self._tried = frozenset()
-            return round_of(starts=(x0, old.x), why=f"{words}: from the start again, with rows between them")
-        self._tried |= violated.deep
         x, y, z = carried_over(program, t, old.x, old.multipliers, old.bound_multipliers)
         warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
+        if violated.depth > _LOST or violated.deep & self._tried:
+            self._tried = frozenset()
+            why = f"{words}: from the start again, with rows between them"
+            return round_of(starts=(x0, warm, old.x), why=why, barrier=_BARRIER_DEEP)
+        self._tried |= violated.deep
         why = f"{words}: on with rows between them"
         return round_of(starts=(warm, x0, old.x), why=why, barrier=_BARRIER_DEEP)

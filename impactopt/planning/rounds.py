@@ -196,7 +196,7 @@ class Refining:
                     effort = {key: getattr(result, key) for key in EFFORT}
                     return before, replace(clean, history=result.history, **effort)
                 self.blocked = True
-                names = sorted({" and ".join(self.margins.bodies.names(row[1:3])) for row in left.rows})
+                names = sorted(" and ".join(self.margins.bodies.names(pair)) for pair in left.pairs)
                 message = (
                     f"Bodies are {1e3 * left.depth:.1f} mm in each other, and no solution was found where "
                     f"they are not: {'; '.join(names[:3])}."
@@ -212,9 +212,10 @@ class Refining:
         elements: Elements | None = None
         error: ContactError | None = None
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
-            violated = rows_to_add(t, old.x, self.margins) if self.margins is not None else None
-        if self.margins is not None and (violated is None or violated.depth <= 0):
-            self._apart = t, old
+            if self.margins is not None:
+                violated = rows_to_add(t, old.x, self.margins)
+                if violated is None or violated.depth <= 0:
+                    self._apart = t, old
         if violated is not None and violated.deep and again < _DEEP_ROUNDS:
             return self._apart_again(t, old, x0, violated)
         needed = nodes = t.nodes if violated is None else violated.nodes

@@ -12,7 +12,7 @@ and Falk, 1976): rounds end with bodies that are apart, or with a program that h
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from impactopt.planning.keeping_apart import (
 )
 from impactopt.transcription.apart import ApartRow
 from impactopt.transcription.at_contact import ContactProgram
-from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.mesh_refinement import MoreNodes
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.transcription import Transcription
 
@@ -47,15 +47,16 @@ INNER = 0.2  # of the time between two nodes: another one is not nearer to them
 
 
 class Violated(NamedTuple):
-    """Rows that a solution needs beside its own, how deep [m] bodies are in each other without them, and
-    which pairs of them are deeper than `DEEP`. And the program's nodes with those that it needs, as bodies
-    meet between two at which they are apart.
+    """Rows that a solution needs beside its own, how deep [m] bodies are in each other without them, which
+    pairs are too near, and which are deeper than `DEEP` so that rows help. And the program's nodes with those
+    that it needs, as bodies meet between two at which they are apart.
     """
 
     rows: Rows
     depth: float
-    deep: frozenset[Pair] = frozenset()
-    nodes: MoreNodes = NO_MORE
+    pairs: frozenset[Pair]
+    deep: frozenset[Pair]
+    nodes: MoreNodes
 
 
 class _Between(NamedTuple):
@@ -97,13 +98,14 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         elif not nodes.add(found, wanted.jumps(beside, pair)):
             wanted.ask_more(beside, pair, found.apart)
     deep = frozenset(pair for pair, apart in at_places.items() if apart < -DEEP)
-    wanted.wherever_near({pair for _, pair in worst} - deep)
+    pairs = frozenset(pair for _, pair in worst)
+    wanted.wherever_near(pairs - deep)
     rows = wanted.rows
     if deep:
         own = bodies.near(spots.at, -DEEP, BETWEEN, set(deep)).least()
         rows = {**rows_all_along(margins, spots, own), **rows}
     new = {key: held for key, held in rows.items() if key not in t.apart_rows}
-    return Violated(new, deepest, deep, nodes.all)
+    return Violated(new, deepest, pairs, deep, nodes.all)
 
 
 def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:
@@ -177,11 +179,11 @@ class _Wanted:
             already = max(self.distance(spot, pair) - asked, 0.0)
             self.add(spot, pair, already + min(asked - apart, DEEP))
 
-    def wherever_near(self, pairs: set[Pair]) -> None:
+    def wherever_near(self, pairs: Set[Pair]) -> None:
         """Rows for these pairs at all places where they are near: bodies that are pushed apart at one come to
         be too near at the next.
         """
-        near = self.margins.bodies.near(self.spots.at, EXACT, only=pairs).least()
+        near = self.margins.bodies.near(self.spots.at, EXACT, only=set(pairs)).least()
         for k, joint, other in zip(near.at, near.joint, near.other, strict=True):
             pair = self.margins.bodies.known(int(joint), int(other))
             if not self._known[self.spots.names[int(k)], pair[0], pair[1]]:
@@ -209,12 +211,13 @@ class _Nodes:
                 continue
             k = int(np.clip(np.searchsorted(nodes, place), 1, len(nodes) - 1))
             first, last = float(nodes[k - 1]), float(nodes[k])
-            if (last - first) * curve.duration < 2 * SHORTEST:
+            span = (last - first) * curve.duration
+            if span < 2 * SHORTEST:
                 return False
             if not any(first < s < last for s in places):
                 inner = INNER * (last - first)
                 place = float(np.clip(place, first + inner, last - inner))
-                beside = [(first + place) / 2, (place + last) / 2] if jumps else []
+                beside = [(first + place) / 2, (place + last) / 2] if jumps and span > 4 * SHORTEST else []
                 places.update(round(s, 4) for s in (place, *beside))
             return True
         return False

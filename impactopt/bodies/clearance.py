@@ -282,6 +282,10 @@ class Bodies:
         solid = self.world[-1 - body]
         return solid.rotation, solid.place + at.travel[k] * self.normal * solid.moves
 
+    def planes(self, body: int) -> Planes:
+        """About what a joint moves, or about a body of the world, -1 - its index."""
+        return self.links.planes[body] if body >= 0 else self.world[-1 - body].planes
+
     @cached_property
     def slack(self) -> float:
         """[m] by how much bodies may be nearer than their spheres and planes say."""

@@ -108,13 +108,17 @@ class Budget:
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
 
     def run(
-        self, program: NonlinearProgram, start: Array | SolverResult, barrier: float | None = None
+        self,
+        program: NonlinearProgram,
+        start: Array | SolverResult,
+        barrier: float | None = None,
+        most: int | None = None,
     ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
 
-        barrier : the first of "sqp" from a result, where that is not as near as it looks.
-
         start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
+        barrier : the first of "sqp" from a result, where that is not as near as it looks.
+        most : iterations of "sqp", if the options do not say how many.
         """
         left, y, z = self.left, None, None
         if isinstance(start, SolverResult):
@@ -124,6 +128,8 @@ class Budget:
         if self.solver == "ipopt":
             return solve_ipopt(program, x0, options=self.options, callback=self.callback, time_limit=left)
         settings = dict(self.options or {})
+        if most is not None:
+            settings.setdefault("max_iterations", most)
         if barrier is not None and z is not None:
             settings.setdefault("barrier_warm", barrier)
         if left is not None:

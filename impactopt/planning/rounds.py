@@ -1,19 +1,37 @@
-"""What a planner solves next, after a program whose solution is not right yet."""
+"""From a program's solution to one that is right between its rows too, round by round."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.solvers.program import SolverResult
-from impactopt.transcription.mesh import Elements
-from impactopt.transcription.mesh_refinement import MoreNodes
-from impactopt.transcription.start import carried_over
-from impactopt.transcription.transcription import Transcription
+from impactopt.bodies.robot_bodies import Pair
+from impactopt.errors import InputError
+from impactopt.planning.keeping_apart import Margins, rows_near
+from impactopt.planning.multistart import EFFORT, VIOLATED, Budget, one_after_the_other
+from impactopt.planning.too_near import Violated, missing_rows, rows_to_add
+from impactopt.planning.verdict import second_look
+from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.apart import ApartRow, Held
+from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
+from impactopt.transcription.mesh import Elements, contact_elements
+from impactopt.transcription.mesh_refinement import nodes_to_add
+from impactopt.transcription.start import carried_over, first_iterate
+from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
+_LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
+_BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
+_BARRIER_DEEP = 1e-3  # and breaks by far
+_STUCK = (Status.INFEASIBLE, Status.FAILED)
+_NODE_ROUNDS, _DEEP_ROUNDS = 3, 7  # at most: with a finer mesh, from the start again
+_ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
+_ITERATIONS = 200  # from a solution, where there is another start: it goes on in a few, or hardly at all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,15 +44,233 @@ class Round:
     why: str
     barrier: float | None = None
 
+    def solved(self, budget: Budget) -> SolverResult:
+        """The first result that is a solution, or the last one."""
+        *others, last = self.starts
+        for start in others:
+            most = _ITERATIONS if isinstance(start, SolverResult) else None
+            new = budget.run(self.program.program, start, self.barrier, most)
+            if new.status.usable or new.status is Status.INTERRUPTED or budget.left == 0:
+                return new
+        return budget.run(self.program.program, last, self.barrier)
+
 
 def start_of(finer: Transcription, t: Transcription, x0: Array) -> Array:
     """What a program started from, for one with more nodes or elements."""
     return carried_over(finer, t, x0, np.zeros(t.program.m), np.zeros(t.layout.n))[0]
 
 
-def more_of(nodes: MoreNodes, elements: Elements | None, rows: int) -> str:
+def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
     """What is more in a program, in words."""
-    words = [f"{nodes.total} more node{'s' if nodes.total > 1 else ''}"] if nodes.total else []
+    words = [f"{nodes} more node{'s' if nodes > 1 else ''}"] if nodes else []
     words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
     words += [f"{rows} more rows between bodies"] if rows else []
     return ", ".join(words)
+
+
+class Refining:
+    """The way from a program's solution to one that is right between its rows too.
+
+    A program has rows between the bodies that come near at its start, and nodes and elements where its mesh
+    has them. Where its solution brings other bodies into each other, leaves its limits between nodes, or has
+    a contact that is too coarse, it gets more of them there and is solved again: from where it is; or, where
+    limbs are through each other, from the start.
+    """
+
+    def __init__(
+        self,
+        budget: Budget,
+        margins: Margins | None,
+        rows: Mapping[ApartRow, Held],
+        report: Callable[[str], None] | None,
+    ) -> None:
+        self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
+        self._known: tuple[Transcription, Array, ContactError | None] | None = None
+        self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
+        self._refined = 0  # rounds with a finer mesh
+        self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
+        self.blocked = False  # whether it ended with bodies in each other: another start may not
+
+    def error(self, t: Transcription, x: Array) -> ContactError | None:
+        """Of a program's contact at its solution; the last one that was asked for is known."""
+        if self._known is None or self._known[0] is not t or self._known[1] is not x:
+            self._known = t, x, contact_error(t, x)
+        return self._known[2]
+
+    def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        """The program with its first rows between bodies, and its result."""
+        if self.margins is not None:
+            warm = isinstance(start, SolverResult)
+            x0 = start.x if isinstance(start, SolverResult) else start
+            t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
+        if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
+            start = start.x  # of a program with other rows
+        result = self.budget.run(t.program, start)
+        if self.margins is None:
+            result = self._looked_at(t, result, start.x if isinstance(start, SolverResult) else start)
+        return t, result
+
+    def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
+        """A result without a verdict with that of another solver, from the same start."""
+        new = second_look(self.budget, t.program, x0, result, self.report)
+        return result if new is result else one_after_the_other(result, new)
+
+    def solve(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        """The last program, and its result with the effort of all."""
+        x0 = start.x if isinstance(start, SolverResult) else start
+        free, self.blocked = t, False
+        t, result = self.first(free, start)
+        if self._stuck(result) and t.apart_rows and self.budget.left != 0:
+            t, result = self._led_out(free, t, result, x0)
+        else:
+            t, result = self._judged(*self.rounds(t, result, x0)[:2])
+        looked = self._looked_at(t, result, x0)
+        if looked is result or not looked.status.usable:
+            return t, looked
+        return self._judged(*self.rounds(t, looked, x0)[:2])
+
+    def _stuck(self, result: SolverResult) -> bool:
+        """Whether the solver has ended without a solution, and not at a limit that the caller has set."""
+        if result.status is Status.ITERATION_LIMIT:
+            return "max_iterations" not in (self.budget.options or {})
+        return result.status in _STUCK
+
+    def _led_out(
+        self, free: Transcription, t: Transcription, stuck: SolverResult, x0: Array
+    ) -> tuple[Transcription, SolverResult]:
+        """What comes of a start that leads nowhere with the first rows between bodies of a program ``t``.
+
+        That is where a solver stopped, not that there is no motion: the rows know the bodies as they are at
+        the start. So the motion without them is led out of what it is in; where that fails too, the rows say
+        what is in the way.
+        """
+        if self.report is not None:
+            self.report("no motion was found from there with rows between bodies: first without them")
+        last, result = self._judged(*self.rounds(free, self.budget.run(free.program, x0), x0)[:2])
+        if result.status.usable:
+            return last, one_after_the_other(stuck, result)
+        return t, one_after_the_other(result, stuck)
+
+    def rounds(
+        self, t: Transcription, result: SolverResult, x0: Array
+    ) -> tuple[Transcription, SolverResult, list[tuple[Transcription, str, SolverResult]]]:
+        """The last program that was solved, its result with the effort of all, and what came of each
+        round.
+        """
+        found: list[tuple[Transcription, str, SolverResult]] = []
+        self._tried, self._refined, self._apart = frozenset(), 0, None
+        while result.status.usable and self.budget.left != 0:
+            if self.margins is None and len(found) == _NODE_ROUNDS:
+                break
+            following = self._next(t, result, x0, len(found))
+            if following is None or len(found) >= (_ROUNDS if self._is_apart(result) else _MOST):
+                break
+            if self.report is not None:
+                self.report(following.why)
+            new = following.solved(self.budget)
+            if not new.status.usable:
+                break
+            if following.program.layout.n != len(x0):  # more nodes or elements: the start has them too
+                x0 = start_of(following.program, t, x0)
+            t, result = following.program, one_after_the_other(result, new)
+            found.append((t, following.name, new))
+        return t, result, found
+
+    def _is_apart(self, result: SolverResult) -> bool:
+        """Whether a result has been looked at, and nothing touches anything."""
+        return self._apart is not None and self._apart[1] is result
+
+    def _judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
+        """A result that could not be mended is a solution only if nothing touches anything; else the last one
+        is that was, if any.
+        """
+        if self.margins is None or not result.status.usable:
+            return t, result
+        if self._is_apart(result):
+            return t, result
+        with contextlib.suppress(InputError):
+            left = rows_to_add(t, result.x, self.margins, share=1.0)
+            if left is not None and left.depth > 0:
+                if self._apart is not None:
+                    before, clean = self._apart
+                    effort = {key: getattr(result, key) for key in EFFORT}
+                    return before, replace(clean, history=result.history, **effort)
+                self.blocked = True
+                names = sorted(" and ".join(self.margins.bodies.names(pair)) for pair in left.pairs)
+                message = (
+                    f"Bodies are {1e3 * left.depth:.1f} mm in each other, and no solution was found where "
+                    f"they are not: {'; '.join(names[:3])}."
+                )
+                # where nothing else is found it is still told, but goes before no start that is clean
+                worst = max(result.max_violation, left.depth, 2 * VIOLATED)
+                return t, replace(result, status=Status.FAILED, max_violation=worst, message=message)
+        return t, result
+
+    def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> Round | None:
+        """What is to be solved next; None if the solution is right."""
+        shares, violated = t.hit.shares, None
+        elements: Elements | None = None
+        error: ContactError | None = None
+        with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+            if self.margins is not None:
+                violated = rows_to_add(t, old.x, self.margins)
+                if violated is None or violated.depth <= 0:
+                    self._apart = t, old
+        if violated is not None and violated.deep and again < _DEEP_ROUNDS:
+            return self._apart_again(t, old, x0, violated)
+        needed = nodes = t.nodes if violated is None else violated.nodes
+        if self._refined < _NODE_ROUNDS:
+            with contextlib.suppress(InputError):
+                nodes = nodes_to_add(t.decode(old.x), needed)
+            error = self.error(t, old.x)
+            elements = refined_elements(error, t.hit.elements)
+            shares = t.hit.drifted(old.x) or shares
+            if shares != t.hit.shares:
+                elements = contact_elements(t.problem, shares)
+            self._refined += nodes != needed or elements is not None
+        if violated is None and nodes == t.nodes and elements is None:
+            return None
+        rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
+        finer = t
+        if nodes != t.nodes or elements is not None:
+            finer_elements = elements or (t.hit.elements if t.hit.guarded else ())
+            functions = block_functions(t.problem, t.coordinates, self.report, finer_elements)
+            finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements, shares)
+        if self.margins is not None:
+            if nodes != t.nodes:
+                x, _, _ = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
+                rows = {**missing_rows(finer, x, self.margins), **rows}
+            finer = finer.with_apart(rows)
+        starts: tuple[Array | SolverResult, ...]
+        if error is not None and error.missed:
+            starts = (first_iterate(finer),)  # such an optimum is none of the finer program, nor near one
+        else:
+            x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
+            starts = (replace(old, x=x, multipliers=y, bound_multipliers=z),)
+        if violated is not None and finer.layout.n == len(old.x):
+            starts = (*starts, old.x, x0)
+        name = more_of(nodes.total - t.nodes.total, elements, len(rows) - len(t.apart_rows))
+        return Round(
+            program=finer,
+            starts=starts,
+            barrier=None if violated is None else _BARRIER,
+            name=name,
+            why=f"the plan is not what it says between nodes: {name}, and on from there",
+        )
+
+    def _apart_again(self, t: Transcription, old: SolverResult, x0: Array, violated: Violated) -> Round:
+        """On with rows between bodies that are deep in each other: from where they are, if that may lead out
+        on the side they came in, and has not failed to, else from the start.
+        """
+        program = t.with_apart({**t.apart_rows, **violated.rows})
+        words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
+        round_of = partial(Round, program=program, name="rows between bodies")
+        x, y, z = carried_over(program, t, old.x, old.multipliers, old.bound_multipliers)
+        warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
+        if violated.depth > _LOST or violated.deep & self._tried:
+            self._tried = frozenset()
+            why = f"{words}: from the start again, with rows between them"
+            return round_of(starts=(x0, warm, old.x), why=why, barrier=_BARRIER_DEEP)
+        self._tried |= violated.deep
+        why = f"{words}: on with rows between them"
+        return round_of(starts=(warm, x0, old.x), why=why, barrier=_BARRIER_DEEP)

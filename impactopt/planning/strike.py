@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.keeping_apart import FAR, Margins, missing_rows, rows_near, spots_of
+from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     EFFORT,
@@ -25,6 +25,7 @@ from impactopt.planning.multistart import (
     solve_from,
 )
 from impactopt.planning.solution import Solved, blow_numbers, versions
+from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status

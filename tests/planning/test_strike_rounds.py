@@ -14,8 +14,9 @@ from support.small_plans import changed
 
 from impactopt.bodies.shapes import Obstacle
 from impactopt.planning import strike as strikes
-from impactopt.planning.keeping_apart import Margins, missing_rows, rows_near
+from impactopt.planning.keeping_apart import Margins, rows_near
 from impactopt.planning.multistart import Budget
+from impactopt.planning.too_near import missing_rows
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription

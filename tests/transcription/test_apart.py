@@ -20,8 +20,9 @@ from impactopt.bodies.clearance import Places
 from impactopt.bodies.fit import PLANES, Planes
 from impactopt.bodies.robot_bodies import bodies_of
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.planning.keeping_apart import BEAD, Margins, missing_rows, rows_near, rows_to_add, spots_of
+from impactopt.planning.keeping_apart import BEAD, Margins, rounded_most, rows_near, spots_of
 from impactopt.planning.solution import Solution
+from impactopt.planning.too_near import missing_rows, rows_to_add
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
@@ -152,7 +153,9 @@ def test_a_row_says_what_planes_and_sphere_do(name: str) -> None:
         numbers = (chain.numbers(), bodies.centre[sphere], planes.with_facing(None), reach)
         value = gap(chain, posed.z(chain, None), numbers)
         there = posed.data.oMi[other].actInv(posed.data.oMi[one].act(bodies.centre[sphere]))
-        more = value - (float((planes.normal @ there - planes.offset).max()) - reach)
+        far = planes.normal @ there - planes.offset
+        assert value == pytest.approx(rounded_most(far) - reach, abs=1e-12)
+        more = value - (float(far.max()) - reach)
         assert -1e-12 <= more <= ROUNDED
         seen = max(seen, more)
     assert seen > 0

@@ -1,0 +1,123 @@
+"""Rounds against bodies that are too near: each adds a row that its solution violates, or a node."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from impactopt import Obstacle, load_problem, solve
+from impactopt.planning.keeping_apart import Margins, spots_of
+from impactopt.planning.multistart import Budget
+from impactopt.planning.rounds import Refining, Round
+from impactopt.planning.solution import Solution
+from impactopt.planning.too_near import missing_rows, rows_to_add
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import SolverResult, Status, max_violation
+from impactopt.transcription.start import carried_over
+from impactopt.transcription.transcription import Transcription, block_functions
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def free() -> Solution:
+    """A planar arm's blow, with few nodes: its hammer goes 5 cm from one to the next."""
+    problem = load_problem("arm_planar")
+    return solve(dataclasses.replace(problem, swing=dataclasses.replace(problem.swing, intervals=6)))
+
+
+def with_peg(problem: ImpactProblem, x: float, z: float) -> ImpactProblem:
+    peg = Obstacle(name="peg", start=(x, -0.2, z), end=(x, 0.2, z), radius=0.005)
+    return dataclasses.replace(problem, obstacles=(peg,))
+
+
+def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
+    c = problem.coordinates
+    return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_apart(solution.apart)
+
+
+def hammer(solution: Solution, time: float) -> Array:
+    """Where the hammer's face is at a time [s]."""
+    motion, robot = solution.plan.motion(1e-3), solution.problem.robot
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, motion.q[int(np.abs(motion.time - time).argmin())])
+    return np.array(data.oMf[robot.model.getFrameId("striker:hammer")].translation)
+
+
+def violation(t: Transcription, x: Array) -> float:
+    return max_violation(t.program, x, t.program.constraints(x))
+
+
+@pytest.mark.parametrize("share", [0.35, 0.5, 0.65])
+def test_every_look_finds_a_row_that_is_violated_or_a_node(free: Solution, share: float) -> None:
+    """Pegs in the hammer's way, between any two nodes of the swing: near ones, and such as it passes by with
+    centimetres to spare at both.
+    """
+    nodes, looked = free.plan.swing_nodes * free.plan.swing.duration, 0
+    for first, last in pairwise(nodes[4:-1]):
+        x, _, z = hammer(free, first + share * (last - first))
+        problem = with_peg(free.problem, x, z)
+        margins, t = Margins(problem), program_of(free, problem)
+        violated = rows_to_add(t, free.result.x, margins)
+        assert violated is not None and violated.depth > 0
+        more = t.with_apart({**t.apart_rows, **violated.rows})
+        if violated.nodes == t.nodes:
+            assert violation(more, free.result.x) > 1e-3
+        else:
+            functions = block_functions(problem, problem.coordinates)
+            finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
+            there, _, _ = carried_over(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
+            rows = missing_rows(finer, there, margins)
+            known = set(spots_of(t, free.result.x).names)
+            assert any(row.place not in known for row in rows)
+            assert violation(finer.with_apart(rows), there) > 1e-3
+        looked += 1
+    assert looked > 3
+
+
+def test_rounds_end_with_bodies_that_are_apart(free: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A peg that the hammer meets only between two nodes, near the nail: no round begins where all its rows
+    are met already.
+    """
+    nodes = free.plan.swing_nodes * free.plan.swing.duration
+    x, _, z = hammer(free, (nodes[10] + nodes[11]) / 2)
+    problem, began, solved = with_peg(free.problem, x, z), list[float](), Round.solved
+
+    def watched(self: Round, budget: Budget) -> SolverResult:
+        start = self.starts[0]
+        began.append(violation(self.program, start.x if isinstance(start, SolverResult) else start))
+        return solved(self, budget)
+
+    monkeypatch.setattr(Round, "solved", watched)
+    solution = solve(problem)
+    assert solution.status is Status.SOLVED and solution.nodes.total > 0
+    assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]
+    assert len(began) > 1 and min(began) > 1e-3
+
+
+def refining(problem: ImpactProblem, **options: int) -> Refining:
+    budget = Budget(solver="sqp", options=options or None, time_limit=None, callback=None)
+    return Refining(budget, Margins(problem), {}, None)
+
+
+def test_a_result_that_touches_nothing_goes_before_a_later_one_that_does(free: Solution) -> None:
+    x, _, z = hammer(free, 0.9 * free.plan.swing.duration)
+    problem = with_peg(free.problem, x, z)
+    t, later = program_of(free, problem), dataclasses.replace(free.result, iterations=1000)
+    rounds = refining(problem)
+    assert rounds._judged(t, later)[1].status is Status.FAILED
+    before = program_of(free, free.problem), free.result
+    rounds._apart = before
+    kept, result = rounds._judged(t, later)
+    assert kept is before[0] and result.status is Status.SOLVED and result.iterations == 1000
+
+
+def test_a_limit_of_iterations_that_nobody_has_set_is_no_answer(free: Solution) -> None:
+    ended = dataclasses.replace(free.result, status=Status.ITERATION_LIMIT)
+    assert refining(free.problem)._stuck(ended)
+    assert not refining(free.problem, max_iterations=5)._stuck(ended)

@@ -268,6 +268,17 @@ class ImpactProblem:
         return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
 
     @property
+    def of_drives(self) -> bool:
+        """Whether a term is about motors or gears."""
+        return any(term.of_drives for term in self.terms)
+
+    @property
+    def first_instant(self) -> bool:
+        """Whether a term looks at the first instant of a contact that has a force at once."""
+        wanted = self.lasts and any(term.first_instant for term in self.terms)
+        return wanted and bool(self.law.branch(0.0, 1.0, True))
+
+    @property
     def abort_after(self) -> float | None:
         """When the motion is aborted if nothing is hit, after the planned contact [s]; None: never."""
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)

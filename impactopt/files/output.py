@@ -178,7 +178,7 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
 
 def replay_arrays(replay: Any) -> dict[str, Any]:
     """What a record keeps of a `Simulation` on free soles: motion and forces, by `replayed_*`."""
-    left_out = {"v", "demand", "torque"}
+    left_out = {"v", "demand", "torque", "gear"}
     kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
     return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}
 

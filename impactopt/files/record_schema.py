@@ -76,9 +76,16 @@ _REPLAYS_NUMBERS = (
     *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
     *("min_normal_force_N?", "sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
 )
+_LOADS: dict[str, _Kinds] = {
+    **dict.fromkeys(("gear_ratio?", "motor_ratio?", "power_W?", "velocity_jump_rad_s?"), _NUMBER),
+    **dict.fromkeys(
+        ("gear_joint?", "motor_joint?", "power_joint?", "velocity_jump_joint?"), (str, type(None))
+    ),
+}
 _ANY_REPLAY: dict[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
+    **_LOADS,
     **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
     **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
     "standing?": _YES,
@@ -115,6 +122,7 @@ _KEYS: Mapping[str, _Kinds] = {
 _OTHERS: Mapping[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
+    **_LOADS,
     **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
     **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _PHASES),
     **dict.fromkeys(
@@ -129,7 +137,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "versions?": ({"*": _TEXT},),
     "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
-    **dict.fromkeys(("note?", "caution?", "command?", "collision_model?"), _TEXT),
+    **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "collision_model?"), _TEXT),
 }
 _DEEPEST = 20
 

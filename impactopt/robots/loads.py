@@ -99,7 +99,7 @@ class DriveLoads:
         k = int(worst[0])
         others = f", and {len(worst) - 1} more" if len(worst) > 1 else ""
         return (
-            f"gear of {names[k]}: {self.gear[k]:.2g} times its torque limit, and {limit[k]:.2g} is its "
+            f"gear of {names[k]}: {self.gear[k]:.3g} times its torque limit, and {limit[k]:.3g} is its "
             f"momentary peak{others}; bound it with [terms.gear_load]"
         )
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import GearLoad
 from impactopt.robots.loads import DriveLoads, gear_torque
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import PlannedCollision, Trajectory
 
-__all__ = ["motion_loads", "strike_loads"]
+__all__ = ["gear_share", "motion_loads", "strike_loads"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +28,17 @@ def strike_loads(robot: Robot, before: Array, after: Array, hit: PlannedCollisio
     """Of a collision alone, with the robot's velocities (nv,) before and after it."""
     none = np.zeros((0, robot.n))
     return _loads(robot, (none, none, none), hit, (after - before)[-robot.n :])
+
+
+def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Array:
+    """(k,) Largest load of a gear over what the problem allows, of torques and accelerations (k, n) of the
+    joints; zeros where it bounds none.
+    """
+    term, robot = problem.extra(GearLoad), problem.robot
+    if term is None or not acceleration.size:
+        return np.zeros(len(torque))
+    load = gear_torque(robot, torque, acceleration) / robot.torque_limit / term.most(robot)
+    return np.asarray(np.abs(load).max(axis=1, initial=0.0))
 
 
 def _loads(robot: Robot, way: tuple[Array, ...], hit: PlannedCollision, jump: Array) -> DriveLoads:

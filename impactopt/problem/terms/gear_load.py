@@ -17,6 +17,7 @@ from impactopt.problem.violation import percent
 
 if TYPE_CHECKING:
     from impactopt.kinematics.coordinates import StanceCoordinates
+    from impactopt.robots.robot import Robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +47,13 @@ class GearLoad(Term):
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"rotors": BlockRecipe(lambda: rotors(coordinates))}
 
+    def most(self, robot: Robot) -> Any:
+        """(n,) largest loads over the torque limits; inf: no bound."""
+        return robot.gear_limit if self.limit is None else of_joints(self.limit, robot.joint_names)
+
     def add_rows(self, program: Any) -> None:
         robot, names = program.robot, program.robot.joint_names
-        most = robot.gear_limit if self.limit is None else of_joints(self.limit, names)
+        most = self.most(robot)
         points, first = program.drive_points(), program.first_instants()
         outputs = [output for _, output in first]
         if points:

@@ -66,7 +66,7 @@ class Record:
 
     summary : the content of `summary.json`.
     problem : text of the problem file, "" if there was none.
-    arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
+    arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>` (k, 2) [m],
         corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
         by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort
         motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*`
@@ -156,6 +156,7 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
         "joints": np.array(robot.joint_names),
         "torque_limit": robot.torque_limit,
         "velocity_limit": robot.velocity_limit,
+        "armature": robot.armature,
         "polygon": support_polygon(robot, c),
     }
     for leg in c.legs:

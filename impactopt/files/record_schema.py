@@ -17,6 +17,7 @@ from impactopt.errors import has_control
 __all__ = ["check_arrays", "check_summary"]
 
 # Letters are sizes: n, nq and nv of the robot in all arrays; others are the same among arrays of one prefix.
+# With a ? before them the array may be missing, as in records of older versions, or empty.
 _MOTION = {"time": "k", "q": "k nq"}
 _REFERENCE = {
     **_MOTION,
@@ -30,13 +31,18 @@ _HISTORIES = {
     "sole_ground": "k s 6",
 }
 _SCHEMA: Mapping[str, Mapping[str, str]] = {
-    "": {"joints": "n", "torque_limit": "n", "velocity_limit": "n", "polygon": "c 2"},
+    "": {
+        **{"joints": "n", "torque_limit": "n", "velocity_limit": "n", "polygon": "c 2"},
+        "armature": "? n",
+    },
     "reference": {**_REFERENCE, "angle": "k n"},
     "missed": _REFERENCE,
     "strike": {"posture": "nq", "velocity": "nv", "torque": "n"},
-    "simulated": {**_MOTION, **_HISTORIES, "v": "k nv", "demand": "k n", "torque": "k n", "angle": "k n"},
+    "simulated": {**_MOTION, **_HISTORIES, "v": "k nv", "demand": "k n", "torque": "k n", "angle": "k n"}
+    | {"gear": "? k n"},
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
-    "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"},
+    "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
+    | dict.fromkeys(("velocity", "acceleration"), "? p n"),
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "point": "3", "normal": "3", "contact": ""},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),
 }
@@ -158,7 +164,9 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
             continue
         sizes = {letter: size for letter, size in sizes.items() if letter in _ROBOT}
         for name, shape in shapes.items():
-            _check_shape(of[name], arrays, shape.split(), sizes)
+            if shape.startswith("?") and not np.size(arrays.get(of[name], ())):
+                continue
+            _check_shape(of[name], arrays, shape.strip("? ").split(), sizes)
             if name in _FINITE and not np.all(np.isfinite(arrays[of[name]])):
                 raise ValueError(f"{of[name]} has numbers that are not finite")
         if "time" in shapes and not _rises(arrays[of["time"]]):

@@ -28,7 +28,7 @@ class Actuator(Described):
     armature: float | None = field(
         default=None,
         metadata=about(
-            "reflected rotor inertia; None: the robot's own, as in `Robot.armature`",
+            "reflected rotor inertia; left out: the robot's own",
             unit="kg m2",
             least=0,
             most=HEAVIEST,

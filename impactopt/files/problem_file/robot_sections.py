@@ -14,6 +14,7 @@ from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import (
     Inertia,
+    JointNames,
     Pair,
     PerJoint,
     Point2,
@@ -85,7 +86,7 @@ _OfActuator: Any = section_of(Actuator)
 class ActuatorSection(_OfActuator):
     """A motor with its gear, of one joint or of many; of sections that name the same joint the last holds."""
 
-    joints: list[str] = required("names of joints, or patterns such as `arm_*_4_joint`")
+    joints: JointNames = required("names of joints, or patterns such as `arm_*_4_joint`")
 
     def build(self) -> Any:
         return Actuator(**{name: value for name, value in self.given().items() if name != "joints"})

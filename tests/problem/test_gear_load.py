@@ -34,7 +34,7 @@ ENGINES = {"pinocchio": simulate_pinocchio, "mujoco": simulate_mujoco}
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("damping", [0.0, 300.0])
 def test_one_joint_hits_a_spring_and_a_damper(engine: str, damping: float) -> None:
-    """Of 6 kg, 5 are the rotor's: 5/6 of the force goes through the gear; with the damper at once the most."""
+    """Of 6 kg, 5 are the rotor's: 5/6 of the force goes through the gear; with the damper most at once."""
     sim, exact = strike(damping, rotor=5.0, simulate=ENGINES[engine])
     expected = 5.0 / 6.0 * exact["peak"]
     if damping:

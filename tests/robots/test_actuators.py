@@ -60,7 +60,7 @@ def test_the_armature_of_an_actuator_is_the_robots() -> None:
     robot = arm(**bare | {"actuators": {"*": Actuator(armature=0.05)}})
     np.testing.assert_array_equal(robot.armature, arm().armature)
     assert all(a.armature is None for a in robot.actuators)
-    with pytest.raises(InputError, match="give it with Robot.with_actuators"):
+    with pytest.raises(InputError, match="which sets the model"):
         replace(robot, actuators=[Actuator(armature=0.1)] * 4)
 
 

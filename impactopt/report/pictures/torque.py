@@ -39,7 +39,8 @@ def torque(record: Record) -> Picture:
     if not gears:
         draw_torque(figure, record)
         return figure
-    above, below = figure.subfigures(2, 1, height_ratios=[height, GEARS])
+    parts: Any = figure.subfigures(2, 1, height_ratios=[height, GEARS])
+    above, below = parts
     draw_torque(above, record)
     _draw_gears(below, record, gears)
     return figure
@@ -75,7 +76,7 @@ def _draw_gears(figure: FigureBase, record: Record, gears: dict[str, tuple[Array
     axes.axhline(0.0, color="0.6", linewidth=0.6)
     axes.set(xlabel="time since contact [ms]", ylabel="through the gear / limit")
     axes.set_title("torque through the gears, worst joints")
-    axes.legend(fontsize=6.5, ncols=2)
+    axes.legend(fontsize=6.5, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def torque_height(record: Record) -> float:

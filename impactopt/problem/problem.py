@@ -276,7 +276,7 @@ class ImpactProblem:
     def first_instant(self) -> bool:
         """Whether a term looks at the first instant of a contact that has a force at once."""
         wanted = self.lasts and any(term.first_instant for term in self.terms)
-        return wanted and bool(self.law.branch(0.0, 1.0, True))
+        return wanted and float(self.law.branch(0.0, 1.0, True)) != 0.0
 
     @property
     def abort_after(self) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.robots.loads import gear_torque
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -18,14 +17,14 @@ class GearWatch:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._most = robot, np.zeros(robot.n)
+        self._armature, self._most = robot.armature, np.zeros(robot.n)
 
     def look(self, torque: Array, acceleration: Array) -> None:
         """Torque (n,) [N m] of the servos, acceleration (nv,) of the robot."""
-        load = gear_torque(self._robot, torque, acceleration[-self._robot.n :])
+        load = torque - self._armature * acceleration[-len(self._armature) :]
         self._most = np.where(np.abs(load) > np.abs(self._most), load, self._most)
 
     def taken(self) -> Array:
         """(n,) [N m]; from now on it begins anew."""
-        found, self._most = self._most, np.zeros(self._robot.n)
+        found, self._most = self._most, np.zeros(len(self._armature))
         return found

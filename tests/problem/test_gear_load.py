@@ -170,6 +170,14 @@ def test_motors_keep_to_their_line_and_their_power(arm_transcription: Transcript
     assert share.max() == pytest.approx(1.0, abs=1e-4)
 
 
+def test_friction_that_takes_all_of_a_motor_is_refused(arm_transcription: Transcription) -> None:
+    robot = arm_transcription.robot.with_actuators(
+        {"elbow": Actuator(stall_torque=10.0, no_load_speed=9.0, coulomb_friction=6.0)}
+    )
+    with pytest.raises(InputError, match="stall torque of elbow is 5 N m, which its friction, 6 N m, takes"):
+        changed(arm_transcription, terms=(MotorCurve(fraction=0.5),), robot=robot)
+
+
 def test_an_impact_without_duration_has_no_gear_load_but_a_jump(arm_transcription: Transcription) -> None:
     terms = (GearLoad(limit=0.9), VelocityJump(limit=0.5))
     t = changed(arm_transcription, terms=terms, collision="virtual-mass")

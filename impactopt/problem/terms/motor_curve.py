@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.contact.fields import about
+from impactopt.errors import InputError
 from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
 from impactopt.problem.joint_motion import joint_motion
 from impactopt.problem.terms.base import Term
@@ -47,6 +48,12 @@ class MotorCurve(Term):
         known, points = np.flatnonzero(np.isfinite(stall)), program.drive_points()
         if not known.size or not points:
             return
+        for joint, have, lost in zip(robot.joint_names, self.fraction * stall, coulomb, strict=True):
+            if lost >= have:
+                raise InputError(
+                    f"MotorCurve.fraction: {self.fraction:g} of the stall torque of {joint} is {have:g} N m, "
+                    f"which its friction, {lost:g} N m, takes; give a larger fraction, or less coulomb_friction"
+                )
         per_speed = np.nan_to_num(1 / idle + viscous / stall)
         at = program.add_block("motor_speed", [p.slots for p in points], per_speed)
         most = (self.fraction - coulomb / stall)[known]

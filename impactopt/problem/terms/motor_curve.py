@@ -52,7 +52,7 @@ class MotorCurve(Term):
             if lost >= have:
                 raise InputError(
                     f"MotorCurve.fraction: {self.fraction:g} of the stall torque of {joint} is {have:g} N m, "
-                    f"which its friction, {lost:g} N m, takes; give a larger fraction, or less coulomb_friction"
+                    f"which its friction, {lost:g} N m, takes; give a larger fraction, or less of it"
                 )
         per_speed = np.nan_to_num(1 / idle + viscous / stall)
         at = program.add_block("motor_speed", [p.slots for p in points], per_speed)

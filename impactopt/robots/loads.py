@@ -50,11 +50,13 @@ def _efforts(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
 class DriveLoads:
     """What gears and motors bear at most in a motion, by joint; nan where it is not known.
 
+    joints : their names.  gear_limit (n,) : `Robot.gear_limit`.
     gear (n,) : torque through the gear over the torque limit.  motor (n,) : as of `motor_use`.  power (n,)
     [W].  velocity_jump (n,) [rad/s] : how much faster or slower a joint is after the contact than before it.
     """
 
-    robot: Robot
+    joints: tuple[str, ...]
+    gear_limit: Array
     gear: Array
     motor: Array
     power: Array
@@ -68,7 +70,8 @@ class DriveLoads:
         [rad/s], each (k, n); jump (n,) [rad/s].
         """
         return cls(
-            robot=robot,
+            joints=robot.joint_names,
+            gear_limit=robot.gear_limit,
             gear=_most(np.asarray(gear) / robot.torque_limit, robot.n),
             motor=_most(motor_use(robot, torque, velocity), robot.n),
             power=_most(motor_power(robot, torque, velocity), robot.n),
@@ -87,12 +90,12 @@ class DriveLoads:
             known = np.flatnonzero(np.isfinite(values))
             worst = int(known[np.argmax(values[known])]) if known.size else -1
             out[key] = float(values[worst]) if known.size else None
-            out[name] = self.robot.joint_names[worst] if known.size else None
+            out[name] = self.joints[worst] if known.size else None
         return out
 
     def beyond_peak(self) -> str:
         """Which gears bear more than their momentary peak, in words; "" if none does."""
-        limit, names = self.robot.gear_limit, self.robot.joint_names
+        limit, names = self.gear_limit, self.joints
         worst = sorted(np.flatnonzero(self.gear > limit * (1 + 1e-3)), key=lambda k: -self.gear[k] / limit[k])
         if not worst:
             return ""

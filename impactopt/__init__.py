@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 
 # public name -> module that defines it
 _EXPORTS = {
+    "Actuator": "robots.actuators",
     "BothSoles": "kinematics.stance",
     "CacheWarning": "errors",
     "Perturbation": "simulation.perturbation",

@@ -294,7 +294,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
             highlight=False,
         )
     error = summary.get("simulated", {}).get("error")
-    for text in (summary.get("note"), error, reach.get("error"), told_touches(summary)):
+    beyond = summary.get("gear_caution")
+    for text in (summary.get("note"), error, reach.get("error"), told_touches(summary), beyond):
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)
     if len(summary["starts"]) > 1:

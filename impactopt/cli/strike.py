@@ -91,6 +91,8 @@ def strike(
 
             shown = Console()
             shown.print(strike_table(record.summary))
+            if beyond := record.summary.get("gear_caution"):
+                shown.print(printable(str(beyond)), highlight=False, markup=False)
             shown.print(multistart_table(record.summary["starts"]))
             if record.summary["violations"]:
                 shown.print(violation_table(record.summary["violations"]))

@@ -131,6 +131,8 @@ def validate(
 
             console = Console()
             console.print(replay_table(done.report, planned.record.summary))
+            if beyond := done.record.summary.get("gear_caution"):
+                console.print(printable(str(beyond)), markup=False, highlight=False)
             for path in written:
                 console.print(printable(str(path)), highlight=False, markup=False, soft_wrap=True)
         if done.report["standing"] is False:

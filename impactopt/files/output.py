@@ -66,13 +66,13 @@ class Record:
 
     summary : the content of `summary.json`.
     problem : text of the problem file, "" if there was none.
-    arrays : by name. `joints`, `torque_limit`, `velocity_limit` (n,); `polygon` and `sole_<name>` (k, 2) [m],
-        corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over time; and, field
-        by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan with an abort
-        motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines), `collision_*`
-        (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*` (`Simulation`
-        on free soles, without velocities and torques), `solver_*` (`SolverResult`), `history_*` (its
-        iterations).
+    arrays : by name. `joints`, `torque_limit`, `velocity_limit`, `armature` (n,); `polygon` and `sole_<name>`
+        (k, 2) [m], corners on the ground; `reference_angle`, `simulated_angle` (k, n), joint angles over
+        time; and, field by field, `reference_*` (`impactopt.transcription.plan.Trajectory`) and, of a plan
+        with an abort motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines),
+        `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
+        (`Simulation` on free soles, without velocities and torques), `solver_*` (`SolverResult`),
+        `history_*` (its iterations).
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
@@ -163,6 +163,7 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
         "joints": np.array(robot.joint_names),
         "torque_limit": robot.torque_limit,
         "velocity_limit": robot.velocity_limit,
+        "armature": robot.armature,
         "polygon": support_polygon(robot, c),
     }
     for leg in c.legs:
@@ -185,7 +186,7 @@ def _parts_arrays(parts: Mapping[str, Any], result: SolverResult) -> dict[str, A
 
 def replay_arrays(replay: Any) -> dict[str, Any]:
     """What a record keeps of a `Simulation` on free soles: motion and forces, by `replayed_*`."""
-    left_out = {"v", "demand", "torque"}
+    left_out = {"v", "demand", "torque", "gear"}
     kept = {name: value for name, value in _numbers(replay).items() if name not in left_out}
     return {f"replayed_{name}": value for name, value in {**kept, "soles": list(replay.soles)}.items()}
 

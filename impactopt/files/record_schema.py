@@ -17,6 +17,7 @@ from impactopt.errors import has_control
 __all__ = ["check_arrays", "check_summary"]
 
 # Letters are sizes: n, nq and nv of the robot in all arrays; others are the same among arrays of one prefix.
+# With a ? before them the array may be missing, as in records of older versions, or empty.
 _MOTION = {"time": "k", "q": "k nq"}
 _REFERENCE = {
     **_MOTION,
@@ -30,13 +31,18 @@ _HISTORIES = {
     "sole_ground": "k s 6",
 }
 _SCHEMA: Mapping[str, Mapping[str, str]] = {
-    "": {"joints": "n", "torque_limit": "n", "velocity_limit": "n", "polygon": "c 2"},
+    "": {
+        **{"joints": "n", "torque_limit": "n", "velocity_limit": "n", "polygon": "c 2"},
+        "armature": "? n",
+    },
     "reference": {**_REFERENCE, "angle": "k n"},
     "missed": _REFERENCE,
     "strike": {"posture": "nq", "velocity": "nv", "torque": "n"},
-    "simulated": {**_MOTION, **_HISTORIES, "v": "k nv", "demand": "k n", "torque": "k n", "angle": "k n"},
+    "simulated": {**_MOTION, **_HISTORIES, "v": "k nv", "demand": "k n", "torque": "k n", "angle": "k n"}
+    | {"gear": "? k n"},
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
-    "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"},
+    "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
+    | dict.fromkeys(("velocity", "acceleration"), "? p n"),
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "point": "3", "normal": "3", "contact": ""},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),
 }
@@ -76,9 +82,16 @@ _REPLAYS_NUMBERS = (
     *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
     *("min_normal_force_N?", "sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
 )
+_LOADS: dict[str, _Kinds] = {
+    **dict.fromkeys(("gear_ratio?", "motor_ratio?", "power_W?", "velocity_jump_rad_s?"), _NUMBER),
+    **dict.fromkeys(
+        ("gear_joint?", "motor_joint?", "power_joint?", "velocity_jump_joint?"), (str, type(None))
+    ),
+}
 _ANY_REPLAY: dict[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
+    **_LOADS,
     **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
     **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
     "standing?": _YES,
@@ -115,6 +128,7 @@ _KEYS: Mapping[str, _Kinds] = {
 _OTHERS: Mapping[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
+    **_LOADS,
     **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
     **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _PHASES),
     **dict.fromkeys(
@@ -129,7 +143,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "versions?": ({"*": _TEXT},),
     "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
-    **dict.fromkeys(("note?", "caution?", "command?", "collision_model?"), _TEXT),
+    **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "collision_model?"), _TEXT),
 }
 _DEEPEST = 20
 
@@ -150,7 +164,9 @@ def check_arrays(arrays: Mapping[str, NDArray[Any]]) -> None:
             continue
         sizes = {letter: size for letter, size in sizes.items() if letter in _ROBOT}
         for name, shape in shapes.items():
-            _check_shape(of[name], arrays, shape.split(), sizes)
+            if shape.startswith("?") and not np.size(arrays.get(of[name], ())):
+                continue
+            _check_shape(of[name], arrays, shape.strip("? ").split(), sizes)
             if name in _FINITE and not np.all(np.isfinite(arrays[of[name]])):
                 raise ValueError(f"{of[name]} has numbers that are not finite")
         if "time" in shapes and not _rises(arrays[of["time"]]):

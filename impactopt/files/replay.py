@@ -15,6 +15,7 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import parse_problem_file, read_problem_file
+from impactopt.planning.solution import gear_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.accuracy import check_steps
@@ -142,7 +143,7 @@ def replay(
     )
     kept = {n: v for n, v in planned.record.arrays.items() if not n.startswith("replayed_")}
     kept |= {name: np.asarray(value) for name, value in replay_arrays(simulation).items()}
-    record = dataclasses.replace(
-        planned.record, arrays=kept, summary={**planned.record.summary, "replayed": report}
-    )
+    beyond = gear_caution(problem, [simulation.loads])
+    summary = {**planned.record.summary, "replayed": report, **beyond}
+    record = dataclasses.replace(planned.record, arrays=kept, summary=summary)
     return Replay(planned=planned, perturbation=world, simulation=simulation, report=report, record=record)

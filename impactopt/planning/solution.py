@@ -18,11 +18,14 @@ from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.multistart import Attempt
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import GearLoad
+from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
 from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
+from impactopt.transcription.planned_loads import motion_loads
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import Rattle
 
@@ -279,6 +282,11 @@ class Solution(Solved):
         """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
         return self.plan.margins(self.trajectory, self.collision)
 
+    @cached_property
+    def loads(self) -> DriveLoads:
+        """What gears and motors bear at most, as planned with the expected target."""
+        return motion_loads(self.problem.robot, self.trajectory, self.collision)
+
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
         plan = self.plan
@@ -293,6 +301,7 @@ class Solution(Solved):
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,
             **self.margins(),
+            **self.loads.summary(),
             **self.clearance(),
             "versions": versions(),
         }
@@ -311,7 +320,8 @@ class Solution(Solved):
             out["simulated"] = simulation.summary(**known)
         if replay is not None:
             out["replayed"] = replay.report(**known)
-        return out
+        replayed = [run.loads for run in (replay, simulation) if run is not None]
+        return out | gear_caution(self.problem, [self.loads, *replayed])
 
 
 def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict[str, Any]:
@@ -324,6 +334,14 @@ def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict
         "contact_ms": 1e3 * duration,
         "hand_speed_m_s": hit.hand_speed,
     }
+
+
+def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> dict[str, str]:
+    """What is to be said of gears that bear too much, in a plan whose problem does not bound them."""
+    if problem.extra(GearLoad) is not None:
+        return {}
+    beyond = [text for loads in found if loads is not None and (text := loads.beyond_peak())]
+    return {"gear_caution": beyond[0]} if beyond else {}
 
 
 def versions() -> dict[str, str]:

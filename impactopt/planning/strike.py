@@ -24,7 +24,7 @@ from impactopt.planning.multistart import (
     one_after_the_other,
     solve_from,
 )
-from impactopt.planning.solution import Solved, blow_numbers, versions
+from impactopt.planning.solution import Solved, blow_numbers, gear_caution, versions
 from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
@@ -66,13 +66,15 @@ class StrikeSolution(Solved):
     def summary(self) -> dict[str, Any]:
         """The numbers of ``summary.json``."""
         hit = self.strike
-        names = self.problem.robot.joint_names
+        loads, names = hit.loads(), self.problem.robot.joint_names
         angles = self.problem.robot.joint_positions(hit.posture)
         return {
             **self.outcome(),
             **blow_numbers(hit, hit.collision),
             "objectives": dict(self.objectives),
             **hit.margins(),
+            **loads.summary(),
+            **gear_caution(self.problem, [loads]),
             "posture_rad": {name: float(a) for name, a in zip(names, angles, strict=True)},
             "velocity_rad_s": {
                 name: float(v) for name, v in zip(names, hit.velocity[-len(names) :], strict=True)

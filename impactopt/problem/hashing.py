@@ -28,7 +28,7 @@ def problem_hash(problem: Any) -> str:
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
     own = {type(term): term for term in (*DEFAULT_TERMS, *problem.terms)}
     shape |= {
-        "robot": _robot(problem.robot, problem.striker),
+        "robot": _robot(problem.robot, problem.striker) | _drives(problem),
         "law": _contact(problem.law),
         "target": _contact(problem.target),
         "start": problem.start_posture,
@@ -48,6 +48,11 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
         "striker": (hits.frame, hits.point),
         "disable_collisions": sorted(map(sorted, robot.disable_collisions)),
     }
+
+
+def _drives(problem: Any) -> dict[str, Any]:
+    """Motors and gears, where something of the problem depends on them."""
+    return {"actuators": problem.robot.actuators} if problem.of_drives else {}
 
 
 def _contact(thing: Any) -> tuple[Any, ...]:

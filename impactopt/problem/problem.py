@@ -273,6 +273,17 @@ class ImpactProblem:
         return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
 
     @property
+    def of_drives(self) -> bool:
+        """Whether a term is about motors or gears."""
+        return any(term.of_drives for term in self.terms)
+
+    @property
+    def first_instant(self) -> bool:
+        """Whether a term looks at the first instant of a contact that has a force at once."""
+        wanted = self.lasts and any(term.first_instant for term in self.terms)
+        return wanted and float(self.law.branch(0.0, 1.0, True)) != 0.0
+
+    @property
     def abort_after(self) -> float | None:
         """When the motion is aborted if nothing is hit, after the planned contact [s]; None: never."""
         return next((s.abort_after for s in self.scenarios if s.abort_after is not None), None)
@@ -353,17 +364,17 @@ class ImpactProblem:
         InputError : the start posture is in the target, in what holds it, or in an obstacle.
         """
         model = self.robot.model
-        soles = [model.getFrameId(sole.frame) for sole in self.stance.soles(self.robot)]
+        frames = [self.robot.striker(self.striker).model_frame]
+        frames += [sole.frame for sole in self.stance.soles(self.robot)]
+        strikes, *stands = (int(model.frames[model.getFrameId(name)].parentJoint) for name in frames)
         return Bodies(
             self.robot,
             self.world,
             self.start_posture,
             normal=self.normal,
-            striking=int(
-                model.frames[model.getFrameId(self.robot.striker(self.striker).model_frame)].parentJoint
-            ),
+            striking=strikes,
             strict=self.keep_out.enabled,
-            standing=tuple(int(model.frames[k].parentJoint) for k in soles),
+            standing=tuple(stands),
         )
 
     def describe(self) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def _body(record: Record, title: str, *, animated: bool) -> Iterator[str]:
     yield '<button id="theme" aria-label="switch between light and dark">dark</button></header><main>'
     yield '<div id="trouble"></div>'
     errors = (s.get(name, {}).get("error") for name in ("simulated", "baseline"))
-    notes = (s.get("note"), s.get("caution"), *errors)
+    notes = (s.get("note"), s.get("caution"), s.get("gear_caution"), *errors)
     for note in filter(None, notes):
         yield f'<p class="note">{escape(str(note))}</p>'
     yield _cards(s)

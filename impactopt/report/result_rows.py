@@ -79,6 +79,14 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         for phase in phases:
             values = [source.get(key, {}).get(phase) for source in sources]
             yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
+    for label, key, joint, digits, most in (
+        ("gear load / torque limit", "gear_ratio", "gear_joint", 2, np.inf),
+        ("motor's use of its line", "motor_ratio", "motor_joint", 2, 1.0),
+        ("power of a motor [W]", "power_W", "power_joint", 0, np.inf),
+        ("jump of a joint's speed [rad/s]", "velocity_jump_rad_s", "velocity_jump_joint", 2, np.inf),
+    ):
+        row = number_row(label, [source.get(key) for source in sources], digits, most=most)
+        yield None if row is None else _with_names(row, [source.get(joint) for source in sources])
     for label, key, digits in (
         ("least normal force [N]", "min_normal_force_N", 0),
         ("largest slip of a sole [mm]", "sole_slip_mm", 2),
@@ -188,6 +196,12 @@ def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> R
         for v in values
     ]
     return Row(label, tuple(cells))
+
+
+def _with_names(row: Row, names: Sequence[Any]) -> Row:
+    """What each number is of."""
+    pairs = zip(row.cells, names, strict=True)
+    return Row(row.label, tuple(Cell(f"{c.text} {name}" if name else c.text, c.good) for c, name in pairs))
 
 
 def _of_replays(row: Row | None) -> Row | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -95,6 +96,18 @@ def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: A
             raise InputError(
                 f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
                 f"set them in the URDF's <limit>, or give position_limit={{{name!r}: (lower, upper)}}"
+            )
+
+
+def check_actuators(joints: Sequence[str], actuators: Sequence[Any]) -> None:
+    """InputError unless there is one a joint, none of which has an armature of its own."""
+    if len(actuators) != len(joints):
+        raise InputError(f"there are {len(actuators)} actuators for {len(joints)} joints; give one a joint")
+    for name, actuator in zip(joints, actuators, strict=True):
+        if actuator.armature is not None:
+            raise InputError(
+                f"the actuator of joint {name!r} has an armature of {actuator.armature:g} kg m2, and the "
+                "model has one too; give it with Robot.with_actuators, which sets the model's"
             )
 
 

@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from impactopt.errors import InputError, did_you_mean, missing_package
 from impactopt.robots import arms as _arms
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import joint_names, lock_joints
 from impactopt.robots.parts import Source
 from impactopt.robots.robot import Robot, Sole, Striker
@@ -46,7 +47,7 @@ def talos(**overrides: Any) -> Robot:
     """PAL Robotics' TALOS: 90 kg, grippers locked, 30 joints and a free-flyer.
 
     * Armature: the SRDF has a rotor inertia of 1e-5 kg m2 and a gear ratio of 100 on every joint:
-      0.1 kg m2.
+      0.1 kg m2 down to the wrists, which is an assumption. What is public of its motors and gears ends there.
     * Limits: the URDF's.
     * Servo: Kd = min(150, 1.5 s/rad x torque limit) N m s/rad and Kp = 30 1/s x Kd.
     * Soles: 0.20 x 0.12 m about `left_sole_link` and `right_sole_link`, 5 mm inside the 0.21 x 0.13 m box
@@ -81,6 +82,35 @@ def talos(**overrides: Any) -> Robot:
 # Reflected rotor inertia [kg m2] of G1's actuators, from the rotor and gear data that public simulation
 # models of it (mjlab, whole_body_tracking) list by motor: 5020, 7520 with gears 14.3 and 22.5, 4010.
 _5020, _7520_14, _7520_22, _4010 = 3.609725e-3, 1.017752e-2, 2.5101925e-2, 4.25e-3
+
+
+def _g1_motor(knee: float, idle: float, torque: float, coulomb: float, viscous: float) -> Actuator:
+    """The line of a motor from its torque [N m] up to a speed [rad/s] and the speed without load [rad/s], and
+    its friction: measured by Unitree, as in its `unitree_rl_lab` (X1, X2, Y1, Fs, Fd of its actuators).
+
+    What its gears bear is not public.
+    """
+    return Actuator(
+        stall_torque=torque * idle / (idle - knee),
+        no_load_speed=idle,
+        coulomb_friction=coulomb,
+        viscous_friction=viscous,
+    )
+
+
+_OF_5020 = _g1_motor(30.86, 40.13, 24.8, 0.6, 0.06)
+_OF_7520_14 = _g1_motor(22.63, 35.52, 71.0, 1.6, 0.16)
+_OF_7520_22 = _g1_motor(14.5, 22.7, 111.0, 2.4, 0.24)
+_OF_4010 = _g1_motor(15.3, 24.76, 4.8, 0.6, 0.06)
+# two in parallel, at the same speed: an assumption, as rods are between them and the joint
+_OF_TWO_5020 = _g1_motor(30.86, 40.13, 2 * 24.8, 2 * 0.6, 2 * 0.06)
+_G1_MOTORS = {
+    _5020: _OF_5020,
+    _7520_14: _OF_7520_14,
+    _7520_22: _OF_7520_22,
+    _4010: _OF_4010,
+    2 * _5020: _OF_TWO_5020,
+}
 # joint: (armature [kg m2], Kd [N m s/rad]); two motors in parallel move ankles, waist roll and waist pitch
 _G1_SIDES = {
     "hip_pitch": (_7520_14, 17.6),
@@ -104,7 +134,8 @@ _G1_WAIST = {"waist_yaw": (_7520_14, 17.6), "waist_roll": (2 * _5020, 7.0), "wai
 def g1(**overrides: Any) -> Robot:
     """Unitree's G1 with 29 joints and rubber hands: 33 kg.
 
-    * Armature: of the motors, 0.0036 to 0.025 kg m2 (source beside the numbers).
+    * Armature: of the motors, 0.0036 to 0.025 kg m2; their lines of torque over speed, and friction (source
+      beside the numbers).
     * Limits: the URDF's.
     * Servo: Kd = 0.2 s/rad x torque limit, Kp = 30 1/s x Kd, a choice of ours: stiffer than what walking
       policies use, and just stiff enough in the ankles (2 x 210 N m/rad) to stand without balance feedback (m
@@ -133,6 +164,7 @@ def g1(**overrides: Any) -> Robot:
     options: dict[str, Any] = {
         "name": "g1",
         "armature": {f"{joint}_joint": armature for joint, (armature, _) in drives.items()},
+        "actuators": {f"{joint}_joint": _G1_MOTORS[armature] for joint, (armature, _) in drives.items()},
         "kd": {f"{joint}_joint": kd for joint, (_, kd) in drives.items()},
         "soles": tuple(
             Sole(

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
 from impactopt.robots import build, checks
+from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
 from impactopt.robots.parts import Sole, Source, Striker, Tool, read_only
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
@@ -37,6 +38,7 @@ class Robot:
     kp, kd : (n,) servo stiffness [N m/rad] and damping [N m s/rad].
     torque_limit, velocity_limit : (n,) [N m], [rad/s], largest magnitudes.
     lower, upper : (n,) position limits [rad]; infinite for a continuous joint.
+    actuators : one a joint, of which nothing may be known; armature is None there, it is in `armature`.
     soles : flat feet, in a fixed order.
     strikers : by name.
     postures : named configurations, (nq,) in Pinocchio's convention. A floating robot's are placed so that
@@ -68,6 +70,7 @@ class Robot:
     tools: tuple[Tool, ...] = ()
     source: Source | None = None
     urdf: str | None = None
+    actuators: tuple[Actuator, ...] = ()
 
     def __post_init__(self) -> None:
         checks.check_joint_types(self.model)
@@ -79,6 +82,8 @@ class Robot:
         object.__setattr__(self, "strikers", dict(self.strikers))
         checks.check_inertias(self.model)
         checks.check_limits(self.joint_names, self.torque_limit, self.velocity_limit, self.lower, self.upper)
+        object.__setattr__(self, "actuators", tuple(self.actuators) or (Actuator(),) * self.n)
+        checks.check_actuators(self.joint_names, self.actuators)
         for sole in self.soles:
             checks.check_frame(self.model, sole.frame, f"sole {sole.name!r}")
         for striker in self.strikers.values():
@@ -141,6 +146,7 @@ class Robot:
         postures: Mapping[str, Mapping[str, float] | ArrayLike] | None = None,
         disable_collisions: Sequence[tuple[str, str]] = (),
         urdf: str | PathLike[str] | None = None,
+        actuators: Mapping[str, Actuator] | None = None,
     ) -> Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
 
@@ -161,6 +167,7 @@ class Robot:
             of that name (an SRDF's), or else of zero. The model's other postures are kept.
         disable_collisions : pairs of links that may pass through each other.
         urdf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
+        actuators : motors and gears, as of `with_actuators`.
         """
         build.check_count("sole", soles)
         build.check_count("striker", strikers)
@@ -169,6 +176,7 @@ class Robot:
         joints = build.joint_names(model)
         base = model.nv - len(joints)
         model.armature[base:] = build.armature(model, joints, armature, rotor or {})
+        drives = with_classes(actuators or {}, joints, (Actuator(),) * len(joints), model)
         limit = build.per_joint("torque_limit", torque_limit, joints, build.effort_limit(model)[base:])
         speed = build.per_joint("velocity_limit", velocity_limit, joints, build.velocity_limit(model)[base:])
         lower, upper = build.position_limit(model, joints, position_limit)
@@ -191,6 +199,7 @@ class Robot:
             strikers=build.by_name("striker", strikers),
             disable_collisions=build.link_pairs(model, disable_collisions),
             urdf=None if urdf is None else str(urdf),
+            actuators=drives,
         )
         build.by_name("sole", soles)
         return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))
@@ -225,6 +234,14 @@ class Robot:
     def armature(self) -> Array:
         """(n,) reflected rotor inertia [kg m2]; it lives in `model.armature`."""
         return read_only(np.array(self.model.armature[self.nv - self.n :], dtype=np.float64))
+
+    @property
+    def gear_limit(self) -> Array:
+        """(n,) What the gears bear in a blow, over the torque limit: their momentary peak, or 2 where that is
+        not known.
+        """
+        known = numbers_of(self.actuators, "momentary_torque") / self.torque_limit
+        return read_only(np.where(np.isnan(known), MOMENTARY_PEAK, known))
 
     def joint_index(self, name: str) -> int:
         """Index of a joint in arrays of length n."""
@@ -265,6 +282,20 @@ class Robot:
         strikers = {**self.strikers, tool.name: tool.striker}
         tools = (*self.tools, tool)
         return dataclasses.replace(self, model=model, strikers=strikers, source=source, tools=tools)
+
+    def with_actuators(self, actuators: Mapping[str, Actuator]) -> Robot:
+        """A copy of the robot with these motors and gears, of joints by name or pattern.
+
+        Of the joints that fit several patterns, such as ``arm_*_4_joint``, the last one holds. Those that fit
+        none keep what they have. Their armature takes the place of the model's.
+
+        Raises
+        ------
+        InputError : what fits no joint; gains too fast for the armature.
+        """
+        model = self.model.copy()
+        drives = with_classes(actuators, self.joint_names, self.actuators, model)
+        return dataclasses.replace(self, model=model, actuators=drives)
 
     def joint_positions(self, q: ArrayLike) -> Array:
         """Joint angles (n,) [rad] of a configuration (nq,); a continuous joint's lies in [-pi, pi]."""

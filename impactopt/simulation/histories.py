@@ -9,6 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.soles import cop_margin, sole_names
@@ -44,13 +45,15 @@ def simulation_of(
     robot: Robot, scene: Scene, rows: list[tuple[Any, ...]], touches: Touches, **rest: Any
 ) -> Simulation:
     """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
-    wrench of each sole, slip and lift of each; ``rest``: the other fields.
+    wrench of each sole, slip and lift of each, torque through the gears since the row before; ``rest``: the
+    other fields.
     """
     if not rows:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, slip, lift = columns
+    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, slip, lift, gear = columns
     contact_start, contact_end = touches.blow()
+    joints = v[:, -robot.n :]
     return Simulation(
         time=time,
         q=q,
@@ -65,8 +68,24 @@ def simulation_of(
         cop_margin=cop_margin(robot, scene, q, sole_ground),
         slip=slip.reshape(len(time), -1),
         lift=lift.reshape(len(time), -1),
+        gear=gear,
+        loads=DriveLoads.of(
+            robot,
+            gear=gear,
+            torque=torque,
+            velocity=joints,
+            jump=_jump(time, joints, contact_start, contact_end),
+        ),
         contact_start=contact_start,
         contact_end=contact_end,
         touches=tuple((start, end, impulse) for start, end, impulse in touches.intervals),
         **rest,
     )
+
+
+def _jump(time: Array, rates: Array, start: float, end: float) -> Array:
+    """(n,) Change of the joints' rates (k, n) from before the contact to after it; nan: there was none."""
+    if not (np.isfinite(start) and end <= time[-1]):
+        return np.full(rates.shape[1], np.nan)
+    before = max(int(np.searchsorted(time, start, side="right")) - 1, 0)
+    return np.asarray(rates[int(np.searchsorted(time, end))] - rates[before])

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.besides import Besides
+from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.simulation.mujoco_robot import MujocoRobot
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file
@@ -48,6 +49,8 @@ class _Replay(MujocoRobot):
         # its depth at the end of a step in contact; of the step before, hand speed and force
         self.kept: float | None = None
         self.before: tuple[float, float] | None = None
+        # how fast the robot accelerates (nv,) by a unit of the contact's force, where it may be one
+        self.yields: Array | None = None
         self.held = {name: k for k, name in enumerate(scene.soles)}
         self.geom_sole = np.full(self.world.ngeom, -1)
         for sole in robot.soles:
@@ -89,10 +92,11 @@ class _Replay(MujocoRobot):
             along = struck.depth(place, 0.0)
             self.travel = along - self.kept if np.isfinite(along) else self.travel
         depth = -np.inf if self.perturbation.missing else struck.depth(place, self.travel)
-        self.kept = None
+        self.kept, self.yields = None, None
         if struck.near(depth, speed, self.target, step):
             answer = np.zeros((1, self.world.nv))
             self.mujoco.mj_solveM(self.world, d, answer, self.along[None])
+            self.yields = answer[0]
             yields = float(self.along @ answer[0])
             gain = 0.0 if self.before is None else (speed - self.before[0]) / step
             gain += 0.0 if self.before is None else self.before[1] * yields
@@ -112,6 +116,13 @@ class _Replay(MujocoRobot):
         self.besides.place(self.data, self.travel * self.scene.normal + broken * AWAY)
 
     # ------------------------------------------------------------------ what a record needs
+    def look_at(self, gears: GearWatch, torque: Array, force: float, peak: float) -> None:
+        """After a step with torque (n,) [N m] of the servos, under a mean force [N] and its peak."""
+        acceleration = self.data.qacc[self.dof]
+        gears.look(torque, acceleration)
+        if self.yields is not None:
+            gears.look(torque, acceleration + (force - peak) * self.yields[self.dof])
+
     def base(self) -> tuple[Array, Array, float]:
         """Position (3,), rotation (3, 3) and speed [m/s] of the base."""
         if not self.floating:
@@ -226,6 +237,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
+    gears = GearWatch(robot)
     impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
     with no_log_file():
         for k in range(round(min(float(reference.end) + settle, until) / step)):
@@ -256,10 +268,13 @@ def simulate_mujoco(
             moves = replay.sole_moves() if kept else None
             mujoco.mj_step2(model, data)
             replay.besides.look(data, t)
+            replay.look_at(gears, torque, force, push.peak)
             if kept:
                 ground = replay.sole_ground()
                 assert state is not None and moves is not None
-                rows.append((t, *state, force, target_speed, speed, demand, torque, ground, *moves))
+                rows.append(
+                    (t, *state, force, target_speed, speed, demand, torque, ground, *moves, gears.taken())
+                )
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(replay.planned(t))
                 if fall:

@@ -15,6 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
+from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
@@ -158,7 +159,7 @@ def simulate_pinocchio(
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     start: list[Array] | None = None
-    touches = Touches()
+    touches, gears = Touches(), GearWatch(robot)
     for k in range(round(end / step)):
         t = k * step
         first = world.rates(t, state, step=step)
@@ -169,12 +170,15 @@ def simulate_pinocchio(
         else:
             touches.add(t, push.force, step, push.since)
         peak = max(peak, first.force if push is None else push.peak)
+        gears.look(first.torque, first.a)
         if touches.touching or k % record == 0:
             corners = world.corners()
             start = corners if start is None else start
             motion = (state.q, state.v, first.force, first.vt, first.hand_speed)
             moves = slip_and_lift(corners, start)
-            rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves))
+            rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves, gears.taken()))
+        if push is not None:  # the force of a contact that begins within the step jumps there
+            gears.look(first.torque, world.body.accelerate(first.torque, push.peak))
         before, state = state, world.step(t, state, first, step)
         left = state.target if state.impulse > before.impulse else left
         check_not_diverged(state.v, t, step)

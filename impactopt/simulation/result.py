@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
+from impactopt.robots.loads import DriveLoads
 from impactopt.simulation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
@@ -32,6 +33,14 @@ REPORT = (
     "final_posture_error_rad",
     "zmp_margin_by_phase_m",
     "torque_ratio_by_phase",
+    "gear_ratio",
+    "gear_joint",
+    "motor_ratio",
+    "motor_joint",
+    "power_W",
+    "power_joint",
+    "velocity_jump_rad_s",
+    "velocity_jump_joint",
     "sole_lift_collision_mm",
     "min_normal_force_N",
     "hand_speed_m_s",
@@ -86,6 +95,8 @@ class Simulation:
     geometry, and which two.  missed: there was no target.  touches: start and end [s] and impulse [N s] of
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
+    gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
+    before.  loads: what gears and motors bear at most.
     """
 
     engine: str
@@ -116,6 +127,8 @@ class Simulation:
     missed: bool = False
     touches: tuple[tuple[float, float, float], ...] = ()
     step_error: float = np.nan
+    gear: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    loads: DriveLoads | None = None
 
     @property
     def ground(self) -> Array:
@@ -174,6 +187,7 @@ class Simulation:
             "clearance_mm": 1e3 * self.clearance if known else None,
             "nearest": " and ".join(self.nearest),
             "contacts_besides": [touched.summary() for touched in self.touched] if known else None,
+            **({} if self.loads is None else self.loads.summary()),
         }
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {

@@ -97,6 +97,13 @@ def _margins(
     """What planning with margin costs in impulse, and what it buys in robustness, one option at a time."""
 
 
+@_command("gains")
+def _gains(
+    quick: Annotated[bool, typer.Option("--quick", help="The two arms only.")] = False,
+) -> None:
+    """From free joints to one rigid body: the impulse of the same blow with stiffer and stiffer servos."""
+
+
 @_command("models")
 def _models(
     quick: Annotated[bool, typer.Option("--quick", help="The two arms only.")] = False,
@@ -224,6 +231,7 @@ def _all(
         "models": {"quick": True},
         "fidelity": {"workers": workers, "quick": True},
         "freezes": drawn,
+        "gains": {"quick": True},
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},

@@ -38,6 +38,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "virtual_base": ("bench", "virtual-base"),
     "collision": ("bench", "collision"),
     "scaling": ("bench", "scaling"),
+    "gains": ("bench", "gains"),
     "skip": ("bench", "skip"),
     "sweep_posture_speed": ("sweep", "collision_posture_speed"),
     "sweep_gains": ("sweep", "collision_gains"),

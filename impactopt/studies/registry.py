@@ -24,6 +24,7 @@ BENCHES = {
     "models": "models",
     "fidelity": "fidelity",
     "freezes": "freezes",
+    "gains": "gains",
     "virtual-base": "virtual_base",
     "collision": "collision",
     "scaling": "scaling",

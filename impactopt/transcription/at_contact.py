@@ -19,6 +19,7 @@ from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_blocks import DEPTH_SCALE
+from impactopt.transcription.drives import ContactEnd, DrivePoint, still
 from impactopt.transcription.elimination import Turn, by_choice, determined
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.impulse import InstantImpact
@@ -130,6 +131,36 @@ class ContactProgram(ABC):
         """The rate ydot (ny) at contact."""
         return self.hit.contact.u0
 
+    def drive_points(self) -> list[DrivePoint]:
+        """Torques and motions of the joints, as variables: at the nodes, and at collocation points of all
+        contacts.
+
+        Raises
+        ------
+        InputError : a collision by shooting.
+        """
+        return self._points
+
+    @cached_property
+    def _points(self) -> list[DrivePoint]:
+        nodes = [
+            DrivePoint(place, torque, still(y, y1, y2, T, legs))
+            for place, torque, (y, y1, y2, legs, _, T) in self._nodes()
+        ]
+        return [*nodes, *self.hit.drives()]
+
+    def first_instants(self) -> list[tuple[Place, Index]]:
+        """First instants of damped contacts, of a program with a term that looks at them.
+
+        Place, and numbers of the outputs (n) that are -armature x acceleration over the torque limit. The
+        torque is that of `feedforward`.
+        """
+        return self.hit.first_instants()
+
+    def contact_ends(self) -> list[ContactEnd]:
+        """What all contacts begin and end with."""
+        return self.hit.contact_ends()
+
     def deepest_penetration(self) -> Affine:
         """[m], of a contact that lasts: at the end of compression, as a variable."""
         return self.lift("deepest penetration", self.hit.deepest)[0] * DEPTH_SCALE
@@ -202,6 +233,10 @@ class ContactProgram(ABC):
     @abstractmethod
     def _determined(self) -> list[Determined]:
         """What rows determine, of all parts."""
+
+    @abstractmethod
+    def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
+        """Places of nodes, torques over limit there, and slots of the block ``node``."""
 
     @abstractmethod
     def _prices(self) -> Prices:

@@ -22,6 +22,7 @@ from impactopt.transcription.contact_blocks import (
     carried,
     coasting,
     collision,
+    first_instant,
     force,
     impact,
     join,
@@ -63,6 +64,7 @@ def sizes(c: StanceCoordinates, target: Target, block: str, *, frozen: bool = Fa
             "invariant": int(bool(target.guards)),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
+        "first": {"base": base, "joints": n, "law": 1, "rotors": n},
         "join": {"travel": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
     }[block]
@@ -167,9 +169,11 @@ def builders(
     instant: bool = False,
     frozen: Effects | None = None,
     freezes: int = 0,
+    first: bool = False,
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Block's name -> a function that builds its expression; ``instant``: for an impact without duration;
-    ``frozen``: the terms of a model with frozen dynamics, and its freezes on the way.
+    ``frozen``: the terms of a model with frozen dynamics, and its freezes on the way; ``first``: whether the
+    first instant of contact is looked at.
 
     That is slow: it is only called when the compiled library is not in the cache.
     """
@@ -187,6 +191,8 @@ def builders(
         hit["impact"] = lambda: impact(c, striker)
     if target.guards:
         hit["join"] = join
+    if first:
+        hit["first"] = lambda: first_instant(c, striker, law)
     return {
         "node": lambda: node(c),
         "contact": lambda: contact(c, striker),

@@ -54,7 +54,7 @@ class Collision(Collocated):
         after: dict[str, Any] | None,
     ) -> None:
         self._b, self.contact, self.stages = b, contact, stages
-        self.number, self.scenario = number, scenario
+        self.number, self.scenario, self.torques = number, scenario, []
         p, c, limits = b.problem, b.coordinates, b.limits
         phases = range(len(p.target.phases))
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in phases]
@@ -145,12 +145,6 @@ class Collision(Collocated):
             join = self._join()
             out["join"] = join, [np.zeros(0)] * len(join)
         return out
-
-    def _travel(self, i: int) -> list[Affine]:
-        """Slots of y = y0 + T1 d1 + T d at a stage."""
-        s = self.stages[i]
-        T1, d1, _ = self._before(s.phase)
-        return [d1, T1, self.d[i], self.T[s.phase][0]]
 
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``."""
@@ -268,15 +262,7 @@ class Collision(Collocated):
         base, joint = first["collision"] + part["base"], first["collision"] + part["joints"]
         b.equal("collision dynamics", place, DIRECTIONS[: c.base], base, b.limits.unbalanced)
         b.equal("collision dynamics", place, joints, joint, percent("of the joint's limit off"))
-        b.rows.add(
-            term=f"{b.limits.torque.name} in collision",
-            place=place,
-            components=joints,
-            outputs=first["collision"] + part["torque"],
-            lower=-self.torque_fraction,
-            upper=self.torque_fraction,
-            measure=percent("over its limit", of=self.torque_fraction),
-        )
+        self._torque_rows(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
             minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0
             add_cone_rows(b, self.w[i], place, self.cone_margin, minimum)
@@ -397,4 +383,5 @@ class Collision(Collocated):
             sole_wrench=wrench,
             ground=total_ground_wrench(b.coordinates, wrench),
             outcome=target.outcome(self.state.read(x)[-1], self.target),
+            **self._joints(x, type(b.problem.law)(**self.law)),
         )

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+
+from impactopt.contact.laws import ContactLaw
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Group
+from impactopt.transcription.contact import Contact
+from impactopt.transcription.drives import ContactEnd, DrivePoint, still
+from impactopt.transcription.first_instant import jump
+from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import CollocationPoint
-from impactopt.transcription.rows import Place, rates
+from impactopt.transcription.rows import Index, Place, percent, rates
 
 
 class Collocated:
@@ -18,6 +25,7 @@ class Collocated:
     stages : collocation points of the phases.  end : the last one of each phase.  T : durations [s] of them.
     u, d : rates and travel of the robot.  xt : travel of the target.  joined, joined_x : those of two phases
         of three as one.  suffix : of places' names.
+    legs : at the stages.  contact : what it starts from.  torques : over limit at the stages, as variables.
     """
 
     _b: Builder
@@ -30,6 +38,9 @@ class Collocated:
     joined: Group
     joined_x: Group
     suffix: str
+    legs: Group
+    contact: Contact
+    torques: list[Affine]
 
     def _before(self, phase: int) -> tuple[Affine, Affine, Affine]:
         """Time [s], travel and the target's travel in the phases before one, both divided by that time."""
@@ -77,6 +88,54 @@ class Collocated:
         time = self._before(s.phase)[0] + self.T[s.phase][0] * s.place
         suffix = self.suffix.replace("{", "{{").replace("}", "}}")
         return Place(f"{s.name}{self.suffix}", f"{{ms}} after contact{suffix}", time)
+
+    def _travel(self, i: int) -> list[Affine]:
+        """Slots of y = y0 + T1 d1 + T d at a stage."""
+        s = self.stages[i]
+        T1, d1, _ = self._before(s.phase)
+        return [d1, T1, self.d[i], self.T[s.phase][0]]
+
+    def _torque_rows(self, place: Place, outputs: Index, most: float) -> None:
+        """Servo torques over limit (n) at a stage are bounded; as variables, if a term is about drives."""
+        b, term = self._b, f"{self._b.limits.torque.name} in collision"
+        common: dict[str, Any] = {"term": term, "place": place, "lower": -most, "upper": most}
+        common["measure"] = percent("over its limit", of=most)
+        if b.problem.of_drives:
+            name = f"torque in collision, {place.name}"
+            self.torques.append(b.lift(name, outputs, labels=b.robot.joint_names, **common)[0])
+        else:
+            b.rows.add(components=b.robot.joint_names, outputs=outputs, **common)
+
+    def drives(self) -> list[DrivePoint]:
+        """Of each stage, once rows are there, if a term is about drives."""
+        pairs = zip(self.stages, self.torques, strict=True)
+        return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
+
+    def _motion(self, i: int) -> list[Affine]:
+        """Slots of a `impactopt.problem.joint_motion.joint_motion` at a stage."""
+        rates = self._slots(self.u, i, self.contact.u0[0])
+        return [self.contact.state.y, *self._travel(i), *rates, Affine.constant(1.0), self.legs[i]]
+
+    def contact_end(self) -> ContactEnd:
+        state, u0, last = self.contact.state, self.contact.u0[0], self.end[-1]
+        before = still(state.y, u0, u0 * 0.0, Affine.constant(1.0), state.legs)
+        place = Place.plain(f"after contact{self.suffix}")
+        return ContactEnd(place, before, self._motion(last), self.u[last] - u0)
+
+    def _joints(self, x: Array, law: ContactLaw) -> dict[str, Array]:
+        """Velocity and acceleration of the joints (m + 1, n), the first at once after contact, for solver
+        variables (n,).
+        """
+        b, c, state = self._b, self._b.coordinates, self.contact.state
+        y, rates, legs = (e.evaluate(x) for e in (state.y, self.contact.u0[0], state.legs))
+        velocity = [c.complete_motion(y, rates, 0 * rates, legs)[1][c.base :]]
+        acceleration = [jump(b.problem, c, law, y, rates, legs)[3]]
+        for i in range(len(self.stages)):
+            y0, d1, T1, d, T, u, slope, _, legs_there = (e.evaluate(x) for e in self._motion(i))
+            _, v, a = c.complete_motion(y0 + T1 * d1 + T * d, u, slope / T, legs_there)
+            velocity.append(v[c.base :])
+            acceleration.append(a[c.base :])
+        return {"velocity": np.array(velocity), "acceleration": np.array(acceleration)}
 
     def _integral_rows(self, i: int, place: Place, integrals: Group, rate: Group) -> None:
         """A group of integrals over the phase so far, of a group of rates."""

@@ -26,6 +26,7 @@ __all__ = [
     "carried",
     "coasting",
     "collision",
+    "first_instant",
     "force",
     "impact",
     "join",
@@ -153,7 +154,7 @@ def _inverse_dynamics(c: StanceCoordinates, q: Any, v: Any, a: Any, *, bias: boo
     """H a (nv), and Coriolis, centrifugal and gravity forces."""
     rb = c.rb
     if not bias:
-        return ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])(q, a)
+        return _inertia(c)(q, a)
     return ca.Function("rnea", [rb.q, rb.v, rb.a], [rb.rnea(rb.v, rb.a)])(q, v, a)
 
 
@@ -272,13 +273,9 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     normal, rigid, given = ca.SX.sym("n", 3), ca.SX.sym("rigid"), ca.SX.sym("e")
     stiffness, damping, inverse_mass = ca.SX.sym("k"), ca.SX.sym("d"), ca.SX.sym("im")
     limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
-    rb = c.rb
-    q = c.configuration(y, legs)
-    inertia = ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])
-    row = ca.Function("row", [rb.q], [ca.densify(rb.jacobian(f"striker:{striker}")[:3, :])])(q)
-    push = ca.mtimes(row.T, normal)
+    q, push = _pushed(c, striker, y, legs, normal)
     change = c.velocity(y, legs, du)
-    balance = inertia(q, change) + push * blow - c.sole_wrench_map(legs, w)
+    balance = _inertia(c)(q, change) + push * blow - c.sole_wrench_map(legs, w)
     lost = -ca.dot(
         push, change
     )  # speed that the impulse takes from the hand; I over it is the effective mass
@@ -292,6 +289,49 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     }
     p = [normal, rigid, given, stiffness, damping, inverse_mass, limit, weight, lever]
     return make_block([y, legs, u0, du, w, blow], p, out, lanes=2)
+
+
+def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockExpression:
+    """The first instant of contact, at which a damped contact has a force already: accelerations jump.
+
+    What changes is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
+    z = y, legs, u0 (ydot) at contact; change of ydd; of the sole wrenches (6 a sole); f [N].
+    p = normal (3), the law's parameters, armature (n), torque limits (n), weight [N], lever [m].
+    out = base rows, joint rows over torque limit, (f - law) / 100 N, torque that the rotors take off the
+        gears, over limit: -armature x acceleration.
+    """
+    ny, n = c.ny, c.robot.n
+    y, u0, change = (ca.SX.sym(s, ny) for s in ("y", "u0", "change"))
+    legs, w, f = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("f")
+    normal, of_law = ca.SX.sym("n", 3), ca.SX.sym("law", len(law.parameters))
+    armature, limit = ca.SX.sym("armature", n), ca.SX.sym("limit", n)
+    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    q, push = _pushed(c, striker, y, legs, normal)
+    jump = c.velocity(y, legs, change)
+    balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(legs, w)
+    v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
+    named = {name: of_law[i] for i, name in enumerate(law.parameters)}
+    out = {
+        "base": balance[: c.base] / base_scale(c, weight, lever),
+        "joints": balance[c.base :] / limit,
+        "law": (f - law.branch(0.0, ca.dot(push, v), True, named)) / FORCE_SCALE,
+        "rotors": -armature * (a + jump)[c.base :] / limit,
+    }
+    z, p = [y, legs, u0, change, w, f], [normal, of_law, armature, limit, weight, lever]
+    return make_block(z, p, out, lanes=2)
+
+
+def _inertia(c: StanceCoordinates) -> Any:
+    """H a (nv) as a function of q and a."""
+    rb = c.rb
+    return ca.Function("inertia", [rb.q, rb.a], [rb.rnea(None, rb.a, gravity=False)])
+
+
+def _pushed(c: StanceCoordinates, striker: str, y: Any, legs: Any, normal: Any) -> tuple[Any, Any]:
+    """q, and the row (nv, 1) of the striking point's speed along the normal in the velocities."""
+    q = c.configuration(y, legs)
+    row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{striker}")[:3, :])])(q)
+    return q, ca.mtimes(row.T, normal)
 
 
 def two_mass_restitution(ratio: Any) -> Any:

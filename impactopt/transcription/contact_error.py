@@ -9,6 +9,7 @@ not fall to zero at the end, the plan has missed an event: the bodies part, and 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,9 +24,11 @@ from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.finer_contact import carry_contact, same_places
 from impactopt.transcription.hit import Hit
 from impactopt.transcription.layout import Affine, Array
-from impactopt.transcription.mesh import Elements, halved
+from impactopt.transcription.mesh import CollocationPoint, Elements, halved
+from impactopt.transcription.mesh_refinement import GEAR
 from impactopt.transcription.phases import switches
 from impactopt.transcription.plan import PlannedCollision
+from impactopt.transcription.planned_loads import gear_share
 from impactopt.transcription.rows import Index
 from impactopt.transcription.structured import StructuredProgram
 
@@ -47,6 +50,7 @@ class ContactError:
     coarse : what of it is the elements'; the rest is that phases hold to one branch of the law.
     of_elements : what each element of each phase adds to `coarse` [%].
     missed : whether an event is missed.
+    strained : in which elements of each phase a gear bears more than it may, between the plan's own points.
     finer : the collisions as they are on elements half as long, in the program's order: torque and ZMP are
         worst between the plan's own points. Empty if none was found.
     """
@@ -55,6 +59,7 @@ class ContactError:
     coarse: float
     of_elements: Elements
     missed: bool
+    strained: tuple[tuple[bool, ...], ...] = ()
     finer: tuple[PlannedCollision, ...] = field(default=(), repr=False, compare=False)
 
 
@@ -78,11 +83,13 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
         grown.append(_grown(new, old, branches, x))
         errors.append(_off(new, old, law, x))
     ends = np.cumsum([len(phase) for phase in t.hit.elements])[:-1]
+    strained = np.any([_strained(t, hit, again.hit.stages) for hit in finer], axis=0)
     return ContactError(
         pct=max(errors, key=abs),
         coarse=max(coarse, key=abs),
         of_elements=tuple(tuple(map(float, phase)) for phase in np.split(np.max(grown, axis=0), ends)),
         missed=bool(np.isinf(errors).any()),
+        strained=tuple(tuple(map(bool, phase)) for phase in np.split(strained, ends)),
         finer=tuple(finer),
     )
 
@@ -90,17 +97,20 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
 def refined_elements(error: ContactError | None, elements: Elements, asked: float = ASKED) -> Elements | None:
     """Elements for a contact with less error than is asked for [%]; None where it has less, or no more help.
 
-    Those with much of the error are cut, into more parts the more they have; all where an event is missed.
+    Those with much of the error are cut, into more parts the more they have, and those in which a gear bears
+    too much; all where an event is missed.
     """
-    if error is None or (abs(error.coarse) <= asked and not error.missed):
+    strained = error is not None and any(map(any, error.strained))
+    if error is None or (abs(error.coarse) <= asked and not error.missed and not strained):
         return None
     share = asked / sum(map(len, elements))
     out = []
-    for lengths, errors in zip(elements, error.of_elements, strict=True):
+    none = [(False,) * len(lengths) for lengths in elements]
+    for lengths, errors, loads in zip(elements, error.of_elements, error.strained or none, strict=True):
         phase: list[float] = []
-        for h, e in zip(lengths, errors, strict=True):
+        for h, e, load in zip(lengths, errors, loads, strict=True):
             parts = int(np.clip(np.ceil((e / share) ** (1 / _ORDER)), 1, _PARTS))
-            parts = max(parts, 2) if error.missed else parts
+            parts = max(parts, 2) if error.missed or load else parts
             phase += [h / parts] * parts
         out.append(tuple(phase) if len(phase) <= max(_MOST, len(lengths)) else lengths)
     refined = tuple(out)
@@ -197,6 +207,16 @@ class _Again:
         for function in (block.value, block.jacobian):
             function.inputs[1][: block.count, RESTITUTING] = restituting ^ wrong
         return bool(wrong.any())
+
+
+def _strained(t: ContactProgram, hit: PlannedCollision, stages: Sequence[CollocationPoint]) -> Array:
+    """In which of the program's elements a gear bears too much, in a collision on elements half as long."""
+    share = gear_share(t.problem, hit.torque, hit.acceleration)[1:] > 1.0 + GEAR
+    elements = sorted({s.members for s in stages})
+    out = np.zeros(len(elements) // 2, dtype=bool)
+    for s, over in zip(stages, share, strict=True):
+        out[elements.index(s.members) // 2] |= over
+    return out
 
 
 def _scale(old: Collision, x: Array) -> float:

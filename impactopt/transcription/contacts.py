@@ -10,11 +10,12 @@ from impactopt.problem.scenario import Scenario
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import Contact
+from impactopt.transcription.drives import ContactEnd, DrivePoint
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.guess import mass_at_contact
 from impactopt.transcription.layout import Array
 from impactopt.transcription.mesh import Elements, Shares
-from impactopt.transcription.rows import Index, percent
+from impactopt.transcription.rows import Index, Place, percent
 
 
 class Contacts:
@@ -67,6 +68,18 @@ class Contacts:
     def determined(self) -> list[Determined]:
         """The feed-forward."""
         return [determined(Turn.FEEDFORWARD, self.contact.feedforward.index(0))]
+
+    def drives(self) -> list[DrivePoint]:
+        """What the drives do in contact, as far as it is known: of an impact without duration, nothing."""
+        return []
+
+    def first_instants(self) -> list[tuple[Place, Index]]:
+        """Where accelerations jump, with the numbers of the outputs that rotors take off the gears' load."""
+        return []
+
+    def contact_ends(self) -> list[ContactEnd]:
+        """Of all contacts."""
+        return [collision.contact_end() for collision in self.collisions]
 
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         """Write what a contact starts from with these coordinates and rates (ny,) and legs (nl,)."""

@@ -41,6 +41,7 @@ def own_blocks(
         instant=not problem.lasts,
         frozen=problem.frozen,
         freezes=problem.freezes,
+        first=problem.first_instant,
     )
 
 

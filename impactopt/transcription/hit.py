@@ -13,12 +13,14 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.contacts import Contacts
+from impactopt.transcription.drives import DrivePoint
+from impactopt.transcription.first_instant import FirstInstant
 from impactopt.transcription.frozen_collision import FrozenCollision
 from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Array
 from impactopt.transcription.mesh import Elements, Shares, contact_elements, contact_mesh, guessed_shares
 from impactopt.transcription.plan import PlannedScenario
-from impactopt.transcription.rows import Index
+from impactopt.transcription.rows import Index, Place
 
 DRIFT = 2e-3  # of the contact's time: how far a freeze may be from where it is asked for
 
@@ -64,6 +66,10 @@ class Hit(Contacts):
             self.expected = kind(b, contact, self.stages, number=0, after=own, **common)
         else:
             self.expected = InstantImpact(b, contact)
+        self.first: list[FirstInstant] = []
+        if p.first_instant:
+            lasting = [c for c in self.collisions if isinstance(c, Collision)]
+            self.first = [FirstInstant(b, contact, c.law, c.suffix) for c in lasting]
 
     # ------------------------------------------------------------------ rows
     def add_rows(self) -> None:
@@ -85,6 +91,12 @@ class Hit(Contacts):
                 {name: (self._at[name] + k * sizes[name], sizes[name]) for name, k in index.items()}
             )
 
+        if self.first:
+            slots_of, numbers = zip(*(first.instance() for first in self.first), strict=True)
+            at = b.add_block("first", list(slots_of), np.array(numbers))
+            for k, each in enumerate(self.first):
+                each.add_rows(at + k * b.blocks[-1].n_out)
+
     def output(self, collision: int, stage: int, part: str) -> Index:
         """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
 
@@ -94,6 +106,12 @@ class Hit(Contacts):
         at = self._at["force"] + (collision * len(self.stages) + stage) * size
         return np.asarray(at + self._b.parts("force")[part])
 
+    def drives(self) -> list[DrivePoint]:
+        return [point for c in self.collisions if isinstance(c, Collision) for point in c.drives()]
+
+    def first_instants(self) -> list[tuple[Place, Index]]:
+        return [(first.place, first.rotors) for first in self.first]
+
     @property
     def deepest(self) -> Index:
         """Number of the output that is the penetration at the end of the expected target's compression."""
@@ -102,13 +120,14 @@ class Hit(Contacts):
 
     def determined(self) -> list[Determined]:
         """Of all collisions, and the feed-forward."""
-        return [*(each for c in self.collisions for each in c.determined()), *super().determined()]
+        parts = [*self.collisions, *self.first]
+        return [*(each for part in parts for each in part.determined()), *super().determined()]
 
     # ------------------------------------------------------------------ numbers
     def guess(self, x: Array, y: Array, rates: Array, legs: Array) -> None:
         super().guess(x, y, rates, legs)
-        for collision in self.collisions:
-            collision.guess(x, y, rates, legs)
+        for part in (*self.collisions, *self.first):
+            part.guess(x, y, rates, legs)
 
     def drifted(self, x: Array) -> Shares | None:
         if not self.shares or not isinstance(self.expected, Collision):

@@ -14,11 +14,12 @@ import numpy as np
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import Contact
+from impactopt.transcription.drives import ContactEnd, still
 from impactopt.transcription.elimination import Turn, determined
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.plan import PlannedCollision
-from impactopt.transcription.rows import Measure, percent
+from impactopt.transcription.rows import Measure, Place, percent
 
 
 class InstantImpact:
@@ -88,6 +89,12 @@ class InstantImpact:
         """As of :meth:`impactopt.transcription.collision.Collision.state_after`."""
         state = self.contact.state
         return [state.y, self._rate, state.legs, Affine.constant(1.0)]
+
+    def contact_end(self) -> ContactEnd:
+        state, none, one = self.contact.state, Affine.zeros(self._b.ny), Affine.constant(1.0)
+        before = still(state.y, self.contact.u0[0], none, one, state.legs)
+        after = still(state.y, self._rate, none, one, state.legs)
+        return ContactEnd(Place.plain("after contact"), before, after, self.du[0])
 
     @property
     def _rate(self) -> Affine:

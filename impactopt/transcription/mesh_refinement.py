@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from impactopt.kinematics.support import margin, zmp
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.transcription.plan import Plan, complete_reference
+from impactopt.transcription.planned_loads import gear_share
 
 Array = NDArray[np.float64]
 _SHARE = 0.5  # of a margin that may be given up between nodes
 _ZMP, _TORQUE = 1e-3, 0.01  # [m], and of the limit: what may be given up of any
+GEAR = 0.03  # of what a gear may bear: what it may bear more between nodes, or collocation points
 
 
 class MoreNodes(NamedTuple):
@@ -40,7 +42,7 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     """Those known, and more where the plan leaves its limits half-way from one node to the next.
 
     That is where it gives up more than half of a margin that it has at the nodes: of the ZMP to the edge of
-    the support polygon, of torques to all that the motors have.
+    the support polygon, of torques to all that the motors have; and where a gear bears 3 % more than it may.
     """
     start = plan.coordinates.split(plan.problem.start_posture)[1]
     swing, legs = _middles_outside(plan, 0, start)
@@ -61,10 +63,11 @@ def _middles_outside(
     curve, begin, nodes, _ = plan.segment(phase, missed=missed)
     places = (nodes[1:] + nodes[:-1]) / 2
     y, yd, ydd, wrench = plan.independent(phase, begin + places * curve.duration, missed=missed)
-    q, _, _, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)
+    q, _, a, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)
     limit, cone = p.term(TorqueLimit).fraction, p.term(ContactWrenchCone)
     ratio = np.abs(torque / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
+    outside |= gear_share(p, torque, a[:, c.base :]) > 1.0 + GEAR
     if len(plan.polygon):
         inside = margin(plan.polygon, zmp(ground)) >= cone.margin - max(_SHARE * cone.margin, _ZMP)
         outside |= ~inside | (ground[:, 2] <= 0.0)

@@ -67,7 +67,8 @@ class PlannedCollision:
     its surface; outcome: what the blow has brought the target, by name and unit (``speed_m_s`` of a free
     mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n) [N m], servo and feed-forward;
     ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each
-    sole's frame.
+    sole's frame. velocity, acceleration (m + 1, n) [rad/s, rad/s^2] of the joints, the first at once after
+    contact, when a damped contact has a force already; (0, 0) where a model does not know them.
     """
 
     time: Array = field(repr=False)
@@ -77,6 +78,8 @@ class PlannedCollision:
     torque: Array = field(repr=False)
     ground: Array = field(repr=False)
     sole_wrench: Array = field(repr=False)
+    velocity: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.loads import DriveLoads
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario
+from impactopt.transcription.planned_loads import strike_loads
 
 Array = NDArray[np.float64]
 
@@ -61,6 +63,11 @@ class PlannedStrike:
         }
         out["capture_margin_m"] = float(margin(polygon, self._capture_point()[None])[0])
         return out
+
+    def loads(self) -> DriveLoads:
+        """What gears and motors bear at most in the blow."""
+        before, after = self.velocity, self.velocity_after
+        return strike_loads(self.problem.robot, before, after, self.collision)
 
     def _capture_point(self) -> Array:
         """(2,) [m] after contact: c + cdot sqrt(c_z / g) (Koolen et al., IJRR 2012)."""

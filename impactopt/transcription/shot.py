@@ -16,10 +16,11 @@ from impactopt.problem.scenario import Scenario
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.contacts import Contacts
+from impactopt.transcription.drives import ContactEnd, DrivePoint, still
 from impactopt.transcription.guess import natural_durations
 from impactopt.transcription.layout import Affine, Array, stack
 from impactopt.transcription.plan import PlannedCollision, PlannedScenario, total_ground_wrench
-from impactopt.transcription.rows import Index, Measure, percent
+from impactopt.transcription.rows import Index, Measure, Place, percent
 from impactopt.transcription.shooting import FORCE, INSTANTS, Shooting, horizon_of, shot_block
 
 # a robot's contact against that of a point mass of 1 m/s in its place, at most
@@ -140,6 +141,12 @@ class Shot:
         legs = Affine.zeros(0) if self._legs is None else self._legs[0]
         return [self._y[0], self._rate[0], legs, Affine.constant(1.0)]
 
+    def contact_end(self) -> ContactEnd:
+        state, u0, one = self.contact.state, self.contact.u0[0], Affine.constant(1.0)
+        y, rate, legs, _ = self.state_after
+        before, after = still(state.y, u0, u0 * 0.0, one, state.legs), still(y, rate, u0 * 0.0, one, legs)
+        return ContactEnd(Place.plain(f"after contact{self.suffix}"), before, after, rate - u0)
+
     # ------------------------------------------------------------------ numbers
     def durations(self, x: Array) -> tuple[float, float]:
         """Compression and restitution [s]."""
@@ -197,6 +204,13 @@ class Shots(Contacts):
         """Of all collisions."""
         for shot in self.collisions:
             shot.add_rows()
+
+    def drives(self) -> list[DrivePoint]:
+        """They are not known."""
+        raise InputError(
+            'method "shooting" does not know how joints accelerate in contact, so it bounds no gears and '
+            'motors there; take "collocation"'
+        )
 
     @property
     def deepest(self) -> Index:

@@ -60,6 +60,7 @@ class StrikeTranscription(ContactProgram):
         super().__init__(b, self._make_hit(b, Contact(state, *coasting), elements, shares))
         node = [state.y, state.y1, state.y2, state.legs, state.w, state.T]
         (torque,) = add_nodes(b, [node], ["contact"])
+        self._node = node
         self.hit.add_feedforward_rows(torque)
         add_touch_rows(b, state)
         self.hit.add_rows()
@@ -75,6 +76,9 @@ class StrikeTranscription(ContactProgram):
     def _make_hit(self, b: Builder, contact: Contact, elements: Elements, shares: Shares) -> Any:
         """The contact with all targets."""
         return Hit(b, contact, elements, shares, after=True)
+
+    def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
+        return [(Place.plain("contact"), self.feedforward[0], self._node)]
 
     def _determined(self) -> list[Determined]:
         return [*at_node([*by_leg(self.legs.index(0)), self.w.index(0)[:6]]), *self.hit.determined()]

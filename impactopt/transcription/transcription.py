@@ -71,7 +71,7 @@ def block_functions(
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     out: dict[str, Any] = {}
-    keys = {"force": contact, "collision": frozen, "coasting": frozen}
+    keys = {"force": contact, "first": contact[:1], "collision": frozen, "coasting": frozen}
     found = {
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()
@@ -178,6 +178,7 @@ class Transcription(ContactProgram):
             instances.append(coasting)
             places.append(name)
         outputs = add_nodes(b, instances, places, closed=int(self.abort is not None))
+        self._slots = instances, places
         self._add_torque_rows(places, outputs)
         joints = np.arange(self.coordinates.base, b.ny)
         b.rows.add(
@@ -255,6 +256,10 @@ class Transcription(ContactProgram):
             b.equal("state after contact", f"position{other.suffix}", labels, outputs, far)
 
     # ------------------------------------------------------------------ structure
+    def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
+        slots, places = self._slots
+        return list(zip(places, self.torques, slots, strict=True))
+
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]
         wrenches = [part.w for part in (self.swing, *self.follows, *self.hit.collisions)]

@@ -56,15 +56,18 @@ def strike(
     step: float = 1e-4,
     own: float = 6.0,
     mass: float = 5.0,
+    rotor: float = 0.0,
     simulate: Callable[..., Simulation] = simulate_pinocchio,
 ) -> tuple[Simulation, dict[str, float]]:
     """A slider, pushed to 1.2 m/s by its feed-forward and let go, hits a free mass; and the closed form.
+
+    rotor : how much of its own mass is its motor's.
 
     mu x'' + d x' + k x = 0 with mu = m_a m_t / (m_a + m_t) until x' = 0, then without the damper until x = 0.
     """
     speed, push = 1.2, 0.05
     force = own * speed / push
-    robot = slider(own)
+    robot = slider(own - rotor, armature=rotor)
     ref = reference(
         [0.0, push, push, 0.5], np.zeros(1), torque=[[force], [force], [0.0], [0.0]], nv=1, n=1, end=0.5
     )

@@ -82,7 +82,7 @@ def transcribed(problem: ImpactProblem) -> Transcription:
             problem, c, _functions(found | own_blocks(problem, c, edges)) | _extra_functions(problem)
         )
     for instant in (False, True):
-        found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant)
+        found |= builders(c, problem.striker, problem.law, problem.target, edges, instant=instant, first=True)
     return Transcription(problem, c, _functions(found) | _extra_functions(problem))
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.robot import Robot, Sole, Striker
 
 HALF_SITTING = {"hip pitch": -0.4, "knee": 0.8, "ankle pitch": -0.4}
@@ -31,6 +32,14 @@ def _add(model: Any, parent: int, kind: Any, at: Any, name: str, body: Any) -> i
 def _mark(model: Any, joint: int, at: tuple[float, float, float], name: str) -> None:
     above = model.getFrameId(model.names[joint])
     model.addFrame(pin.Frame(name, joint, above, _placement(*at), pin.FrameType.OP_FRAME))
+
+
+# of all joints: quicker than any of them
+MOTORS = {
+    "*": Actuator(
+        stall_torque=250.0, no_load_speed=12.0, viscous_friction=0.2, coulomb_friction=1.0, power_limit=2000.0
+    )
+}
 
 
 def biped() -> Robot:
@@ -71,6 +80,7 @@ def biped() -> Robot:
         velocity_limit=6.0,
         # knees do not straighten: there the legs are singular
         position_limit={name: (0.1, 2.2) if "knee" in name else (-2.2, 2.2) for name in names},
+        actuators=MOTORS,
         soles=soles,
         strikers=[Striker(name="fist", frame="fist", point=np.array([0.02, 0.0, 0.0]))],
         postures={
@@ -95,6 +105,7 @@ def arm(**options: Any) -> Robot:
     _mark(model, parent, (0.0, 0.0, 0.1), "hand")
     settings = {
         "armature": 0.05,
+        "actuators": MOTORS,
         "torque_limit": np.array([60.0, 80.0, 60.0, 40.0]),
         "velocity_limit": 5.0,
         "position_limit": dict.fromkeys(("shoulder", "elbow", "wrist"), (-2.5, 2.5)),

@@ -15,12 +15,16 @@ from numpy.typing import NDArray
 
 from impactopt.problem.terms import (
     Gaze,
+    GearLoad,
     HandOrientation,
     HitCone,
     HitRegion,
     JointAcceleration,
+    MotorCurve,
+    PowerLimit,
     Term,
     TorqueRate,
+    VelocityJump,
 )
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.plan import Plan
@@ -106,6 +110,12 @@ def joint_acceleration(plan: Solved, term: JointAcceleration) -> float:
     return float((np.abs(accelerations) / limit).max())
 
 
+def velocity_jump(plan: Solved, term: VelocityJump) -> float:
+    before = plan.plan.swing.sample(plan.plan.swing.duration)[1][0]
+    after = plan.plan.follow.sample(0.0)[1][0]
+    return float(np.abs(after - before).max()) / float(term.limit)  # type: ignore[arg-type]
+
+
 CASES: dict[str, Case] = {
     "torque rate": Case(TorqueRate(limit=20.0), TorqueRate(limit=30.0), TorqueRate(limit=200.0), torque_rate),
     "rate of some joints": Case(
@@ -138,6 +148,12 @@ CASES: dict[str, Case] = {
         JointAcceleration(limit={"wrist": 30.0}),
         JointAcceleration(limit=200.0),
         joint_acceleration,
+    ),
+    "gear load": Case(GearLoad(limit=0.6), GearLoad(limit=0.7), GearLoad(limit=1.0)),
+    "motor curve": Case(MotorCurve(fraction=0.2), MotorCurve(fraction=0.25), MotorCurve()),
+    "power limit": Case(PowerLimit(limit=30.0), PowerLimit(limit=40.0), PowerLimit(limit=200.0)),
+    "velocity jump": Case(
+        VelocityJump(limit=0.1), VelocityJump(limit=0.13), VelocityJump(limit=2.0), velocity_jump
     ),
     "hit cone": Case(HitCone(angle=0.05), HitCone(angle=0.2), HitCone(angle=0.2), hit_cone),
 }

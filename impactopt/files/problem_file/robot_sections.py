@@ -10,9 +10,11 @@ import pinocchio as pin
 from pydantic import model_validator
 
 from impactopt.errors import InputError
+from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import (
     Inertia,
+    JointNames,
     Pair,
     PerJoint,
     Point2,
@@ -22,6 +24,7 @@ from impactopt.files.problem_file.values import (
     Rotation,
     Vector,
 )
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import check_count
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
@@ -77,6 +80,18 @@ class ToolSection(Section):
     head: Vector = required("the point that hits, in the frame [m]", "head_m")
 
 
+_OfActuator: Any = section_of(Actuator)
+
+
+class ActuatorSection(_OfActuator):
+    """A motor with its gear, of one joint or of many; of sections that name the same joint the last holds."""
+
+    joints: JointNames = required("names of joints, or patterns such as `arm_*_4_joint`")
+
+    def build(self) -> Any:
+        return Actuator(**{name: value for name, value in self.given().items() if name != "joints"})
+
+
 class RobotSection(Section):
     """A preset with changes, or a URDF; files are relative to the problem file.
 
@@ -103,6 +118,7 @@ class RobotSection(Section):
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
     strikers: list[StrikerSection] = optional("points that hit")
     tools: list[ToolSection] = optional("what the robot holds")
+    actuators: list[ActuatorSection] = optional("motors and gears; joints that none names keep the preset's")
     postures: dict[str, dict[str, float]] = optional(
         "named postures: joint angles by joint, the others 0 or the SRDF's [rad]", "postures_rad"
     )
@@ -127,10 +143,17 @@ class RobotSection(Section):
             options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
         strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
         tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
+        drives = {
+            joint: section.build()
+            for section in (self.actuators if options.pop("actuators", None) else ())
+            for joint in section.joints
+        }
         if "urdf" in options:
+            options |= {"actuators": drives} if drives else {}
             robot = Robot.from_urdf(options.pop("urdf"), **options)
         else:
             robot = load_robot(options.pop("preset"), **options)
+            robot = robot.with_actuators(drives) if drives else robot
         for striker in strikers:
             robot = robot.with_striker(striker)
         for tool in tools:

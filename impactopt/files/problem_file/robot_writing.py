@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from impactopt.contact.fields import abouts
 from impactopt.errors import InputError
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.toml import plain_value
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 __all__ = ["robot_data"]
@@ -99,6 +101,8 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
     moved = {joint: [float(c), float(d)] for joint, a, b, c, d in limits if (a, b) != (c, d)}
     if moved:
         out["position_limit_rad"] = moved
+    if built.actuators != robot.actuators:
+        out["actuators"] = _actuators(robot)
     if [_sole(sole) for sole in built.soles] != [_sole(sole) for sole in robot.soles]:
         out["soles"] = [_sole(sole) for sole in robot.soles]
     apart = [list(pair) for pair in robot.disable_collisions if pair not in built.disable_collisions]
@@ -112,6 +116,23 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
         if name not in made
     ]
     return out | ({"strikers": strikers} if strikers else {})
+
+
+def _actuators(robot: Robot) -> list[dict[str, Any]]:
+    """A section for all joints whose motors and gears are alike."""
+    alike: dict[Actuator, list[str]] = {}
+    for joint, actuator in zip(robot.joint_names, robot.actuators, strict=True):
+        alike.setdefault(actuator, []).append(joint)
+    usual = Actuator()
+    return [
+        {"joints": joints}
+        | {
+            told.key_of(field.name): value
+            for field, told in abouts(Actuator)
+            if (value := getattr(actuator, field.name)) != getattr(usual, field.name)
+        }
+        for actuator, joints in alike.items()
+    ]
 
 
 def _relative(path: Any, folder: Path) -> str:

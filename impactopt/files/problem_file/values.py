@@ -79,6 +79,13 @@ def per_joint(value: Any) -> Any:
     return value
 
 
+def _joint_names(value: list[str]) -> list[str]:
+    """Names, at least one."""
+    if not value:
+        raise ValueError("it is empty; name a joint, or give a pattern")
+    return value
+
+
 def _posture(value: Any) -> Any:
     """A name, or a list of numbers."""
     if not (isinstance(value, str) or (value and _numbers(value))):
@@ -172,5 +179,6 @@ ContactDuration = Annotated[Any, PlainValidator(_contact_duration)]
 Fractions = Annotated[list[Positive], AfterValidator(_fractions)]
 PerJoint = Annotated[Any, PlainValidator(per_joint)]
 Preset = Annotated[str, AfterValidator(_known_robot)]
+JointNames = Annotated[list[str], AfterValidator(_joint_names)]
 Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 IpoptOptions = Annotated[dict[str, Any], AfterValidator(_ipopt_options)]

@@ -8,6 +8,7 @@ from impactopt.problem.terms.balance import Balance
 from impactopt.problem.terms.base import Term, check_known, kind_of
 from impactopt.problem.terms.contact_wrench_cone import ContactWrenchCone
 from impactopt.problem.terms.gaze import Gaze
+from impactopt.problem.terms.gear_load import GearLoad
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.terms.hit_cone import HitCone
 from impactopt.problem.terms.hit_region import HitRegion
@@ -15,10 +16,13 @@ from impactopt.problem.terms.incidence import Incidence
 from impactopt.problem.terms.joint_acceleration import JointAcceleration
 from impactopt.problem.terms.keep_out import KeepOut
 from impactopt.problem.terms.leg_extension import LegExtension
+from impactopt.problem.terms.motor_curve import MotorCurve
 from impactopt.problem.terms.position_limit import PositionLimit
+from impactopt.problem.terms.power_limit import PowerLimit
 from impactopt.problem.terms.self_collision import SelfCollision
 from impactopt.problem.terms.torque_limit import TorqueLimit
 from impactopt.problem.terms.torque_rate import TorqueRate
+from impactopt.problem.terms.velocity_jump import VelocityJump
 from impactopt.problem.terms.velocity_limit import VelocityLimit
 
 DEFAULT_TERMS: tuple[Term, ...] = (
@@ -41,6 +45,10 @@ TERMS: tuple[type[Term], ...] = (
     HitRegion,
     HitCone,
     JointAcceleration,
+    GearLoad,
+    MotorCurve,
+    PowerLimit,
+    VelocityJump,
 )
 
 __all__ = [
@@ -49,6 +57,7 @@ __all__ = [
     "Balance",
     "ContactWrenchCone",
     "Gaze",
+    "GearLoad",
     "HandOrientation",
     "HitCone",
     "HitRegion",
@@ -56,11 +65,14 @@ __all__ = [
     "JointAcceleration",
     "KeepOut",
     "LegExtension",
+    "MotorCurve",
     "PositionLimit",
+    "PowerLimit",
     "SelfCollision",
     "Term",
     "TorqueLimit",
     "TorqueRate",
+    "VelocityJump",
     "VelocityLimit",
     "check_known",
     "kind_of",

@@ -27,12 +27,17 @@ class Term(Described):
 
     whole_motion : a strike alone is planned without this term.
     needs_torques : its rows need the torques at the nodes as variables.
+    first_instant : its rows look at the first instant of contact, at which accelerations jump.
+    of_drives : its rows are about the joints' drives, `impactopt.Actuator`: they need the torques in contact
+        as variables too.
     """
 
     name: ClassVar[str] = ""
     unit: ClassVar[str] = ""
     whole_motion: ClassVar[bool] = False
     needs_torques: ClassVar[bool] = False
+    first_instant: ClassVar[bool] = False
+    of_drives: ClassVar[bool] = False
 
     def blocks(self, problem: Any, coordinates: Any) -> Mapping[str, Any]:
         """Nonlinear functions that the rows need, by name: `impactopt.problem.block.make_block`.

@@ -1,4 +1,4 @@
-"""Torque demand over limit: joints by time."""
+"""Torque demand over limit, joints by time; and torque through the gears in the blow."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from matplotlib.figure import FigureBase
 
 from impactopt.files.output import Record
 from impactopt.report.pictures.style import (
+    BLUE,
+    GREEN,
     OVER,
     PAGE,
     PHASES,
+    VERMILION,
     Array,
     Picture,
     joint_label,
@@ -22,16 +25,58 @@ from impactopt.report.pictures.style import (
 )
 
 ROW = 0.13  # [in] of a joint
+GEARS = 2.0  # [in] of the panel of gears
 
 
 @styled
 def torque(record: Record) -> Picture:
     """Torque demand over limit, joints by time; contact has a panel of its own, at a larger scale."""
-    figure = Picture(PAGE, torque_height(record) + 0.2)
-    draw_torque(figure, record)
+    gears = _gears(record)
+    height = torque_height(record) + 0.2
+    figure = Picture(PAGE, height + (GEARS if gears else 0.0))
     kind = "simulated, before saturation" if record.simulated else "planned"
     figure.suptitle(title(record, f"torque over limit ({kind})"))
+    if not gears:
+        draw_torque(figure, record)
+        return figure
+    parts: Any = figure.subfigures(2, 1, height_ratios=[height, GEARS])
+    above, below = parts
+    draw_torque(above, record)
+    _draw_gears(below, record, gears)
     return figure
+
+
+def _gears(record: Record) -> dict[str, tuple[Array, Array]]:
+    """Times since contact [ms] and torque through the gears over limit (k, n): planned, and simulated."""
+    a, out = record.arrays, dict[str, tuple[Array, Array]]()
+    if a.get("collision_acceleration", np.zeros(0)).size and "armature" in a:
+        load = a["collision_torque"] - a["armature"] * a["collision_acceleration"]
+        out["planned"] = 1e3 * a["collision_time"], load / a["torque_limit"]
+    start, end = (a.get(f"simulated_contact_{name}", np.nan) for name in ("start", "end"))
+    if a.get("simulated_gear", np.zeros(0)).size and np.isfinite(start) and np.isfinite(end):
+        before = 0.1 * (end - start)
+        near = (a["simulated_time"] >= start - before) & (a["simulated_time"] <= end + before)
+        out["simulated"] = (
+            1e3 * (a["simulated_time"][near] - start),
+            a["simulated_gear"][near] / a["torque_limit"],
+        )
+    return {name: part for name, part in out.items() if len(part[0]) > 1}
+
+
+def _draw_gears(figure: FigureBase, record: Record, gears: dict[str, tuple[Array, Array]]) -> None:
+    """Of the joints whose gears bear most; at contact it jumps where a damper has a force at once."""
+    axes, names = figure.subplots(), record.arrays["joints"]
+    most = np.max([np.abs(load).max(axis=0) for _, load in gears.values()], axis=0)
+    for k, colour in zip(np.argsort(-most), (BLUE, VERMILION, GREEN), strict=False):
+        for source, style in (("planned", "-"), ("simulated", "--")):
+            if source in gears:
+                time, load = gears[source]
+                label = f"{joint_label(names[k])}, {source}"
+                axes.plot(time, load[:, k], style, color=colour, label=label)
+    axes.axhline(0.0, color="0.6", linewidth=0.6)
+    axes.set(xlabel="time since contact [ms]", ylabel="through the gear / limit")
+    axes.set_title("torque through the gears, worst joints")
+    axes.legend(fontsize=6.5, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def torque_height(record: Record) -> float:

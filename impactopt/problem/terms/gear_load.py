@@ -1,0 +1,80 @@
+"""What gears bear, in the blow above all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.joint_motion import joint_motion
+from impactopt.problem.terms.base import Term, of_joints
+from impactopt.problem.violation import percent
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+    from impactopt.robots.robot import Robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class GearLoad(Term):
+    """|torque through the gear| is bounded: the servo's torque less what its rotor takes to accelerate.
+
+    That is servo torque - armature x joint acceleration. It holds at the nodes of all motions, at the
+    collocation points of all contacts, and in their first instant, where the force of a damped contact jumps.
+    If the limit is given by joint, joints that are not named have no bound.
+    """
+
+    name: ClassVar[str] = "gear load"
+    unit: ClassVar[str] = "of limit"
+    needs_torques: ClassVar[bool] = True
+    first_instant: ClassVar[bool] = True
+    of_drives: ClassVar[bool] = True
+    limit: float | Mapping[str, float] | None = field(
+        default=None,
+        metadata=about(
+            "largest load over the torque limit: one for all joints, or by joint; left out: the gear's "
+            "momentary peak where `[[robot.actuators]]` has it, else 2",
+            above=0,
+            by_joint=True,
+        ),
+    )
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"rotors": BlockRecipe(lambda: rotors(coordinates))}
+
+    def most(self, robot: Robot) -> Any:
+        """(n,) largest loads over the torque limits; inf: no bound."""
+        return robot.gear_limit if self.limit is None else of_joints(self.limit, robot.joint_names)
+
+    def add_rows(self, program: Any) -> None:
+        robot, names = program.robot, program.robot.joint_names
+        most = self.most(robot)
+        points, first = program.drive_points(), program.first_instants()
+        outputs = [output for _, output in first]
+        if points:
+            at = program.add_block("rotors", [p.slots for p in points], robot.armature / robot.torque_limit)
+            outputs = [at + robot.n * k + np.arange(robot.n) for k in range(len(points))] + outputs
+        torques = [*(p.torque for p in points), *(program.feedforward[0] for _ in first)]
+        places = [*(p.place for p in points), *(place for place, _ in first)]
+        for place, torque, output in zip(places, torques, outputs, strict=True):
+            program.rows.add(
+                term=self.name,
+                place=place,
+                components=names,
+                outputs=output,
+                affine=torque,
+                lower=-most,
+                upper=most,
+                measure=[percent("over its limit", of=limit) for limit in most],
+            )
+
+
+def rotors(c: StanceCoordinates) -> BlockExpression:
+    """z of `joint_motion`;  p = armature over torque limit (n);  out = -p x acceleration (n)."""
+    motion, inertia = joint_motion(c), ca.SX.sym("inertia", c.robot.n)
+    return make_block(motion.z, [inertia], {"rotors": -inertia * motion.acceleration}, motion.through)

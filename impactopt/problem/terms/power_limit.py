@@ -1,0 +1,93 @@
+"""What motors may give and take."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import product
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.joint_motion import joint_motion
+from impactopt.problem.terms.base import Term, of_joints
+from impactopt.problem.violation import Measure
+from impactopt.robots.actuators import numbers_of
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+SIGNS = tuple(product((1.0, -1.0), repeat=2))  # of the servo's power, and of that of friction
+
+
+@dataclass(frozen=True, kw_only=True)
+class PowerLimit(Term):
+    """The mechanical power of each motor is bounded, whether it drives or brakes.
+
+    It holds at the nodes of all motions and at the collocation points of all contacts. Friction counts as if
+    it always opposed the motor. If the limit is given by joint, joints that are not named have no bound.
+    """
+
+    name: ClassVar[str] = "power limit"
+    unit: ClassVar[str] = "of limit"
+    needs_torques: ClassVar[bool] = True
+    of_drives: ClassVar[bool] = True
+    limit: float | Mapping[str, float] | None = field(
+        default=None,
+        metadata=about(
+            "largest power: one for all joints, or by joint; left out: that of `[[robot.actuators]]`",
+            unit="W",
+            above=0,
+            by_joint=True,
+        ),
+    )
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {"motor_power": BlockRecipe(lambda: motor_power(coordinates))}
+
+    def add_rows(self, program: Any) -> None:
+        robot, n = program.robot, program.robot.n
+        most = numbers_of(robot.actuators, "power_limit")
+        if self.limit is not None:
+            most = of_joints(self.limit, robot.joint_names)
+        viscous, coulomb = (
+            numbers_of(robot.actuators, name) for name in ("viscous_friction", "coulomb_friction")
+        )
+        known, points = np.flatnonzero(np.isfinite(most)), program.drive_points()
+        if not known.size or not points:
+            return
+        per_power = np.nan_to_num(1 / most, posinf=0.0)
+        numbers = np.concatenate([robot.torque_limit, viscous, coulomb, per_power])
+        at = program.add_block("motor_power", [[p.torque, *p.slots] for p in points], numbers)
+        signs = SIGNS if coulomb.any() else SIGNS[::2]
+        for (k, point), (j, (way, against)) in product(enumerate(points), enumerate(SIGNS)):
+            if (way, against) not in signs:
+                continue
+            word = "giving" if way > 0 else "taking"
+            word += ("" if against > 0 else ", backwards") if coulomb.any() else ""
+            program.rows.add(
+                term=self.name,
+                place=point.place,
+                components=[f"{robot.joint_names[i]} {word}" for i in known],
+                outputs=at + (len(SIGNS) * k + j) * n + known,
+                upper=1.0,
+                measure=[Measure("%", 100.0, "over its limit")] * len(known),
+            )
+
+
+def motor_power(c: StanceCoordinates) -> BlockExpression:
+    """z = servo torque over limit (n), z of `joint_motion`;  p = torque limits, viscous and Coulomb friction,
+    1 over the power limit (n each).  out = power over limit, with each of the signs (n each).
+    """
+    n, motion = c.robot.n, joint_motion(c)
+    torque = ca.SX.sym("torque", n)
+    p = limit, viscous, coulomb, per_power = [ca.SX.sym(s, n) for s in ("limit", "viscous", "coulomb", "per")]
+    v = motion.velocity
+    out = {
+        f"power{k}": (way * limit * torque * v + against * coulomb * v + viscous * v**2) * per_power
+        for k, (way, against) in enumerate(SIGNS)
+    }
+    return make_block([torque, *motion.z], list(p), out, motion.through)

@@ -1,0 +1,76 @@
+"""How much faster or slower a blow makes joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.joint_motion import joint_motion
+from impactopt.problem.terms.base import Term, of_joints
+from impactopt.problem.violation import Measure
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+
+@dataclass(frozen=True, kw_only=True)
+class VelocityJump(Term):
+    """|joint speed after contact - before it| is bounded, with all targets.
+
+    If the limit is given by joint, joints that are not named have no bound.
+    """
+
+    name: ClassVar[str] = "velocity jump"
+    unit: ClassVar[str] = "rad/s"
+    limit: float | Mapping[str, float] = field(
+        metadata=about("largest jump: one for all joints, or by joint", unit="rad/s", above=0, by_joint=True)
+    )
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        if not coordinates.legs:
+            return {}
+        return {"leg_jump": BlockRecipe(lambda: leg_jump(coordinates))}
+
+    def add_rows(self, program: Any) -> None:
+        """Linear in the rates of the independent joints; those of the legs follow from them."""
+        c = program.coordinates
+        most = of_joints(self.limit, program.robot.joint_names)
+        measure = Measure("rad/s", 1.0, "too much")
+        ends = program.contact_ends()
+        at = 0
+        if c.legs:
+            at = program.add_block("leg_jump", [[*e.before, *e.after] for e in ends], np.zeros(0))
+        for k, end in enumerate(ends):
+            program.rows.add(
+                term=self.name,
+                place=end.place,
+                components=c.labels[c.base :],
+                affine=end.change[c.base :],
+                lower=-most[c.independent],
+                upper=most[c.independent],
+                measure=measure,
+            )
+            program.rows.add(
+                term=self.name,
+                place=end.place,
+                components=c.leg_labels,
+                outputs=at + c.nl * k + np.arange(c.nl),
+                lower=-most[c.dependent],
+                upper=most[c.dependent],
+                measure=measure,
+            )
+
+
+def leg_jump(c: StanceCoordinates) -> BlockExpression:
+    """z = z of `joint_motion` before contact, and after it;  out = change of the legs' rates [rad/s] (nl)."""
+    before, after = joint_motion(c), joint_motion(c)
+    legs = [int(j) for j in c.dependent]
+    change = ca.vertcat(*[after.velocity[j] - before.velocity[j] for j in legs])
+    through = [*before.through, *after.through]
+    return make_block([*before.z, *after.z], [], {"jump": change}, through)

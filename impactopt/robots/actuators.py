@@ -1,0 +1,133 @@
+"""`Actuator`: a joint's motor and gear, as far as it is known; which joints a class of them is of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.fields import Described, about, abouts
+from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.robots.checks import HEAVIEST, STRONGEST
+
+__all__ = ["MOMENTARY_PEAK", "Actuator", "numbers_of", "with_classes"]
+
+# of a gear over the joint's torque limit, where nothing better is known: see docs/howto/gears.md
+MOMENTARY_PEAK = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuator(Described):
+    """A joint's motor and gear. All is as the joint feels it, after the gear; None is not known."""
+
+    armature: float | None = field(
+        default=None,
+        metadata=about(
+            "reflected rotor inertia; left out: the robot's own",
+            unit="kg m2",
+            least=0,
+            most=HEAVIEST,
+        ),
+    )
+    viscous_friction: float = field(
+        default=0.0,
+        metadata=about(
+            "that the motor overcomes beside the servo's torque", unit="N m s/rad", least=0, most=STRONGEST
+        ),
+    )
+    coulomb_friction: float = field(
+        default=0.0,
+        metadata=about(
+            "that the motor overcomes beside the servo's torque", unit="N m", least=0, most=STRONGEST
+        ),
+    )
+    continuous_torque: float | None = field(
+        default=None, metadata=about("that the gear bears all the time", unit="N m", above=0, most=STRONGEST)
+    )
+    peak_torque: float | None = field(
+        default=None,
+        metadata=about("that the gear bears at each start and stop", unit="N m", above=0, most=STRONGEST),
+    )
+    momentary_torque: float | None = field(
+        default=None,
+        metadata=about("that the gear bears now and then, in a blow", unit="N m", above=0, most=STRONGEST),
+    )
+    stall_torque: float | None = field(
+        default=None,
+        metadata=about(
+            "where the line of the motor's torque over its speed begins, at rest",
+            unit="N m",
+            above=0,
+            most=STRONGEST,
+        ),
+    )
+    no_load_speed: float | None = field(
+        default=None,
+        metadata=about("where that line ends, without torque", unit="rad/s", above=0, most=STRONGEST),
+    )
+    power_limit: float | None = field(
+        default=None, metadata=about("mechanical power of the motor", unit="W", above=0, most=STRONGEST)
+    )
+
+    def __post_init__(self) -> None:
+        for told_of, told in abouts(type(self)):
+            value = getattr(self, told_of.name)
+            if value is None:
+                continue
+            name = f"Actuator: {told_of.name} [{told.unit}]"
+            number = check_number(name, value)
+            if not told.allows(number):
+                raise InputError(f"{name}: {number:g}; give a number {told.range}")
+            object.__setattr__(self, told_of.name, number)
+        if (self.stall_torque is None) != (self.no_load_speed is None):
+            raise InputError(
+                "Actuator: stall_torque and no_load_speed are two ends of one line; give both, or neither"
+            )
+        gear = ("continuous_torque", "peak_torque", "momentary_torque")
+        known = [(name, value) for name in gear if (value := getattr(self, name)) is not None]
+        for (low, less), (high, more) in pairwise(known):
+            if less > more:
+                raise InputError(
+                    f"Actuator: {low} is {less:g} N m, and {high} {more:g} N m; a gear bears a larger torque "
+                    "the more rarely it comes"
+                )
+
+
+def with_classes(
+    classes: Mapping[str, Actuator], joints: Sequence[str], known: Sequence[Actuator], model: Any
+) -> tuple[Actuator, ...]:
+    """The actuator of each joint: of the last class whose name or pattern it fits, else the known one.
+
+    classes : by names of joints, or patterns of them such as ``arm_*_4_joint``.
+    model : a pin.Model with these joints last, which gets the armature of the classes.
+
+    Raises
+    ------
+    InputError : what fits no joint.
+    """
+    out, base = list(known), model.nv - len(joints)
+    for pattern, actuator in classes.items():
+        if not isinstance(actuator, Actuator):
+            raise InputError(f"actuators: of {pattern!r} is {actuator!r}; give an Actuator")
+        fits = [k for k, joint in enumerate(joints) if joint == pattern or fnmatchcase(joint, pattern)]
+        if not fits:
+            raise InputError(
+                f"actuators: no joint is called {pattern!r}{did_you_mean(pattern, joints)}; joints are "
+                f"{', '.join(joints)}"
+            )
+        for k in fits:
+            out[k] = replace(actuator, armature=None)
+            if actuator.armature is not None:
+                model.armature[base + k] = actuator.armature
+    return tuple(out)
+
+
+def numbers_of(actuators: Iterable[Actuator], name: str) -> NDArray[np.float64]:
+    """(n,) of one field of them; nan where it is not known."""
+    values = [getattr(actuator, name) for actuator in actuators]
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)

@@ -363,9 +363,8 @@ class ImpactProblem:
         ------
         InputError : the start posture is in the target, in what holds it, or in an obstacle.
         """
-        model = self.robot.model
-        frames = [self.robot.striker(self.striker).model_frame]
-        frames += [sole.frame for sole in self.stance.soles(self.robot)]
+        robot, model = self.robot, self.robot.model
+        frames = [robot.striker(self.striker).model_frame, *(s.frame for s in self.stance.soles(robot))]
         strikes, *stands = (int(model.frames[model.getFrameId(name)].parentJoint) for name in frames)
         return Bodies(
             self.robot,

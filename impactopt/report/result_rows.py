@@ -86,7 +86,9 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("jump of a joint's speed [rad/s]", "velocity_jump_rad_s", "velocity_jump_joint", 2, np.inf),
     ):
         row = number_row(label, [source.get(key) for source in sources], digits, most=most)
-        yield None if row is None else _with_names(row, [source.get(joint) for source in sources])
+        if row is not None:  # names in a line of their own: beside the numbers they would fill a terminal
+            yield row
+            yield _of_joints([source.get(joint) for source in sources])
     for label, key, digits in (
         ("least normal force [N]", "min_normal_force_N", 0),
         ("largest slip of a sole [mm]", "sole_slip_mm", 2),
@@ -198,10 +200,10 @@ def word_row(label: str, values: Sequence[Any], *, no_is_bad: bool = False) -> R
     return Row(label, tuple(cells))
 
 
-def _with_names(row: Row, names: Sequence[Any]) -> Row:
-    """What each number is of."""
-    pairs = zip(row.cells, names, strict=True)
-    return Row(row.label, tuple(Cell(f"{c.text} {name}" if name else c.text, c.good) for c, name in pairs))
+def _of_joints(names: Sequence[Any]) -> Row:
+    """What the numbers above are of, from the left."""
+    different = dict.fromkeys(str(name) for name in names if name)
+    return Row(f"  {', '.join(different)}", (Cell(""),) * len(names))
 
 
 def _of_replays(row: Row | None) -> Row | None:

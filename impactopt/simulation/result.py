@@ -127,8 +127,8 @@ class Simulation:
     missed: bool = False
     touches: tuple[tuple[float, float, float], ...] = ()
     step_error: float = np.nan
-    gear: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    loads: DriveLoads | None = None
+    gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    loads: DriveLoads | None = field(default=None, repr=False)
 
     @property
     def ground(self) -> Array:

@@ -339,7 +339,7 @@ class Collision(Collocated):
         self.u.write(x, found.speed[:, None] * rates)
         self.d.write(x, d)
         self.state.write(x, found.state)
-        self.xt.write(x, found.moved[:, None] * per_time)
+        self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
         self.p.write(x, found.impulse[:, None])
         if p.target.guards:

@@ -285,7 +285,7 @@ def test_it_needs_no_files(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(presets, "distribution", missing)
     assert load_robot("standin").name == "standin"
-    with pytest.raises(InputError, match=r"impactopt\[robots\].*robot 'standin' needs nothing"):
+    with pytest.raises(InputError, match=r"not 'standin'.*\[robots\]"):
         load_robot("talos")
 
 

@@ -425,7 +425,7 @@ def test_mujoco_is_asked_for(monkeypatch):
     with pytest.raises(InputError, match="MujocoDynamics a step below"):
         in_mujoco(model, step=5e-3).collide(q, v, torque)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"impactopt\[validate\]"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[validate\]'"):
         in_mujoco(model)
 
 

@@ -94,7 +94,7 @@ def test_a_point_out_of_reach_is_drawn_again(punch: ImpactProblem) -> None:
 
 def test_nothing_in_reach_is_an_error(punch: ImpactProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zoo, "TRIES", 2)
-    monkeypatch.setattr("impactopt.problem.problem.reach", _unreachable)
+    monkeypatch.setattr("impactopt.problem.problem.inverse_kinematics", _unreachable)
     with pytest.raises(InputError, match="nowhere"):
         drawn_problem(punch, (0.1, 0.1, 0.1), np.random.default_rng(0))
 

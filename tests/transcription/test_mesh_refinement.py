@@ -15,7 +15,7 @@ from support.term_cases import MILD
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.kinematics.splines import CubicSpline
-from impactopt.planning import planner
+from impactopt.planning import planner, rounds
 from impactopt.problem.objectives import (
     OBJECTIVES,
     AngularMomentum,
@@ -328,5 +328,5 @@ def test_a_plan_that_cannot_be_looked_at_is_not_lost(coarse: Any, monkeypatch: p
     def unreachable(*_: Any) -> MoreNodes:
         raise InputError("a leg does not reach")
 
-    monkeypatch.setattr(planner, "nodes_to_add", unreachable)
+    monkeypatch.setattr(rounds, "nodes_to_add", unreachable)
     assert planner.solve(coarse).status is Status.SOLVED

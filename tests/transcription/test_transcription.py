@@ -399,3 +399,15 @@ def test_the_soles_rows_in_contact_can_be_left_out(biped_transcription: Transcri
     names = [str(row) for row in biped_transcription.rows.origins if not in_contact(row)]
     assert [str(row) for row in without.rows.origins] == names
     assert without.program.m < biped_transcription.program.m
+
+
+def test_a_contact_is_guessed_with_integrals_of_its_own_speeds(arm_transcription: Transcription) -> None:
+    """Of the robot's coordinates, and of the target, whose state is its speed: slower at first."""
+    t = arm_transcription
+    x, hit = first_iterate(t), t.hit.expected
+    for integral, rate in (*hit.integrated(), (hit.xt, hit.state)):
+        reached, speed = integral.read(x), rate.read(x)
+        for i, s in enumerate(hit.stages):
+            so_far = sum(w * speed[m] for m, w in zip(s.members, s.quadrature, strict=True))
+            so_far = so_far + (0.0 if s.new_phase else reached[s.previous])
+            np.testing.assert_allclose(reached[i], so_far, atol=0.02 * np.abs(reached).max(), err_msg=s.name)

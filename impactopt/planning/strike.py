@@ -17,6 +17,7 @@ from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     EFFORT,
+    VIOLATED,
     Budget,
     Starts,
     check_starts,
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 ROUNDS = 6  # of more rows between bodies
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
 # solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
-BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.1, 1e-2, 1e-3
+BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.03, 1e-2, 1e-3
 # where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
 ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
@@ -155,7 +156,7 @@ def optimize_strike(
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     t, fields = solve_from(
-        t, _starts(t, given, starts, seed), budget, began, partial(clear_strike, budget, margins)
+        t, _starts(t, given, starts, seed), budget, began, partial(_clean_strike, budget, margins)
     )
     result = fields["result"] = with_reason(t, fields["result"])
     held = rattle(t, result.x) if result.status.usable else None
@@ -212,7 +213,7 @@ def clear_strike(
         more = missing_rows(t, result.x, margins)
         if not more and not rough:
             break
-        deep = bool(more) and _in_each_other(t, result.x, margins, more)
+        deep = bool(more) and _depth(t, result.x, margins, more) > 0
         finer = t.with_apart({**t.apart_rows, **more}) if more else t
         roughly = interior and deep and again > 0
         solving = _roughly(budget) if roughly else budget
@@ -232,6 +233,26 @@ def clear_strike(
     return t, result
 
 
+def _clean_strike(
+    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
+) -> tuple[StrikeTranscription, SolverResult]:
+    """As `clear_strike`; what still has bodies in each other is no solution."""
+    t, result = clear_strike(budget, margins, t, start)
+    if margins is None or not result.status.usable:
+        return t, result
+    left = missing_rows(t, result.x, margins)
+    depth = _depth(t, result.x, margins, left)
+    if depth <= 0:
+        return t, result
+    names = sorted({" and ".join(margins.bodies.names(row[1:3])) for row in left})
+    message = (
+        f"Bodies are {1e3 * depth:.1f} mm in each other, and no strike was found where they are not: "
+        f"{'; '.join(names[:3])}."
+    )
+    worst = max(result.max_violation, depth, 2 * VIOLATED)  # goes before no start that is clean
+    return t, replace(result, status=Status.FAILED, max_violation=worst, message=message)
+
+
 def _roughly(budget: Budget) -> Budget:
     """The same, content with what is nearly solved."""
     given = budget.options or {}
@@ -246,11 +267,11 @@ def _carried(new: StrikeTranscription, old: StrikeTranscription, result: SolverR
     return replace(result, x=x, multipliers=y, bound_multipliers=z)
 
 
-def _in_each_other(t: StrikeTranscription, x: Array, margins: Margins, rows: Iterable[ApartRow]) -> bool:
-    """Whether any two of these bodies are."""
+def _depth(t: StrikeTranscription, x: Array, margins: Margins, rows: Iterable[ApartRow]) -> float:
+    """[m] that any two of these bodies are in each other."""
     spots = spots_of(t, x)
     places = ((spots.names.index(row.place), (row.joint, row.other)) for row in rows)
-    return any(margins.bodies.exact(spots.at, k, pair) < 0 for k, pair in places)
+    return max((-margins.bodies.exact(spots.at, k, pair) for k, pair in places), default=0.0)
 
 
 def _settled(

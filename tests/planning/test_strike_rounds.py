@@ -75,7 +75,7 @@ def rounds(
         how = list(deep)
         monkeypatch.setattr(strikes, "rows_near", lambda *_: {})
         monkeypatch.setattr(strikes, "missing_rows", lambda *_: left.pop(0) if left else {})
-        monkeypatch.setattr(strikes, "_in_each_other", lambda *_: how.pop(0))
+        monkeypatch.setattr(strikes, "_depth", lambda *_: 0.01 * how.pop(0))
         budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
         t, result = strikes.clear_strike(budget, margins, strike, x)
         return t, result, budget.asked
@@ -145,3 +145,16 @@ def test_it_ends_with_bodies_apart_though_it_began_with_no_row_for_them(
     assert result.status is Status.SOLVED and result.kkt <= 1e-6 and result.max_violation <= 1e-6
     assert t.apart_rows and not missing_rows(t, result.x, margins)
     assert result.iterations == result.history[-1].iteration
+
+
+def test_a_strike_whose_bodies_stay_in_each_other_is_none(
+    strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = next(iter(rows_near(strike, strike_iterate(strike), Margins(strike.problem), 1.0)))
+    monkeypatch.setattr(strikes, "missing_rows", lambda *_: {row: None})
+    monkeypatch.setattr(strikes, "_depth", lambda *_: 0.012)
+    budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=(Status.SOLVED,))
+    solved = budget.run(strike.program, strike_iterate(strike))
+    monkeypatch.setattr(strikes, "clear_strike", lambda *_: (strike, solved))
+    _, result = strikes._clean_strike(budget, Margins(strike.problem), strike, strike_iterate(strike))
+    assert result.status is Status.FAILED and "12.0 mm in each other" in result.message

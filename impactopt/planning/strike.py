@@ -30,7 +30,7 @@ from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status
-from impactopt.transcription.apart import ApartRow
+from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import rattle
@@ -40,6 +40,7 @@ from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
 ROUNDS = 6  # of more rows between bodies
+AGAIN = 3  # from the start, with all rows that are known by then
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
 # solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
 BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.03, 1e-2, 1e-3
@@ -192,7 +193,11 @@ def _of_shooting(solver: str, options: Mapping[str, Any] | None) -> dict[str, An
 
 
 def clear_strike(
-    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
+    budget: Budget,
+    margins: Margins | None,
+    t: StrikeTranscription,
+    start: Array | SolverResult,
+    known: dict[ApartRow, Held] | None = None,
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
     not, and on from there; its result has the effort of all.
@@ -203,7 +208,8 @@ def clear_strike(
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
         return _settled(budget, t, budget.run(t.program, x0))
-    t = t.with_apart(rows_near(t, x0, margins, FAR))
+    known = {} if known is None else known
+    t = t.with_apart({**rows_near(t, x0, margins, FAR), **known})
     t, result = _settled(budget, t, budget.run(t.program, x0))
     exact = t, result  # the last one that is solved to its end; the others lead there
     for again in reversed(range(ROUNDS)):
@@ -214,6 +220,7 @@ def clear_strike(
         if not more and not rough:
             break
         deep = bool(more) and _depth(t, result.x, margins, more) > 0
+        known |= more
         finer = t.with_apart({**t.apart_rows, **more}) if more else t
         roughly = interior and deep and again > 0
         solving = _roughly(budget) if roughly else budget
@@ -237,13 +244,19 @@ def _clean_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """As `clear_strike`; what still has bodies in each other is no solution."""
-    t, result = clear_strike(budget, margins, t, start)
-    if margins is None or not result.status.usable:
-        return t, result
-    left = missing_rows(t, result.x, margins)
-    depth = _depth(t, result.x, margins, left)
-    if depth <= 0:
-        return t, result
+    free, known = t, dict[ApartRow, Held]()
+    for _ in range(AGAIN):
+        t, result = clear_strike(budget, margins, free, start, known)
+        if margins is None or not result.status.usable:
+            return t, result
+        left = missing_rows(t, result.x, margins)
+        depth = _depth(t, result.x, margins, left)
+        if depth <= 0:
+            return t, result
+        known |= left
+        if budget.left == 0:
+            break
+    assert margins is not None
     names = sorted({" and ".join(margins.bodies.names(row[1:3])) for row in left})
     message = (
         f"Bodies are {1e3 * depth:.1f} mm in each other, and no strike was found where they are not: "

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson
+from impactopt.cli.options import AsJson, OtherProblem
 from impactopt.report.plain_errors import plain_errors
 
 # what is done with the files where they go, said when they are written
@@ -55,9 +55,7 @@ def export(
             metavar="A,B,C", help="Order of the joints, each of the robot's once (default: the robot's own)."
         ),
     ] = None,
-    problem: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
-    ] = None,
+    problem: OtherProblem = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a plan for other programs: reference, feed-forward, gains, contact, abort motion.

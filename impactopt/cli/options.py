@@ -70,6 +70,11 @@ Settings = Annotated[
 ]
 
 
+OtherProblem = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
+]
+
+
 class SolverChoice(str, enum.Enum):
     ipopt = "ipopt"
     sqp = "sqp"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from impactopt.cli.options import OtherProblem
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
@@ -37,9 +38,7 @@ def show(
         ),
     ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
-    problem: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
-    ] = None,
+    problem: OtherProblem = None,
 ) -> None:
     """Write a result as one page: numbers, plots, the robot's motion, how it was made. It needs no network.
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from impactopt.cli.options import AsJson, Quiet, Settings, Verbose, check_loudness
+from impactopt.cli.options import AsJson, OtherProblem, Quiet, Settings, Verbose, check_loudness
 from impactopt.report.plain_errors import plain_errors
 
 FELL = 1  # exit code
@@ -41,9 +41,7 @@ def validate(
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
-    problem: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
-    ] = None,
+    problem: OtherProblem = None,
     step: Annotated[float | None, typer.Option(metavar="S", help="Step of the simulation.")] = None,
     settle: Annotated[
         float | None, typer.Option(metavar="S", help="Time that is simulated after the motion's end.")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
+from impactopt.planning.multistart import carried
 from impactopt.planning.solution import ModelError, Solved
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
@@ -25,7 +26,7 @@ from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.guess import fastest
-from impactopt.transcription.start import carried_over, strike_rates
+from impactopt.transcription.start import strike_rates
 
 Array = NDArray[np.float64]
 AnySolution = TypeVar("AnySolution", bound=Solved)
@@ -80,11 +81,7 @@ def carried_start(
     was, now = start.problem, t.problem
     if (was.collision, was.freezes) == (now.collision, now.freezes):
         return start.result
-    result, new = start.result, t.with_apart(rows)
-    x, y, z = carried_over(
-        new, old().with_apart(rows), result.x, result.multipliers, result.bound_multipliers
-    )
-    return replace(result, x=x, multipliers=y, bound_multipliers=z)
+    return carried(t.with_apart(rows), old().with_apart(rows), start.result)
 
 
 def climbed(

@@ -14,6 +14,7 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
+from impactopt.transcription.start import carried_over
 
 if TYPE_CHECKING:
     from impactopt.transcription.at_contact import ContactProgram
@@ -240,3 +241,28 @@ def one_after_the_other(old: SolverResult, new: SolverResult) -> SolverResult:
     )
     effort = {key: getattr(old, key) + getattr(new, key) for key in EFFORT}
     return replace(new, history=old.history + later, **effort)
+
+
+def with_effort_of(kept: SolverResult, last: SolverResult) -> SolverResult:
+    """A result that an earlier round had, with the effort until the last one."""
+    return replace(kept, history=last.history, **{key: getattr(last, key) for key in EFFORT})
+
+
+def carried(new: ContactProgram, old: ContactProgram, result: SolverResult) -> SolverResult:
+    """A program's result as the start of another, see `carried_over`."""
+    if new is old:
+        return result
+    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
+    return replace(result, x=x, multipliers=y, bound_multipliers=z)
+
+
+def touching(result: SolverResult, depth: float, names: Iterable[str], what: str) -> SolverResult:
+    """A result whose bodies are so deep [m] in each other: no solution.  names : of the pairs of bodies.
+
+    Where nothing else is found it is still told, but goes before no start that is clean.
+    """
+    pairs = "; ".join(sorted(set(names))[:3])
+    found = f"no {what} was found where they are not"
+    message = f"Bodies are {1e3 * depth:.1f} mm in each other, and {found}: {pairs}."
+    worst = max(result.max_violation, depth, 2 * VIOLATED)
+    return replace(result, status=Status.FAILED, max_violation=worst, message=message)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.errors import InputError
 from impactopt.planning.keeping_apart import Margins, rows_near
-from impactopt.planning.multistart import EFFORT, VIOLATED, Budget, one_after_the_other
+from impactopt.planning.multistart import Budget, carried, one_after_the_other, touching, with_effort_of
 from impactopt.planning.too_near import Violated, missing_rows, rows_to_add
 from impactopt.planning.verdict import second_look
 from impactopt.solvers.program import SolverResult, Status
@@ -193,17 +193,10 @@ class Refining:
             if left is not None and left.depth > 0:
                 if self._apart is not None:
                     before, clean = self._apart
-                    effort = {key: getattr(result, key) for key in EFFORT}
-                    return before, replace(clean, history=result.history, **effort)
+                    return before, with_effort_of(clean, result)
                 self.blocked = True
-                names = sorted(" and ".join(self.margins.bodies.names(pair)) for pair in left.pairs)
-                message = (
-                    f"Bodies are {1e3 * left.depth:.1f} mm in each other, and no solution was found where "
-                    f"they are not: {'; '.join(names[:3])}."
-                )
-                # where nothing else is found it is still told, but goes before no start that is clean
-                worst = max(result.max_violation, left.depth, 2 * VIOLATED)
-                return t, replace(result, status=Status.FAILED, max_violation=worst, message=message)
+                names = (" and ".join(self.margins.bodies.names(pair)) for pair in left.pairs)
+                return t, touching(result, left.depth, names, "solution")
         return t, result
 
     def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> Round | None:
@@ -238,15 +231,12 @@ class Refining:
             finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements, shares)
         if self.margins is not None:
             if nodes != t.nodes:
-                x, _, _ = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
-                rows = {**missing_rows(finer, x, self.margins), **rows}
+                rows = {**missing_rows(finer, carried(finer, t, old).x, self.margins), **rows}
             finer = finer.with_apart(rows)
+        # an optimum whose contact was missed is none of the finer program, nor near one
+        missed = error is not None and error.missed
         starts: tuple[Array | SolverResult, ...]
-        if error is not None and error.missed:
-            starts = (first_iterate(finer),)  # such an optimum is none of the finer program, nor near one
-        else:
-            x, y, z = carried_over(finer, t, old.x, old.multipliers, old.bound_multipliers)
-            starts = (replace(old, x=x, multipliers=y, bound_multipliers=z),)
+        starts = (first_iterate(finer) if missed else carried(finer, t, old),)
         if violated is not None and finer.layout.n == len(old.x):
             starts = (*starts, old.x, x0)
         name = more_of(nodes.total - t.nodes.total, elements, len(rows) - len(t.apart_rows))
@@ -265,8 +255,7 @@ class Refining:
         program = t.with_apart({**t.apart_rows, **violated.rows})
         words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
         round_of = partial(Round, program=program, name="rows between bodies")
-        x, y, z = carried_over(program, t, old.x, old.multipliers, old.bound_multipliers)
-        warm = replace(old, x=x, multipliers=y, bound_multipliers=z)
+        warm = carried(program, t, old)
         if violated.depth > _LOST or violated.deep & self._tried:
             self._tried = frozenset()
             why = f"{words}: from the start again, with rows between them"

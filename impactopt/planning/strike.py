@@ -16,14 +16,15 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
-    EFFORT,
-    VIOLATED,
     Budget,
     Starts,
+    carried,
     check_starts,
     drawn,
     one_after_the_other,
     solve_from,
+    touching,
+    with_effort_of,
 )
 from impactopt.planning.solution import Solved, blow_numbers, gear_caution, versions
 from impactopt.planning.too_near import missing_rows
@@ -34,7 +35,7 @@ from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import rattle
-from impactopt.transcription.start import carried_over, strike_iterate
+from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
@@ -224,15 +225,14 @@ def clear_strike(
         finer = t.with_apart({**t.apart_rows, **more}) if more else t
         roughly = interior and deep and again > 0
         solving = _roughly(budget) if roughly else budget
-        new = solving.run(finer.program, _carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
+        new = solving.run(finer.program, carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
         if new.status in _STUCK and budget.left != 0:
             roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
         steps, t, result = new.iterations, finer, one_after_the_other(result, new)
         if new.status is Status.INTERRUPTED:
             break
         if not new.status.usable:  # what is too near stays so
-            t, kept = exact
-            return t, replace(kept, history=result.history, **{k: getattr(result, k) for k in EFFORT})
+            return exact[0], with_effort_of(exact[1], result)
         if not roughly:
             exact = t, result
             if not steps:
@@ -244,9 +244,10 @@ def _clean_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """As `clear_strike`; what still has bodies in each other is no solution."""
-    free, known = t, dict[ApartRow, Held]()
+    free, known, before = t, dict[ApartRow, Held](), list[SolverResult]()
     for _ in range(AGAIN):
         t, result = clear_strike(budget, margins, free, start, known)
+        result = one_after_the_other(before.pop(), result) if before else result
         if margins is None or not result.status.usable:
             return t, result
         left = missing_rows(t, result.x, margins)
@@ -254,30 +255,18 @@ def _clean_strike(
         if depth <= 0:
             return t, result
         known |= left
+        before.append(result)
         if budget.left == 0:
             break
     assert margins is not None
-    names = sorted({" and ".join(margins.bodies.names(row[1:3])) for row in left})
-    message = (
-        f"Bodies are {1e3 * depth:.1f} mm in each other, and no strike was found where they are not: "
-        f"{'; '.join(names[:3])}."
-    )
-    worst = max(result.max_violation, depth, 2 * VIOLATED)  # goes before no start that is clean
-    return t, replace(result, status=Status.FAILED, max_violation=worst, message=message)
+    names = (" and ".join(margins.bodies.names(row[1:3])) for row in left)
+    return t, touching(result, depth, names, "strike")
 
 
 def _roughly(budget: Budget) -> Budget:
     """The same, content with what is nearly solved."""
     given = budget.options or {}
     return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in ROUGHLY.items()}})
-
-
-def _carried(new: StrikeTranscription, old: StrikeTranscription, result: SolverResult) -> SolverResult:
-    """A program's result as the start of one with more rows."""
-    if new is old:
-        return result
-    x, y, z = carried_over(new, old, result.x, result.multipliers, result.bound_multipliers)
-    return replace(result, x=x, multipliers=y, bound_multipliers=z)
 
 
 def _depth(t: StrikeTranscription, x: Array, margins: Margins, rows: Iterable[ApartRow]) -> float:
@@ -299,8 +288,7 @@ def _settled(
         functions = block_functions(t.problem, t.coordinates, None, elements)
         finer = StrikeTranscription(t.problem, t.coordinates, functions, elements, shares)
         finer = finer.with_apart(t.apart_rows)
-        x, *_ = carried_over(finer, t, result.x, result.multipliers, result.bound_multipliers)
-        new = budget.run(finer.program, x)
+        new = budget.run(finer.program, carried(finer, t, result).x)
         if not new.status.usable:
             break
         t, result = finer, one_after_the_other(result, new)

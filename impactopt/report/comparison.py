@@ -17,7 +17,7 @@ from impactopt.kinematics.support import margin
 from impactopt.report.histories import at_contact, ground_wrenches, planned_torque
 from impactopt.report.page import html_page
 from impactopt.report.report import Report
-from impactopt.report.result_rows import Cell, Row, number_row, target_rows, word_row
+from impactopt.report.result_rows import Cell, Row, blow_rows, number_row, phase_rows, word_row
 from impactopt.report.thinning import thinned
 from impactopt.simulation.result import centre_of_pressure
 
@@ -112,23 +112,10 @@ def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
         ),
     )
     replays = [s.get("replayed") or s.get("simulated") or {} for s in summaries]
-    for label, key, digits in (
-        ("impulse [N s]", "impulse_Ns", 2),
-        ("peak force [N]", "peak_force_N", 0),
-        ("contact time [ms]", "contact_ms", 1),
-        ("speed at contact [m/s]", "hand_speed_m_s", 3),
-        ("duration [s]", "duration_s", 2),
-    ):
-        yield number_row(label, [s.get(key) for s in summaries], digits)
-    yield from target_rows([s.get("target") or {} for s in summaries])
-    for label, key, digits, scale, least, most in (
-        ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
-        ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
-    ):
-        phases = dict.fromkeys(phase for s in summaries for phase in s.get(key, {}))
-        for phase in phases:
-            values = [s.get(key, {}).get(phase) for s in summaries]
-            yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
+    yield from blow_rows(summaries)
+    yield number_row("duration [s]", [s.get("duration_s") for s in summaries], 2)
+    said = [s.get(key, {}) for s in summaries for key in ("zmp_margin_m", "torque_ratio")]
+    yield from phase_rows(summaries, tuple(dict.fromkeys(phase for table in said for phase in table)))
     yield number_row("least distance of bodies [mm]", [s.get("clearance_mm") for s in summaries], 1)
     yield number_row("replayed impulse [N s]", [r.get("impulse_Ns") for r in replays], 2)
     yield number_row("replayed, largest slip of a sole [mm]", [r.get("sole_slip_mm") for r in replays], 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +13,10 @@ from impactopt.solvers.program import MINOR
 __all__ = [
     "Cell",
     "Row",
+    "blow_rows",
     "collision_rows",
     "number_row",
+    "phase_rows",
     "replay_columns",
     "result_columns",
     "result_rows",
@@ -64,21 +66,8 @@ def result_rows(columns: Columns, phases: Sequence[str] = PHASES) -> list[Row]:
 
 
 def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterator[Row | None]:
-    for label, key, digits in (
-        ("impulse [N s]", "impulse_Ns", 2),
-        ("peak force [N]", "peak_force_N", 0),
-        ("contact time [ms]", "contact_ms", 1),
-        ("speed at contact [m/s]", "hand_speed_m_s", 3),
-    ):
-        yield number_row(label, [source.get(key) for source in sources], digits)
-    yield from target_rows([source.get("target") or {} for source in sources])
-    for label, key, digits, scale, least, most in (
-        ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
-        ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
-    ):
-        for phase in phases:
-            values = [source.get(key, {}).get(phase) for source in sources]
-            yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
+    yield from blow_rows(sources)
+    yield from phase_rows(sources, phases)
     for label, key, joint, digits, most in (
         ("gear load / torque limit", "gear_ratio", "gear_joint", 2, np.inf),
         ("motor's use of its line", "motor_ratio", "motor_joint", 2, 1.0),
@@ -100,6 +89,29 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
     yield from _model_rows(sources)
     stands = [None, *(source.get("standing") for source in sources[1:])]
     yield _of_replays(word_row("stands at the end", stands, no_is_bad=True))
+
+
+def blow_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    """The blow itself, and what it has brought the target."""
+    for label, key, digits in (
+        ("impulse [N s]", "impulse_Ns", 2),
+        ("peak force [N]", "peak_force_N", 0),
+        ("contact time [ms]", "contact_ms", 1),
+        ("speed at contact [m/s]", "hand_speed_m_s", 3),
+    ):
+        yield number_row(label, [source.get(key) for source in sources], digits)
+    yield from target_rows([source.get("target") or {} for source in sources])
+
+
+def phase_rows(sources: Sequence[Mapping[str, Any]], phases: Iterable[str]) -> Iterator[Row | None]:
+    """What has its own number in each phase."""
+    for label, key, digits, scale, least, most in (
+        ("ZMP margin [mm]", "zmp_margin_m", 1, 1e3, 0.0, np.inf),
+        ("torque demand / limit", "torque_ratio", 2, 1.0, 0.0, 1.0),
+    ):
+        for phase in phases:
+            values = [source.get(key, {}).get(phase) for source in sources]
+            yield number_row(f"{label}, {phase}", values, digits, scale=scale, least=least, most=most)
 
 
 def collision_rows(found: Mapping[str, Any]) -> list[Row]:

@@ -13,15 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from impactopt import SDC, BothSoles, FixedBase, Robot, Sole, Striker, arm7
-from impactopt.collision.effects import Effects
-from impactopt.contact import FreeMass, SpringDamper
 from impactopt.kinematics.held import striking_velocity
+from impactopt.studies.bench.gains import LAW, ONLY_SERVO, TARGET, impulse_of
 
 Array = NDArray[np.float64]
-LAW, TARGET = SpringDamper(stiffness=1e5, damping=100.0), FreeMass(mass=1.0)
 NORMAL = np.array([0.6, 0.0, -0.8])
-# nothing but the servo and the contact is in them, so that point masses are exact
-SERVO = Effects(bias=False, jdot=False, saturation=False, feedforward=False)
 VIRTUAL = BothSoles(base_mass=5.0, base_inertia=0.4)
 
 
@@ -50,13 +46,6 @@ def rider() -> Robot:
     )
 
 
-def impulse_of(mass: float) -> float:
-    """[N s] of a point mass [kg] of 1 m/s: a damper in compression, none in restitution."""
-    reduced = 1 / (1 / mass + 1 / TARGET.mass)
-    z = LAW.damping / (2 * np.sqrt(LAW.stiffness * reduced))
-    return float(reduced * (1 + np.exp(-z * np.arccos(z) / np.sqrt(1 - z**2))))
-
-
 def effective_mass(robot: Robot, q: Array, striker: str, stance: Any, locked: bool) -> float:
     """[kg] of the striking point, by Pinocchio: with all joints free, or of one rigid body."""
     model = robot.model
@@ -81,7 +70,7 @@ def impulse(robot: Robot, stance: Any, q: Array, v: Array, striker: str, factor:
         law=LAW,
         target=TARGET,
         stance=stance,
-        effects=SERVO,
+        effects=ONLY_SERVO,
         kp=factor * robot.kp,
         kd=factor * robot.kd,
         accuracy=None,

@@ -538,7 +538,7 @@ def test_a_missing_package_says_how_to_get_it(
     planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
-    with pytest.raises(InputError, match=r"pip install 'impactopt\[mcap\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[mcap\]'"):
         export_planned(planned, "mcap", tmp_path / "some" / "where" / "out")
     assert list(tmp_path.iterdir()) == []
 

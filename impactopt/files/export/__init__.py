@@ -81,7 +81,7 @@ def export_planned(
     chosen = _format(to)
     content = export_of(planned, rate=chosen.rate if rate is None else rate, joints=joints)
     writer = importlib.import_module(f"impactopt.files.export.{chosen.module}")
-    return write_directory(Path(directory), to, content.meta(), lambda new: writer.write(content, new))
+    return write_directory(Path(directory), to, content.meta, lambda new: writer.write(content, new))
 
 
 def _format(to: str) -> Format:

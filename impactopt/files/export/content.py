@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,7 @@ class Export:
         """Numbers (n,) of the robot in the order of the export."""
         return np.asarray(values)[self.order]
 
+    @cached_property
     def meta(self) -> dict[str, Any]:
         """All that is no history, for `meta.json`."""
         p, robot, s = self.problem, self.robot, self.planned.record.summary

@@ -32,7 +32,7 @@ def _columns(export: Export, motion: Motion) -> dict[str, Array]:
     inside = (motion.phase == 1).astype(float)
     phase = motion.phase.astype(float)
     out: dict[str, Array] = {"time [s]": motion.time, "phase": phase, "contact": inside}
-    kinds = [joint["kind"] == "prismatic" for joint in export.meta()["joints"]]
+    kinds = [joint["kind"] == "prismatic" for joint in export.meta["joints"]]
     for what, values, turning, sliding in (
         ("position", motion.position, "rad", "m"),
         ("velocity", motion.velocity, "rad/s", "m/s"),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.errors import InputError
+from impactopt.errors import missing_package
 from impactopt.files.export.content import Export
 from impactopt.files.export.motion import Motion
 from impactopt.files.export.ros2 import stamp
@@ -73,13 +73,11 @@ def write(export: Export, directory: Path) -> None:
     try:
         from mcap_ros2.writer import Writer
     except ImportError as error:
-        raise InputError(
-            "MCAP files need the package mcap-ros2-support; run: pip install 'impactopt[mcap]'"
-        ) from error
+        raise missing_package("an MCAP file", "mcap-ros2-support", "mcap") from error
     with open(directory / "motion.mcap", "wb") as file:
         bag = Writer(file)
         schemas = {name: bag.register_msgdef(name, _definition(name)) for name in _TYPES}
-        meta = json.dumps(export.meta(), indent=2, allow_nan=False)
+        meta = json.dumps(export.meta, indent=2, allow_nan=False)
         bag.add_attachment(0, 0, "meta.json", "application/json", meta.encode())
         for topic, motion in export.motions.items():
             bag.write_message(

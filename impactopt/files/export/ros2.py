@@ -28,7 +28,7 @@ def stamp(seconds: float) -> tuple[int, int]:
 
 
 def _lines(export: Export, motion: Motion) -> Iterator[str]:
-    meta = export.meta()
+    meta = export.meta
     yield f"# {json.dumps(meta['problem'])} for {json.dumps(meta['robot'])}, {export.rate:g} Hz; SI units"
     yield f"# contact from {motion.contact_start:.9g} to {motion.contact_end:.9g} s; meta.json has the rest"
     # what is text in JSON is text in YAML, whatever is in the names

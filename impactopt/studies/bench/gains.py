@@ -19,7 +19,7 @@ from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot
 from impactopt.studies.report import Report, Say, columns_table
 
-__all__ = ["run"]
+__all__ = ["LAW", "ONLY_SERVO", "TARGET", "impulse_of", "run"]
 
 # robot: its striker, and the posture that it hits from
 BLOWS = {

@@ -217,7 +217,7 @@ def clear_strike(
         rough = result is not exact[1]
         if not result.status.usable or (budget.left == 0 and not rough):
             break
-        more = missing_rows(t, result.x, margins)
+        more = missing_rows(t, result.x, margins, all_along=True)
         if not more and not rough:
             break
         deep = bool(more) and _depth(t, result.x, margins, more) > 0
@@ -250,7 +250,7 @@ def _clean_strike(
         result = one_after_the_other(before.pop(), result) if before else result
         if margins is None or not result.status.usable:
             return t, result
-        left = missing_rows(t, result.x, margins)
+        left = missing_rows(t, result.x, margins, all_along=True)
         depth = _depth(t, result.x, margins, left)
         if depth <= 0:
             return t, result

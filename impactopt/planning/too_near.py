@@ -108,14 +108,19 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     return Violated(new, deepest, pairs, deep, nodes.all)
 
 
-def missing_rows(t: ContactProgram, x: Array, margins: Margins) -> Rows:
-    """Rows for the bodies that are too near at the places of a program themselves."""
+def missing_rows(t: ContactProgram, x: Array, margins: Margins, *, all_along: bool = False) -> Rows:
+    """Rows for the bodies that are too near at the places of a program themselves.
+
+    all_along : and for these bodies wherever they are near.
+    """
     spots, bodies = spots_of(t, x), margins.bodies
     near, wanted = bodies.near(spots.at, margins.most + bodies.slack).least(), _Wanted(t, spots, margins)
     for k, joint, other in zip(near.at, near.joint, near.other, strict=True):
         pair = bodies.known(int(joint), int(other))
         if margins.term(pair).enabled and wanted.distance(int(k), pair) < (1 - SHARE) * margins.of(pair):
             wanted.add(int(k), pair, around=False)
+    if all_along:
+        wanted.wherever_near({(row.joint, row.other) for row in wanted.rows})
     return wanted.rows
 
 

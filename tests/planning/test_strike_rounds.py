@@ -74,7 +74,7 @@ def rounds(
         left = [dict([row]) for row, _ in zip(rows, deep, strict=False)]
         how = list(deep)
         monkeypatch.setattr(strikes, "rows_near", lambda *_: {})
-        monkeypatch.setattr(strikes, "missing_rows", lambda *_: left.pop(0) if left else {})
+        monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: left.pop(0) if left else {})
         monkeypatch.setattr(strikes, "_depth", lambda *_: 0.01 * how.pop(0))
         budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
         t, result = strikes.clear_strike(budget, margins, strike, x)
@@ -151,7 +151,7 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = next(iter(rows_near(strike, strike_iterate(strike), Margins(strike.problem), 1.0)))
-    monkeypatch.setattr(strikes, "missing_rows", lambda *_: {row: None})
+    monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: {row: None})
     monkeypatch.setattr(strikes, "_depth", lambda *_: 0.012)
     budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=(Status.SOLVED,))
     solved = budget.run(strike.program, strike_iterate(strike))

@@ -1,7 +1,7 @@
 """The course of a collision: one freeze from contact to separation, or several, one after the other.
 
 With N freezes on the way, the freeze at contact only predicts. It says how long contact lasts, a trial with a
-freeze in the middle of that says it better, T, and the course is cut into N segmentes of T / N (shorter ones
+freeze in the middle of that says it better, T, and the course is cut into N segments of T / N (shorter ones
 first are no better). Each goes by a freeze at its *middle*, which the freeze before it predicts. The
 prediction's error is of second order in the segment's length, and so is that of a coefficient frozen in the
 middle: the course converges to full dynamics with 1/N^2. What lasts
@@ -74,7 +74,7 @@ def _gained(settings: Mapping[str, Any], time: Any) -> Any:
 
 
 def cuts(freezes: int) -> list[float]:
-    """Where segmentes begin and end, as fractions of the contact's duration (freezes + 1)."""
+    """Where segments begin and end, as fractions of the contact's duration (freezes + 1)."""
     return [i / freezes for i in range(freezes + 1)]
 
 
@@ -106,27 +106,27 @@ class Course:
         self._names = tuple(dict.fromkeys((*model.frozen, *wanted, *whole)))
         self._freeze = frozen.function("frozen", self._names)
 
-    def run(self, inputs: dict[str, Any], target_yield: Any) -> list[Segment]:
-        """The segmentes, in order; `inputs` are q, v, feedforward and settings by name."""
+    def run(self, inputs: dict[str, Any], target_start: Any) -> list[Segment]:
+        """The segments, in order; `inputs` are q, v, feedforward and settings by name."""
         q, v = inputs["q"], inputs["v"]
         inputs = inputs | {"joint_velocity": v[-self.frozen.robot.n :]}
-        data = relative_to(inputs, 0.0, inputs | self._frozen(q, v, inputs["normal"], target_yield))
+        data = relative_to(inputs, 0.0, inputs | self._frozen(q, v, inputs["normal"], target_start))
         if not self.freezes:
             return [self._segment(data, q, q, v, ca.MX(self.model.start()), 1.0, 0.0, record=True)]
         data |= {"velocity_before": ca.MX.zeros(self.model.n), "until": ca.MX(self.horizon)}
         guess = self._time(self._loop(data, ca.MX(self.model.start()), 1.0)[0])
-        (trial,) = self._segmentes(inputs, data, guess, [0.0, 1.0], record=False)
-        return self._segmentes(inputs, data, self._time(trial.final), cuts(self.freezes), record=True)
+        (trial,) = self._segments(inputs, data, guess, [0.0, 1.0], record=False)
+        return self._segments(inputs, data, self._time(trial.final), cuts(self.freezes), record=True)
 
-    def _segmentes(
+    def _segments(
         self, inputs: dict[str, Any], data: dict[str, Any], duration: Any, ends: list[float], *, record: bool
     ) -> list[Segment]:
-        """The segmentes between these fractions of about that duration [s]; `data` of the freeze at
+        """The segments between these fractions of about that duration [s]; `data` of the freeze at
         contact."""
         n = self.model.n
         q, v = inputs["q"], inputs["v"]
         start = ca.MX(self.model.start())
-        segmentes: list[Segment] = []
+        segments: list[Segment] = []
         reached, frozen_at, contact = start, q, ca.MX(1.0)
         for a, b in pairwise(ends):
             last = b == ends[-1]
@@ -134,10 +134,10 @@ class Course:
             ahead = data | {"until": self._time(reached) + duration * (b - a) / 2}
             middle = self._loop(ahead, reached, (b - a) / 2)[0]
             q_middle, v_middle = self._moved(data, frozen_at, q, v, middle)
-            if segmentes:
-                q, v = segmentes[-1].q_after(), segmentes[-1].v_after()
+            if segments:
+                q, v = segments[-1].q_after(), segments[-1].v_after()
             frozen_at = q_middle
-            data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], GIVES_WAY)
+            data = inputs | self._frozen(q_middle, v_middle, inputs["normal"], ca.DM([GIVES_WAY, 0.0]))
             data = relative_to(inputs, duration * (a + b) / 2, data)
             data["hand_speed"] = self.frozen.speed_of_hand(q, v, inputs["normal"])
             data["velocity_before"] = (v - inputs["v"])[-n:]
@@ -149,14 +149,14 @@ class Course:
             data["until"] = ca.if_else(contact, length, -1.0)
             share = 1.0 if last else b - a
             begin = (start, share, duration * a)
-            segmentes.append(self._segment(data, frozen_at, q, v, *begin, record=record))
-            reached = segmentes[-1].final
+            segments.append(self._segment(data, frozen_at, q, v, *begin, record=record))
+            reached = segments[-1].final
             start = self._handed_on(reached)
             contact *= self.model.phase(reached, data)[1]
-        return segmentes
+        return segments
 
-    def _frozen(self, q: Any, v: Any, normal: Any, target_yield: Any) -> dict[str, Any]:
-        return dict(zip(self._names, self._freeze.call([q, v, normal, target_yield]), strict=True))
+    def _frozen(self, q: Any, v: Any, normal: Any, target_start: Any) -> dict[str, Any]:
+        return dict(zip(self._names, self._freeze.call([q, v, normal, target_start]), strict=True))
 
     def _segment(
         self,

@@ -57,13 +57,13 @@ class FrozenDynamics:
         self.held = stance.constraint_frames(robot)
         self.soles = stance.sole_frames(robot)
         self.q, self.v = ca.MX.sym("q", robot.nq), ca.MX.sym("v", robot.nv)
-        self.normal, self.target_yield = ca.MX.sym("normal", 3), ca.MX.sym("target_yield")
+        self.normal, self.target_start = ca.MX.sym("normal", 3), ca.MX.sym("target_start", 2)
         self._tree = _TreeQuantities(robot, self.held, self.soles, frame)
         self._gamma = ca.diag(ca.repmat(ca.DM(stance.compliance), len(self.held), 1))
 
     def function(self, name: str, outputs: tuple[str, ...]) -> Any:
-        """ca.Function (q (nq), v (nv), normal (3), target's yield) -> the named attributes of this class."""
-        inputs = {"q": self.q, "v": self.v, "normal": self.normal, "target_yield": self.target_yield}
+        """ca.Function (q (nq), v (nv), normal (3), `target_start` (2)) -> these attributes of this class."""
+        inputs = {"q": self.q, "v": self.v, "normal": self.normal, "target_start": self.target_start}
         out = [ca.densify(getattr(self, key)) for key in outputs]
         return ca.Function(name, list(inputs.values()), out, list(inputs), list(outputs))
 
@@ -83,7 +83,8 @@ class FrozenDynamics:
             return self.v
         w, z = self._roots, self._held
         inner = w["hand"] - ca.mtimes(w["held"], ca.mtimes(self._cholesky.T, z["hand"]))
-        impulse = ca.fmax(self.hand_speed, 0.0) / (self.m + self.target_yield)
+        closing = self.hand_speed - self.target_start[1]
+        impulse = ca.fmax(closing, 0.0) / (self.m + self.target_start[0])
         return self.v - ca.mtimes(self._inverse_root.T, inner) * impulse
 
     # ------------------------------------------------------------ inverse inertias

@@ -26,7 +26,7 @@ __all__ = [
     "frozen_dynamics",
     "gradient_graph",
     "joint_space_model",
-    "target_yield",
+    "target_start",
 ]
 
 # where steps find their own length
@@ -59,15 +59,18 @@ def frozen_dynamics(collision: SteppedModel) -> FrozenDynamics:
     return FrozenDynamics(collision.robot, collision.held_by, frame, bias=effects.bias, jdot=effects.jdot)
 
 
-def target_yield(target: Target, numbers: dict[str, Any]) -> Any:
-    """[1/kg] acceleration of the target's surface per contact force, at rest: one over a free mass."""
+def target_start(target: Target, numbers: dict[str, Any]) -> Any:
+    """(2) of the target's surface where contact begins: acceleration per contact force [1/kg], which is one
+    over a free mass; speed along the normal [m/s].
+    """
     z, f = ca.SX.sym("z", target.n_states), ca.SX.sym("f")
     symbols = {name: ca.SX.sym(name) for name in numbers}
     states = [z[i] for i in range(target.n_states)]
     rates = ca.vertcat(ca.SX(0, 1), *target.derivative(states, f, symbols))
     acceleration = ca.mtimes(ca.jacobian(ca.SX(target.velocity(states, symbols)), z), rates)
     slope = ca.densify(ca.jacobian(acceleration, f))
-    function = ca.Function("target_yield", [z, f, *symbols.values()], [slope])
+    start = ca.vertcat(slope, ca.densify(ca.SX(target.velocity(states, symbols))))
+    function = ca.Function("target_start", [z, f, *symbols.values()], [start])
     return function(ca.DM.zeros(target.n_states), 0.0, *numbers.values())
 
 
@@ -120,9 +123,9 @@ def _expressions(
         freezes=collision.n_freezes,
         wanted=frozen_for(outputs),
     )
-    gives_way = target_yield(model.target, model.target_numbers(inputs))
-    segmentes = course.run(inputs, gives_way)
-    made = Outputs(model, segmentes, len(frozen.soles), len(frozen.held), inputs["v"])
+    gives_way = target_start(model.target, model.target_numbers(inputs))
+    segments = course.run(inputs, gives_way)
+    made = Outputs(model, segments, len(frozen.soles), len(frozen.held), inputs["v"])
     return inputs, [ca.densify(getattr(made, output)) for output in outputs]
 
 

@@ -93,7 +93,7 @@ class Outputs:
     Parameters
     ----------
     model : the collision in joint space.
-    segmentes : what each freeze has led to.
+    segments : what each freeze has led to.
     soles, held : number of held soles, and of all that is held, the soles first.
     v : velocity at contact (nv).
     """
@@ -101,13 +101,13 @@ class Outputs:
     def __init__(
         self,
         model: JointSpaceModel,
-        segmentes: list[Segment],
+        segments: list[Segment],
         soles: int,
         held: int,
         v: Any,
     ) -> None:
-        self._model, self._segmentes, self._last = model, segmentes, segmentes[-1]
-        self._instants = [Instants(model, segment, soles, held, v) for segment in segmentes]
+        self._model, self._segments, self._last = model, segments, segments[-1]
+        self._instants = [Instants(model, segment, soles, held, v) for segment in segments]
 
     def __getattr__(self, name: str) -> Any:
         if name not in HISTORIES:
@@ -116,7 +116,7 @@ class Outputs:
         return rows.T if rows.size1() == 1 else rows
 
     def _sum(self, part: str) -> Any:
-        return sum(self._model.part(segment.final, part) for segment in self._segmentes)
+        return sum(self._model.part(segment.final, part) for segment in self._segments)
 
     @cached_property
     def impulse(self) -> Any:
@@ -152,7 +152,7 @@ class Outputs:
     def separated(self) -> Any:
         """No longer in contact at the end of any freeze."""
         contact = ca.MX(1.0)
-        for segment in self._segmentes:
+        for segment in self._segments:
             contact *= self._model.phase(segment.final, segment.data)[1]
         return 1 - contact
 

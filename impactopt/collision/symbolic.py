@@ -17,7 +17,7 @@ from impactopt.collision.checks import breaks, check_course, check_finite, left_
 from impactopt.collision.derivatives import differentiable
 from impactopt.collision.describe import Description, describe
 from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
-from impactopt.collision.graph import collision_graph, target_yield
+from impactopt.collision.graph import collision_graph, target_start
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
 from impactopt.collision.outputs import OF_SERVO, SCALARS, check_jacobian, check_outputs
 from impactopt.collision.result import Collision
@@ -316,7 +316,7 @@ class SymbolicModel(SteppedModel):
             error += float(left_out_by_breaking(self, result.impulse, outputs["target_result"][:, 0], force))
         # of a plastic blow, where the contact is broken off before
         numbers = {name: values[f"target_{name}"] for name in self.target.parameters}
-        yields = float(frozen["m"].item()) + float(target_yield(self.target, numbers))
+        yields = float(frozen["m"].item()) + float(target_start(self.target, numbers)[0])
         plastic = float(result.hand_speed[0] - result.target_speed[0]) / max(yields, 1e-300)
         check_course(self, result, error * result.impulse / max(result.impulse, plastic, 1e-300))
         return result

@@ -18,7 +18,7 @@ from impactopt.transcription.at_contact import ContactProgram
 
 Array = NDArray[np.float64]
 Rows = dict[ApartRow, Held]
-AFTER = 2  # phase after contact
+WITHIN, AFTER = 1, 2  # phases in and after contact
 NEAR = 0.15  # [m] nearer bodies get a row
 OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no more
 BETWEEN = 4  # joints at least between two links that get a row because they are near
@@ -153,7 +153,7 @@ def spots_of(t: ContactProgram, x: Array) -> Spots:
     """All places of a program with coordinates and legs."""
     states = t.body_states(x)
     phase, time = np.array([s.phase for s in states], dtype=np.intp), np.array([s.time for s in states])
-    travel = np.where(phase == AFTER, t.travel(x, time), 0.0)
+    travel = np.where(phase == WITHIN, 0.0, t.travel(x, time))
     q = np.array([s.q for s in states])
     return Spots(names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impactopt.files.output import Record
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation.result import centre_of_pressure
+from impactopt.simulation.result import centre_of_pressure, travelled
 
 __all__ = ["AROUND", "FAR", "Track", "planned_hand_speed", "tracks_of"]
 
@@ -82,8 +82,7 @@ def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Tr
     else:
         q, force = a[f"{prefix}_q"][chosen], a[f"{prefix}_force"][chosen]
         wrench, speed = a[f"{prefix}_sole_ground"].sum(axis=1)[chosen], a[f"{prefix}_target_speed"]
-    steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2
-    travel = np.concatenate([[0.0], np.cumsum(steps)])
+    travel = travelled(time, speed, start)
     if prefix == "reference" and record.summary.get("target", {}).get("broken", 1.0) < 0.5:
         travel[time > end] = 0.0  # a board that holds springs back
     travel = travel[chosen]
@@ -158,7 +157,7 @@ def _predicted(record: Record, chosen: NDArray[np.intp]) -> tuple[Array, Array, 
         at = hit[-len(ground) :]
         wrench[contact] = np.column_stack([np.interp(since[chosen][contact], at, w) for w in ground.T])
     force = np.where(contact, np.interp(since[chosen], hit, a["collision_force"]), 0.0)
-    speed = np.interp(since, hit, a["collision_target_speed"], left=0.0)
+    speed = np.interp(since, hit, a["collision_target_speed"])
     if "depth_m" in record.summary.get("target", {}):  # a nail stays in its wood
         speed = np.where(since > hit[-1], 0.0, speed)
     return wrench, force, speed

@@ -23,12 +23,10 @@ def with_clearance(problem: ImpactProblem, simulation: Simulation) -> Simulation
     itself.
     """
     time = simulation.time
-    steps = np.diff(time) * (simulation.target_speed[1:] + simulation.target_speed[:-1]) / 2
-    travel = np.concatenate([[0.0], np.cumsum(steps)])
     _, chosen = np.unique(np.floor(time / STEP), return_index=True)
     phase = np.full(len(time), MISSED) if simulation.missed else simulation.phase()
     bodies = problem.bodies
-    at = Places.of(problem.robot, simulation.q[chosen], travel[chosen], phase[chosen])
+    at = Places.of(problem.robot, simulation.q[chosen], simulation.travel()[chosen], phase[chosen])
     found = bodies.survey(time[chosen], at)
     touched = simulation.touched
     if simulation.fall is None or not problem.keeps_apart:  # this replay's robot has no solids

@@ -45,7 +45,8 @@ class _Replay(MujocoRobot):
         self.besides = Besides(self.world, solids)
         self.follow(reference)
         self.struck = Struck(self.scene)
-        self.target, self.travel = self.struck.at_rest, 0.0  # the target's state, and how far it has gone [m]
+        # the target's state, and how far it has gone [m]
+        self.target, self.travel = self.struck.untouched, self.struck.travel_at_start(reference)
         # its depth at the end of a step in contact; of the step before, hand speed and force
         self.kept: float | None = None
         self.before: tuple[float, float] | None = None

@@ -153,7 +153,8 @@ def simulate_pinocchio(
     """
     world = _World(robot, scene, reference)
     struck = world.struck
-    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), 0.0, struck.at_rest, 0.0)
+    start_travel = struck.travel_at_start(reference)
+    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), start_travel, struck.untouched, 0.0)
     left = state.target  # as the last touch has left it
     end = min(float(reference.end) + settle, until)
     rows: list[tuple[Any, ...]] = []

@@ -52,13 +52,19 @@ REPORT = (
 )
 
 
+def travelled(time: Array, speed: Array, contact_start: float) -> Array:
+    """(k,) [m] that something with these speeds [m/s] has gone since contact began; nan: since the start."""
+    gone = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
+    return gone - np.interp(contact_start, time, gone) if np.isfinite(contact_start) else gone
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scene:
     """The target, its contact and the ground.
 
-    point (3,) [m], normal (3,): where the target's surface is at rest, and the way it is pushed; law, target:
-    the contact's force and the target's motion; striker: frame of the model that hits; soles: frames of the
-    model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
+    point (3,) [m], normal (3,): where the target's surface is to be hit, and the way it is pushed; law,
+    target: the contact's force and the target's motion; striker: frame of the model that hits; soles: frames
+    of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
     counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
     else can touch.
     """
@@ -152,6 +158,10 @@ class Simulation:
     def sole_cop(self) -> Array:
         """Centre of pressure (k, soles, 2) [m] of each sole, world; nan where it does not press."""
         return centre_of_pressure(self.sole_ground)
+
+    def travel(self) -> Array:
+        """(k,) [m] of the target along its normal, from where contact began."""
+        return travelled(self.time, self.target_speed, self.contact_start)
 
     def phase(self) -> NDArray[np.intp]:
         """0 swing, 1 collision, 2 follow-through, by the contact that happened."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,18 +42,22 @@ class Push:
 
 
 class Struck:
-    """The scene's law and target, evaluated. A target's state is (n_states,), zero at rest.
+    """The scene's law and target, evaluated. A target's state is (n_states,), zero before contact.
 
     Targets know their speed only; how far one has gone is the engine's to integrate.
     """
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.law, self.target = scene, scene.law, scene.target
-        self.at_rest: Array = np.zeros(self.target.n_states)
+        self.untouched: Array = np.zeros(self.target.n_states)
 
     def speed(self, state: Array) -> float:
         """[m/s] of the hit surface along the normal."""
         return float(self.target.velocity(state))
+
+    def travel_at_start(self, reference: Any) -> float:
+        """[m] that it has to go until contact is planned, below zero, as it moves before contact already."""
+        return -self.speed(self.untouched) * float(reference.contact_start)
 
     def depth(self, place: Array, travel: float) -> float:
         """[m] of a striking point at a place (3,) [m] in a target that has gone so far [m]; beside its face

@@ -24,9 +24,10 @@ def add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase) -> None:
         motions += [follow.at(s)[0] for s in after]
     first = b.add_block("approach", [[y] for y in motions], p.normal)
     ahead = float(np.mean(p.swing.duration))
-    plane = Affine.constant(float(p.normal @ p.point))
-    spots = [(first + i, swing.place_at(s), (1 - s) * ahead) for i, s in enumerate(before)]
-    _add_rows(b, "no touch before contact", spots, plane)
+    there, coming = float(p.normal @ p.point), float(p.target.speed_before())
+    for i, s in enumerate(before):
+        plane = Affine.constant(there) - swing.T[0] * (coming * (1 - s))
+        _add_rows(b, "no touch before contact", [(first + i, swing.place_at(s), (1 - s) * ahead)], plane)
     if not p.target.stays:
         return
     # the striker has left the target where it is then; a nail that coasts on only makes room

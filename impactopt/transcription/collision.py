@@ -370,7 +370,8 @@ class Collision(Collocated):
         b, target = self._b, self._b.problem.target
         durations = [float(g.read(x)[0, 0]) for g in self.T]
         time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
-        first, wrench = float(b.problem.law.branch(0.0, approach, True, self.law)), self.w.read(x)
+        before = float(target.speed_before(self.target))
+        first, wrench = float(b.problem.law.branch(0.0, approach - before, True, self.law)), self.w.read(x)
         start = self.number * len(self.stages)  # of its instances in the blocks
         of_stages = slice(start, start + len(self.stages))
         torque = outputs["collision"][of_stages, b.parts("collision")["torque"]]
@@ -378,7 +379,7 @@ class Collision(Collocated):
         return PlannedCollision(
             time=np.array([0.0, *time]),
             force=np.array([first, *self.f.read(x)[:, 0]]),
-            target_speed=np.array([0.0, *speed]),
+            target_speed=np.array([before, *speed]),
             torque=np.vstack([self._feedforward().evaluate(x), torque]) * b.robot.torque_limit,
             sole_wrench=wrench,
             ground=total_ground_wrench(b.coordinates, wrench),

@@ -263,8 +263,8 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
 
     z = y; legs; u0 (ydot) at contact; its change; impulsive sole wrenches [N s, N m s]; impulse I [N s].
     p = normal (3); 1 for a given restitution, 0 for that of the contact law; that restitution; stiffness
-        [N/m], damping [N s/m] of the law; 1/mass of the target [1/kg]; torque limits (n); weight [N];
-        lever [m].
+        [N/m], damping [N s/m] of the law; 1/mass of the target [1/kg], its speed before [m/s]; torque limits
+        (n); weight [N]; lever [m].
     out = base rows, joint rows (over torque limit), separation against approach [m/s].
     """
     ny, n = c.ny, c.robot.n
@@ -272,6 +272,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     legs, w, blow = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("I")
     normal, rigid, given = ca.SX.sym("n", 3), ca.SX.sym("rigid"), ca.SX.sym("e")
     stiffness, damping, inverse_mass = ca.SX.sym("k"), ca.SX.sym("d"), ca.SX.sym("im")
+    before = ca.SX.sym("before")
     limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
     q, push = _pushed(c, striker, y, legs, normal)
     change = c.velocity(y, legs, du)
@@ -279,7 +280,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     lost = -ca.dot(
         push, change
     )  # speed that the impulse takes from the hand; I over it is the effective mass
-    approach = ca.dot(push, c.velocity(y, legs, u0))
+    approach = ca.dot(push, c.velocity(y, legs, u0)) - before
     stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
     e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
     out = {
@@ -287,7 +288,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
         "joints": balance[c.base :] / (0.1 * limit),
         "blow": blow * inverse_mass + lost - (1 + e) * approach,
     }
-    p = [normal, rigid, given, stiffness, damping, inverse_mass, limit, weight, lever]
+    p = [normal, rigid, given, stiffness, damping, inverse_mass, before, limit, weight, lever]
     return make_block([y, legs, u0, du, w, blow], p, out, lanes=2)
 
 
@@ -296,7 +297,8 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
 
     What changes is linear in the force: H da = J_c' dw - j' f, the frozen part of equation (6).
     z = y, legs, u0 (ydot) at contact; change of ydd; of the sole wrenches (6 a sole); f [N].
-    p = normal (3), the law's parameters, armature (n), torque limits (n), weight [N], lever [m].
+    p = normal (3), the law's parameters, the target's speed before [m/s], armature (n), torque limits (n),
+        weight [N], lever [m].
     out = base rows, joint rows over torque limit, (f - law) / 100 N, torque that the rotors take off the
         gears, over limit: -armature x acceleration.
     """
@@ -305,7 +307,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     legs, w, f = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("f")
     normal, of_law = ca.SX.sym("n", 3), ca.SX.sym("law", len(law.parameters))
     armature, limit = ca.SX.sym("armature", n), ca.SX.sym("limit", n)
-    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    weight, lever, before = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("before")
     q, push = _pushed(c, striker, y, legs, normal)
     jump = c.velocity(y, legs, change)
     balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(legs, w)
@@ -314,10 +316,10 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     out = {
         "base": balance[: c.base] / base_scale(c, weight, lever),
         "joints": balance[c.base :] / limit,
-        "law": (f - law.branch(0.0, ca.dot(push, v), True, named)) / FORCE_SCALE,
+        "law": (f - law.branch(0.0, ca.dot(push, v) - before, True, named)) / FORCE_SCALE,
         "rotors": -armature * (a + jump)[c.base :] / limit,
     }
-    z, p = [y, legs, u0, change, w, f], [normal, of_law, armature, limit, weight, lever]
+    z, p = [y, legs, u0, change, w, f], [normal, of_law, before, armature, limit, weight, lever]
     return make_block(z, p, out, lanes=2)
 
 

@@ -45,7 +45,8 @@ class FirstInstant:
         b, state = self._b, self.contact.state
         slots = [state.y, state.legs, self.contact.u0[0], self.change[0], self.w[0], self.f[0]]
         law, robot = np.array([*self.law.values()]), b.robot
-        numbers = [b.problem.normal, law, robot.armature, robot.torque_limit, b.limits.units]
+        before = [float(b.problem.target.speed_before())]
+        numbers = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
         return slots, np.concatenate(numbers)
 
     def add_rows(self, at: int) -> None:
@@ -93,7 +94,7 @@ def jump(
     pin.updateFramePlacements(model, data)
     axes = pin.LOCAL_WORLD_ALIGNED
     row = problem.normal @ np.reshape(pin.getFrameJacobian(model, data, hand, axes), (6, model.nv))[:3]
-    force = float(law.branch(0.0, float(row @ v), True))
+    force = float(law.branch(0.0, float(row @ v - problem.target.speed_before()), True))
     both = np.linalg.solve(inertia, np.column_stack([soles.T, -force * row]))
     spread, free = both[:, :-1], both[:, -1]
     w: Array = np.zeros(0)

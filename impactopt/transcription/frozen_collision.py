@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.collision.graph import target_yield
+from impactopt.collision.graph import target_start
 from impactopt.solvers.program import Determined
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -78,7 +78,7 @@ class FrozenCollision(Collision):
         self.carried = add("sole wrench that carries", carried, b.nw, **b.limits.of_wrenches)
         self._meeting: InstantImpact | None = None
         if self.effects.jdot and not self.freezes:
-            gives_way = float(target_yield(b.problem.target, self.target))
+            gives_way = float(target_start(b.problem.target, self.target)[0])
             mass = 1 / gives_way if gives_way > 0 else np.inf
             self._meeting = InstantImpact(b, contact, mass=mass, named=f"{self._named}meeting: ")
         self._segments = [self._segment(s) for s in stages]

@@ -28,6 +28,7 @@ AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as 
 # the blow is made harder until a board breaks, or a nail moves; and softer, where contact is so stiff that
 # a harder one has hammer and nail part before the nail stands
 FASTER, TRIES = 1.3, 12
+CLOSING = 0.5  # [m/s] at which what moves away is met, at least
 DECADES = range(1, 5)  # of stiffness that are tried where bodies part too early
 # a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
 # robot's; and the shortest blow [s] that it stands for
@@ -145,8 +146,10 @@ def blow(
 ) -> Blow:
     """A point mass [kg] that meets the target at a speed [m/s], at points ``place`` in [0, 1] of phases.
 
-    A target with events is met as fast, or as slowly, as it takes for all of them to happen.
+    A target with events is met as fast, or as slowly, as it takes for all of them to happen, and one that
+    moves away no slower than it goes.
     """
+    speed = max(speed, float(target.speed_before()) + CLOSING)
     for k in range(2 * TRIES if target.guards else 1):
         at = speed * FASTER ** ((k + 1) // 2 * (1 if k % 2 else -1))
         time, rows = _histories(law, target, mass, at)
@@ -166,7 +169,7 @@ def blow(
     x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
     state = sample(rows[3:-1]) if target.n_states else np.zeros((len(times), 0))
     if isinstance(target, FreeMass) and ends[-1] > SOFT:
-        return push(target.mass, phase, place)
+        return push(target, phase, place)
     return Blow(
         durations=np.diff(ends),
         speed=np.interp(times, time, v) / v[0],
@@ -184,8 +187,8 @@ def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
     return blow(law, target, mass, 1.0, np.arange(phases, dtype=np.intp), np.ones(phases)).durations
 
 
-def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
-    """A uniform force on a free mass [kg].
+def push(target: FreeMass, phase: NDArray[np.intp], place: Array) -> Blow:
+    """A uniform force on a free mass.
 
     Where a contact with one is soft, plans with much else to meet converge more surely from here than from
     its true blow.
@@ -195,7 +198,7 @@ def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
     elapsed = before + place * PUSH[phase]
     fraction = elapsed / total
     ramp = (before / total + fraction) / 2 * place * PUSH[phase]  # the fraction's integral in the phase
-    force = np.full(len(phase), mass * PUSHED / total)
+    force = np.full(len(phase), target.mass * PUSHED / total)
     return Blow(
         durations=PUSH,
         speed=1 - (1 - LEFT) * fraction,
@@ -203,7 +206,7 @@ def push(mass: float, phase: NDArray[np.intp], place: Array) -> Blow:
         force=force,
         impulse=force * elapsed,
         state=PUSHED * fraction[:, None],
-        travel=PUSHED * ramp,
+        travel=PUSHED * ramp + target.initial_velocity * place * PUSH[phase],
     )
 
 

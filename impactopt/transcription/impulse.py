@@ -35,6 +35,7 @@ class InstantImpact:
         self.target = b.problem.target
         # a wall takes any impulse without moving
         self.mass = self.target.parameters.get("mass", np.inf) if mass is None else mass
+        self.before = float(self.target.speed_before())
 
         def add(name: str, size: int, **options: Any) -> Group:
             return b.layout.add(named + name, 1, size, **options)
@@ -60,7 +61,7 @@ class InstantImpact:
         slots = [state.y, state.legs, self.contact.u0[0], self.du[0], self.w[0], self.blow[0]]
         rigid = float(self._meets or p.collision == "rigid")
         law = [p.law.parameters.get(name, 1.0) for name in ("stiffness", "damping")]
-        numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass]
+        numbers = [*p.normal, rigid, p.coefficient_of_restitution, *law, 1 / self.mass, self.before]
         return {"impact": ([slots], [np.concatenate([numbers, b.robot.torque_limit, b.limits.units])])}
 
     def determined(self) -> list[Determined]:
@@ -110,12 +111,12 @@ class InstantImpact:
 
     def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
         b = self._b
-        speed = float(self.blow.read(x)[0, 0]) / self.mass
-        outcome = self.target.outcome([speed] * self.target.n_states)
+        gained = float(self.blow.read(x)[0, 0]) / self.mass
+        outcome = self.target.outcome([gained] * self.target.n_states)
         return PlannedCollision(
             time=np.zeros(2),
             force=np.zeros(2),
-            target_speed=np.array([0.0, speed]),
+            target_speed=self.before + np.array([0.0, gained]),
             outcome=outcome,
             torque=np.repeat(self.contact.feedforward.read(x), 2, axis=0) * b.robot.torque_limit,
             sole_wrench=np.zeros((0, b.nw)),

@@ -298,7 +298,7 @@ class Plan:
     def travel(self, time: Array) -> Array:
         """How far (k,) [m] the target has gone along the normal at times [s] since the motion's start.
 
-        After contact a free one goes on as fast as it is then.
+        Before contact it comes as fast as it does then, and after it a free one goes on so.
         """
         hit, since = self.collision, np.asarray(time) - self.contact_start
         if len(hit.time) < 2:
@@ -307,7 +307,9 @@ class Plan:
             [[0.0], np.cumsum(np.diff(hit.time) * (hit.target_speed[1:] + hit.target_speed[:-1]) / 2)]
         )
         last = 0.0 if self.problem.target.stays else float(hit.target_speed[-1])
-        return np.interp(since, hit.time, gone, left=0.0) + last * np.maximum(since - hit.time[-1], 0.0)
+        before = float(self.problem.target.speed_before()) * np.minimum(since, 0.0)
+        within = np.interp(since, hit.time, gone, left=0.0)
+        return before + within + last * np.maximum(since - hit.time[-1], 0.0)
 
     def _closed(self, y: Array) -> Array:
         """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""

@@ -37,7 +37,7 @@ def add_touch_rows(b: Builder, state: ContactState) -> None:
         place="contact",
         components=["normal"],
         outputs=np.array([at + 3]),
-        lower=0.05,
+        lower=0.05 + float(p.target.speed_before()),
         measure=Measure("m/s", 1.0, "too slow"),
     )
     if p.extra(HitCone) is None:

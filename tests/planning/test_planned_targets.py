@@ -33,9 +33,10 @@ from impactopt.contact import (
 from impactopt.errors import InputError
 from impactopt.kinematics.splines import Radau
 from impactopt.kinematics.stance import FixedBase
-from impactopt.problem.objectives import Penetration
+from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import TargetSpeed
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Determined, Status, check_program
 from impactopt.solvers.sqp.condense import Condenser, find_eliminations
@@ -376,3 +377,67 @@ def test_a_power_as_a_user_writes_it_is_planned_with(target: Target) -> None:
 def test_a_class_that_is_no_number_below_zero_is_refused() -> None:
     with pytest.raises(InputError, match=r"the law Rubber has no finite .* 0 mm.*impactopt\.contact\.power"):
         problem(Rubber(), FreeMass(mass=1.0))
+
+
+# ---- targets that move before contact
+
+
+def ball(before: float, **options: Any) -> ImpactProblem:
+    law = HuntCrossley(stiffness=3e6, dissipation=0.1)
+    return problem(law, FreeMass(mass=0.5, initial_velocity=before), **options)
+
+
+@pytest.mark.parametrize("before", [-4.0, 0.3])
+def test_a_target_that_comes_or_goes_is_hit_as_the_collision_models_say(before: float) -> None:
+    plan = solved(ball(before))
+    assert plan.impulse == pytest.approx(integrated(plan).impulse, rel=5e-4)
+    gained = plan.collision.outcome["speed_m_s"] - before
+    assert 0.5 * gained == pytest.approx(plan.impulse, rel=1e-6)
+    assert plan.collision.target_speed[0] == before
+
+
+@pytest.mark.parametrize("collision", ["rigid", "virtual-mass"])
+def test_an_impact_without_duration_knows_how_fast_the_target_comes(collision: str) -> None:
+    """Two masses, closed form: (1 + e) mu times the difference of their speeds."""
+    p = problem(
+        SpringDamper(stiffness=1e5, damping=0.0),
+        FreeMass(mass=0.5, initial_velocity=-4.0),
+        collision=collision,
+        coefficient_of_restitution=0.5 if collision == "rigid" else 0.0,
+    )
+    plan = solved(p)
+    e = 0.5 if collision == "rigid" else 1.0
+    mu = MASS * 0.5 / (MASS + 0.5)
+    assert plan.impulse == pytest.approx((1 + e) * mu * (plan.hand_speed + 4.0), rel=1e-6)
+    assert plan.collision.outcome["speed_m_s"] == pytest.approx(plan.impulse / 0.5 - 4.0)
+
+
+def test_the_striker_keeps_behind_a_target_that_goes_before_it() -> None:
+    """Its plane is where it is then: 0.3 m/s for 0.5 s are half of the way."""
+    plan = solved(ball(0.3))
+    time = np.linspace(0.0, plan.contact_start - 1e-3, 200)
+    hand = plan.independent(0, time)[0][:, 0]
+    surface = 0.3 + plan.travel(time)
+    assert surface[0] == pytest.approx(0.15)
+    assert (hand <= surface + 1e-6).all()
+    assert hand.max() < 0.3
+
+
+def test_what_comes_is_caught_if_its_speed_after_contact_is_to_be_none() -> None:
+    """The impulse is the mass's momentum, whatever the hand does, and the hand gives way for it."""
+    p = ball(-1.0, objectives=(PeakForce(weight=-0.01),))
+    p = dataclasses.replace(p, terms=(*p.terms, TargetSpeed(least=-1e-3, most=1e-3)))
+    plan = solved(p)
+    assert plan.impulse == pytest.approx(0.5, abs=1e-3)
+    assert plan.hand_speed < 0
+
+
+def test_a_bound_on_the_targets_speed_is_kept_and_one_of_nothing_is_none() -> None:
+    free = solved(ball(-2.0)).collision.outcome["speed_m_s"]
+    p = ball(-2.0)
+    slower = solved(dataclasses.replace(p, terms=(*p.terms, TargetSpeed(most=0.8 * free))))
+    assert slower.collision.outcome["speed_m_s"] <= 0.8 * free + 1e-6
+    with pytest.raises(InputError, match="bounds nothing"):
+        TargetSpeed()
+    with pytest.raises(InputError, match="swap"):
+        TargetSpeed(least=1.0, most=0.0)

@@ -8,13 +8,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from impactopt.collision import SDC
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 
 
 def _frozen(model: SDC, q: Any, v: Any, values: dict[str, Any]) -> dict[str, Any]:
     function = frozen_dynamics(model).function("frozen", joint_space_model(model).frozen)
     numbers = {name: float(values[f"target_{name}"]) for name in model.target.parameters}
-    found = function.call([q, v, values["normal"], target_yield(model.target, numbers)])
+    found = function.call([q, v, values["normal"], target_start(model.target, numbers)])
     return {name: np.array(x) for name, x in zip(function.name_out(), found, strict=True)}
 
 

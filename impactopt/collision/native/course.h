@@ -100,8 +100,8 @@ typedef struct {
 } Course;
 
 #if FREEZES
-/* from contact, over n segmentes of about that duration at all; the freeze at contact is in w */
-static void segmentes(const double **arg, Work *w, Course *c, double duration, int n, Record *recorded) {
+/* from contact, over n segments of about that duration at all; the freeze at contact is in w */
+static void segments(const double **arg, Work *w, Course *c, double duration, int n, Record *recorded) {
   Frozen *F = &w->frozen;
   Data *d = &w->data;
   const double *q = filled(arg[ARG_q], w->q, NQ), *v = filled(arg[ARG_v], w->v, NV);
@@ -126,7 +126,7 @@ static void segmentes(const double **arg, Work *w, Course *c, double duration, i
       memcpy(c->q, q_then, sizeof c->q);
       memcpy(c->v, v_then, sizeof c->v);
     }
-    freeze(q_middle, v_middle, normal, GIVES_WAY, F);
+    freeze(q_middle, v_middle, normal, GIVES_WAY, 0.0, F);
     follow(arg, duration * (begin + end) / 2, duration * begin, w);
     const double *in[] = {c->q, c->v, normal};
     double *out[] = {&d->hand_speed};
@@ -164,7 +164,7 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   Record recorded = {.out = res, .v = v, .columns = N_COLUMNS[0]};
   Record *record = HISTORIES ? &recorded : 0;
   load_data(arg, d);
-  freeze(q, v, normal, call(target_yield, d->target, 0, 0), F);
+  freeze(q, v, normal, call(target_yield, d->target, 0, 0), call(target_before, d->target, 0, 0), F);
   follow(arg, 0.0, 0.0, w);
   d->frozen = F;
   d->hand_speed = F->hand_speed;
@@ -182,9 +182,9 @@ static void collide(const double **arg, double **res, Work *w, Course *c) {
   run(d, &reached, STEPS_AT_ALL, 0, &w->tape);
   w->frozen_at_contact = *F;
   w->data_at_contact = *d;
-  segmentes(arg, w, c, reached.time, 1, 0);
+  segments(arg, w, c, reached.time, 1, 0);
   *F = w->frozen_at_contact;
   *d = w->data_at_contact;
-  segmentes(arg, w, c, c->duration, FREEZES, record);
+  segments(arg, w, c, c->duration, FREEZES, record);
 #endif
 }

@@ -2,7 +2,7 @@
    nothing: (q, v[, feedforward], settings) -> of each output, by each of these inputs, its Jacobian: a row for each of
    its entries column by column, a column for each of the input's; q's are in v's basis, as `integrate` moves it.
 
-   For what tangents do not carry: freezes on the way, whose places depend on the segmentes before, and settings. Left
+   For what tangents do not carry: freezes on the way, whose places depend on the segments before, and settings. Left
    out is a sixth of the square of DIFFERENCE times the third derivative, and what rounding and the steps leave, over
    DIFFERENCE. Where an output has a kink between the two ends, it is the mean of both slopes. */
 

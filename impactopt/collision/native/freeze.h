@@ -15,7 +15,7 @@ typedef struct {
   double push[C1];      /* R^-1 (acceleration of what is held if it were free) */
   double bias_root[NV];
   double drift_velocity[NV];
-  double hand_speed;
+  double hand_speed, closing; /* of the hand, and against the target, both along the normal */
   double soles[AT_LEAST_1(3 * SOLES)];
   double unmodelled[6];
   int spoiled;          /* whether rounding has spoilt it */
@@ -128,8 +128,7 @@ static void meeting(const double *v, double yields, Frozen *F) {
   vec held_y[VC];
   pad(held_y, VC, y, C, 0.0);
   const double *of_hand = (const double *)F->Q[N];
-  const double approach = F->hand_speed < 0.0 ? 0.0 : F->hand_speed;
-  const double impulse = approach / (of_hand[N] + yields);
+  const double impulse = (F->closing < 0.0 ? 0.0 : F->closing) / (of_hand[N] + yields);
   FOR(r, NV - N) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   FOR(i, NV - N) FOR(r, i + 1) F->drift_velocity[i] -= ((double *)F->root[r])[COLUMN(i)] * inner[r] * impulse;
   FOR(j, N) F->drift_velocity[NV - N + j] -= of_hand[j] * impulse;
@@ -205,8 +204,10 @@ static void no_number_of_spoiled(Frozen *F) {
   FOR(j, N + 1) FOR(i, V) F->Q[j][i] = (vec){0} + NAN;
 }
 
-static void freeze(const double *q, const double *v, const double *normal, double yields, Frozen *F) {
+static void freeze(const double *q, const double *v, const double *normal, double yields, double before,
+                   Frozen *F) {
   roots(q, v, normal, F);
+  F->closing = F->hand_speed - before;
   hold(F);
   inverse_inertia(F);
   no_number_of_spoiled(F);

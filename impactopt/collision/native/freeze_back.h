@@ -71,10 +71,10 @@ static void drifts_back(const double *q, const double *normal, double yields, co
   FOR(r, NV) inner[r] = ((double *)F->root[r])[N] - dot(F->held[r], held_y, VC);
   times_root_transposed(F, inner, change);
   const double yielding = ((double *)F->Q[N])[N] + yields;
-  const double impulse = (F->hand_speed >= 0.0 ? F->hand_speed : 0.0) / yielding;
+  const double impulse = (F->closing >= 0.0 ? F->closing : 0.0) / yielding;
   double by_impulse = 0.0, by_inner[NV];
   FOR(i, NV) by_impulse -= change[i] * by_v[i], by_v[i] *= -impulse;
-  if (F->hand_speed >= 0.0) all->hand_speed += by_impulse / yielding;
+  if (F->closing >= 0.0) all->hand_speed += by_impulse / yielding;
   ((double *)all->Q[N])[N] -= by_impulse * impulse / yielding;
   to_columns(by_v, by_change);
   times_root(F, by_change, by_inner);

@@ -91,7 +91,7 @@ static void inverse_inertia_forward(const Frozen *F, FreezeForward *w) {
 static void meeting_forward(double yields, const Frozen *F, const FreezeForward *w, vec velocity[2][NV][VD]) {
   const FrozenTangent *t = &w->frozen;
   const double yielding = ((double *)F->Q[N])[N] + yields;
-  const double impulse = (F->hand_speed < 0.0 ? 0.0 : F->hand_speed) / yielding;
+  const double impulse = (F->closing < 0.0 ? 0.0 : F->closing) / yielding;
   double inner[NV], change[NV];
   vec hand[NV][VD];
   FOR(r, NV) {
@@ -114,7 +114,7 @@ static void meeting_forward(double yields, const Frozen *F, const FreezeForward 
   FOR(kind, 2) {
     vec more[VD];
     FOR_EACH(k) {
-      more[k] = either(F->hand_speed < 0.0, (vec){0}, t->hand_speed[kind][k] / yielding);
+      more[k] = either(F->closing < 0.0, (vec){0}, t->hand_speed[kind][k] / yielding);
       if (kind == BY_Q) more[k] -= t->Q[N][N][k] * (impulse / yielding);
     }
     FOR(i, NV) FOR_EACH(k) velocity[kind][i][k] -= change[i] * more[k];

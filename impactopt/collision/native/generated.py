@@ -10,7 +10,7 @@ import casadi as ca
 
 from impactopt.collision.contact_slopes import contact_functions
 from impactopt.collision.frozen import FrozenDynamics
-from impactopt.collision.graph import target_yield
+from impactopt.collision.graph import target_start
 from impactopt.collision.model import JointSpaceModel
 from impactopt.contact import ContactLaw
 from impactopt.kinematics.stance import Stance
@@ -88,7 +88,7 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         left_force (x, rate, law) : above zero while contact lasts in restitution
         contact_force (x, rate, law) -> force
         target_velocity (z, target), target_rates (z, force, target), target_energy, target_result (z, target)
-        target_yield (target)
+        target_yield, target_before (target): the numbers of `target_start`
     """
     law_numbers, target_numbers = list(model.law.parameters), list(model.target.parameters)
     law, target = ca.SX.sym("law", len(law_numbers)), ca.SX.sym("target", len(target_numbers))
@@ -103,6 +103,7 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
     def column(values: Any) -> Any:
         return ca.densify(ca.vertcat(ca.SX(0, 1), *values))
 
+    start = target_start(thing, of_target)
     functions = [
         ca.Function("left_force", [x, rate, law], [_number(left(x, rate, of_law))]),
         ca.Function("contact_force", [x, rate, law], [model.law.force(x, rate, of_law)]),
@@ -110,7 +111,8 @@ def scalar_functions(model: JointSpaceModel, *, method: str) -> list[Any]:
         ca.Function("target_rates", [z, force, target], [column(thing.derivative(states, force, of_target))]),
         ca.Function("target_energy", [z, target], [_number(thing.energy(states, of_target))]),
         ca.Function("target_result", [z, target], [column(thing.result(states, of_target))]),
-        ca.Function("target_yield", [target], [_number(target_yield(thing, of_target))]),
+        ca.Function("target_yield", [target], [_number(start[0])]),
+        ca.Function("target_before", [target], [_number(start[1])]),
     ]
     return functions + (contact_functions(model.law, model.target) if method == "implicit" else [])
 

@@ -88,7 +88,7 @@ def _rows(collision: SteppedModel, history: str) -> int:
 
 
 def _ends(collision: SteppedModel) -> list[float]:
-    """Where segmentes end, as fractions of the contact's duration."""
+    """Where segments end, as fractions of the contact's duration."""
     return cuts(max(collision.n_freezes, 1))
 
 

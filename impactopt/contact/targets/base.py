@@ -18,12 +18,12 @@ UNITS = {"speed": "m_s", "depth": "m"}  # of targets' results
 
 
 class Target(Described, ABC):
-    """Something that is hit, at rest when contact begins; motion is along the contact normal only.
+    """Something that is hit; motion is along the contact normal only. Before contact its speed is constant.
 
     To write one, make a frozen dataclass whose fields are its numbers, and give the methods below. They have
     to be smooth, except where one of `switches` changes its sign. `state` is a column of `n_states` numbers
-    or CasADi symbols; it is zero at rest. Fields with `impactopt.contact.fields.about` as metadata are
-    checked when a target is made.
+    or CasADi symbols; it is zero when contact begins. Fields with
+    `impactopt.contact.fields.about` as metadata are checked when a target is made.
 
     Attributes
     ----------
@@ -69,13 +69,17 @@ class Target(Described, ABC):
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
         """Velocity of the hit surface along the normal [m/s]."""
 
+    def speed_before(self, parameters: Parameters | None = None) -> Any:
+        """Velocity of the surface along the normal [m/s] before contact, and when it begins; 0: at rest."""
+        return self.velocity([0.0] * self.n_states, parameters)
+
     @abstractmethod
     def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
         """d(state)/dt, a list of `n_states` expressions, under the contact force [N]."""
 
     @abstractmethod
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Energy [J] that the target has taken: what it holds, and the work done in it, as against wood."""
+        """Energy [J] that the target has taken: its own, and the work done in it, as against wood."""
 
     def switches(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
         """Expressions whose changes of sign split the motion into smooth modes; steps end there."""

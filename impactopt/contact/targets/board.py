@@ -18,8 +18,9 @@ class Board(Target):
 
     m dv/dt = f - k w - d v up to the deflection w = breaking_force / k, and m dv/dt = f beyond it, where its
     two halves are a free mass. As f >= 0, and v > 0 at the break, the deflection never comes back: a broken
-    board stays broken. The state is (v, w). Its result is `broken`: 1 if the board broke before separation,
-    else 0. A board that swings on and breaks after separation counts as not broken.
+    board stays broken. The state is (v, w). A board that is swung at the striker moves with its holders at
+    the initial velocity, and v and w are against them. Its result is `broken`: 1 if the board broke before
+    separation, else 0. A board that swings on and breaks after separation counts as not broken.
 
     Source: lowest mode of a brittle beam, as in Walker, "Karate strikes", Am. J. Phys. 43 (1975) 845-849.
     """
@@ -29,6 +30,12 @@ class Board(Target):
     stiffness: float = field(metadata=about("stiffness of the bending", unit="N/m", above=0))
     breaking_force: float = field(metadata=about("spring force at which it breaks", unit="N", above=0))
     damping: float = field(default=0.0, metadata=about("damping of the bending", unit="N s/m", least=0))
+    initial_velocity: float = field(
+        default=0.0,
+        metadata=about(
+            "velocity along the normal before contact; below zero: towards the striker", unit="m/s"
+        ),
+    )
 
     n_states = 2
     results: ClassVar[tuple[str, ...]] = ("broken",)
@@ -37,7 +44,8 @@ class Board(Target):
     phases: ClassVar[tuple[str, ...]] = ("compression", "compression after the break", "restitution")
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
-        return state[0]
+        p = self.parameters if parameters is None else parameters
+        return p["initial_velocity"] + state[0]
 
     def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
         p = self.parameters if parameters is None else parameters
@@ -51,7 +59,7 @@ class Board(Target):
         """On its spring until it breaks, free after that."""
         p = self.parameters if parameters is None else parameters
         bending = p["stiffness"] * state[1] + p["damping"] * state[0]
-        return state[0], [(force - (0.0 if phase else bending)) / p["mass"], state[0]]
+        return self.velocity(state, p), [(force - (0.0 if phase else bending)) / p["mass"], state[0]]
 
     def guard(
         self, state: Any, force: Any, late: Any, phase: int, parameters: Parameters | None = None
@@ -74,11 +82,13 @@ class Board(Target):
         return [self._beyond(state, self.parameters if parameters is None else parameters)]
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
-        """Kinetic energy, and that of bending; after the break the energy that breaking took."""
+        """Kinetic energy gained, and that of bending; after the break the energy that breaking took."""
         p = self.parameters if parameters is None else parameters
         beyond, at_break = self._beyond(state, p), p["breaking_force"] / p["stiffness"]
         bent = choose(beyond > 0, at_break + 0.0 * beyond, state[1])
-        return 0.5 * p["mass"] * state[0] ** 2 + 0.5 * p["stiffness"] * bent**2
+        return (
+            p["mass"] * state[0] * (p["initial_velocity"] + 0.5 * state[0]) + 0.5 * p["stiffness"] * bent**2
+        )
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         p = self.parameters if parameters is None else parameters

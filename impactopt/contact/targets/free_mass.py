@@ -16,18 +16,25 @@ __all__ = ["FreeMass"]
 class FreeMass(Target):
     """A mass that moves freely along the normal.
 
-    A point mass (paper, figs. 1 and 9); its state is its velocity. Its result is `speed` [m/s], after the
-    blow.
+    A point mass (paper, figs. 1 and 9); its state is the change of its velocity. It may come with a velocity,
+    as a ball does. Its result is `speed` [m/s], after the blow.
     """
 
     word: ClassVar[str] = "free mass"
     mass: float = field(metadata=about("mass of the target", unit="kg", above=0))
+    initial_velocity: float = field(
+        default=0.0,
+        metadata=about(
+            "velocity along the normal before contact; below zero: towards the striker", unit="m/s"
+        ),
+    )
 
     n_states = 1
     results: ClassVar[tuple[str, ...]] = ("speed",)
 
     def velocity(self, state: Any, parameters: Parameters | None = None) -> Any:
-        return state[0]
+        p = self.parameters if parameters is None else parameters
+        return p["initial_velocity"] + state[0]
 
     def derivative(self, state: Any, force: Any, parameters: Parameters | None = None) -> list[Any]:
         p = self.parameters if parameters is None else parameters
@@ -35,7 +42,7 @@ class FreeMass(Target):
 
     def energy(self, state: Any, parameters: Parameters | None = None) -> Any:
         p = self.parameters if parameters is None else parameters
-        return 0.5 * p["mass"] * state[0] ** 2
+        return p["mass"] * state[0] * (p["initial_velocity"] + 0.5 * state[0])
 
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
-        return [state[0]]
+        return [self.velocity(state, parameters)]

@@ -60,6 +60,8 @@ def write(export: Export, directory: Path) -> None:
             f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
             "know the laws and targets of problem files: export to csv instead"
         )
+    if isinstance(p.target, Board) and p.target.initial_velocity:
+        raise InputError("mujoco: the scene's board stands still before contact; export to csv instead")
     try:
         with no_log_file():
             _write_scene(export, directory)
@@ -221,6 +223,7 @@ def _add_keyframes(spec: Any, export: Export) -> None:
     """`start`, at rest, and `contact`, as planned just before it."""
     motion, model = export.motion, spec.compile()
     at_contact = int(np.flatnonzero(motion.phase == 0)[-1])
+    coming = float(export.problem.target.speed_before())
     for name, k in (("start", 0), ("contact", at_contact)):
         qpos, qvel = np.zeros(model.nq), np.zeros(model.nv)
         for column, joint in enumerate(export.joints):
@@ -230,6 +233,9 @@ def _add_keyframes(spec: Any, export: Export) -> None:
             qpos[:3], qpos[3:7] = base.position[k], base.quaternion[k]
             turned = pin.Quaternion(*base.quaternion[k]).toRotationMatrix()
             qvel[:3], qvel[3:6] = base.linear[k], turned.T @ base.angular[k]
+        if coming:
+            slide, until = model.joint("target"), float(motion.time[k]) - motion.contact_start
+            qpos[slide.qposadr[0]], qvel[slide.dofadr[0]] = coming * until, coming
         spec.add_key(name=name, qpos=qpos, qvel=qvel, time=float(motion.time[k]))
 
 

@@ -20,6 +20,7 @@ from impactopt.problem.terms.motor_curve import MotorCurve
 from impactopt.problem.terms.position_limit import PositionLimit
 from impactopt.problem.terms.power_limit import PowerLimit
 from impactopt.problem.terms.self_collision import SelfCollision
+from impactopt.problem.terms.target_speed import TargetSpeed
 from impactopt.problem.terms.torque_limit import TorqueLimit
 from impactopt.problem.terms.torque_rate import TorqueRate
 from impactopt.problem.terms.velocity_jump import VelocityJump
@@ -49,6 +50,7 @@ TERMS: tuple[type[Term], ...] = (
     MotorCurve,
     PowerLimit,
     VelocityJump,
+    TargetSpeed,
 )
 
 __all__ = [
@@ -69,6 +71,7 @@ __all__ = [
     "PositionLimit",
     "PowerLimit",
     "SelfCollision",
+    "TargetSpeed",
     "Term",
     "TorqueLimit",
     "TorqueRate",

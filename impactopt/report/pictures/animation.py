@@ -74,8 +74,7 @@ class _Drawing:
         self.striker = model.getFrameId(self.scene.striker)
         chain = set(model.supports[model.frames[self.striker].parentJoint])
         self.strikes = np.array([j in chain for _, j in self.links])
-        steps = np.diff(self.sim.time) * (self.sim.target_speed[1:] + self.sim.target_speed[:-1]) / 2
-        self.travel = np.concatenate([[0.0], np.cumsum(steps)])
+        self.travel = self.sim.travel()
         self.figure = Figure(figsize=(9.4, 4.2), dpi=80)
         self.canvas: Any = FigureCanvasAgg(self.figure)
         self.panels: list[Any] = []

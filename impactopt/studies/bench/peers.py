@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.collision import Collision
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 from impactopt.collision.runge_kutta import rate_of_change
 from impactopt.simulation.mujoco_world import mujoco_module, no_log_file
 from impactopt.simulation.pinocchio_robot import PinocchioBody
@@ -142,7 +142,7 @@ def cvodes(setup: Setup, duration: float, tolerance: float) -> tuple[Callable[[]
     options = {"reltol": tolerance, "abstol": 1e-2 * tolerance, "max_num_steps": 100_000}
     solver = ca.integrator("collision", "cvodes", problem, 0.0, duration, options)
     freeze = frozen_dynamics(sdc).function("frozen", model.frozen)
-    yields = target_yield(model.target, model.target_numbers(dict(sdc.settings)))
+    yields = target_start(model.target, model.target_numbers(dict(sdc.settings)))
     frozen = dict(zip(freeze.name_out(), freeze.call([case.q, case.v, case.normal, yields]), strict=True))
     known = {**frozen, **sdc.settings, "feedforward": case.torque}
     p = ca.vertcat(*[ca.vec(ca.DM(known[name])) for name in data])

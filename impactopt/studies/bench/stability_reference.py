@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 from impactopt.collision.symbolic import SymbolicModel
 from impactopt.contact import Board, FreeMass
 from impactopt.errors import InputError
@@ -97,7 +97,7 @@ def frozen_numbers(model: SymbolicModel, q: Array, v: Array, values: dict[str, A
     """What is frozen at contact, by name."""
     function = _freeze(model)
     numbers = {name: float(values[f"target_{name}"]) for name in model.target.parameters}
-    found = function(q, v, values["normal"], target_yield(model.target, numbers))
+    found = function(q, v, values["normal"], target_start(model.target, numbers))
     return {name: np.array(x) for name, x in zip(function.name_out(), found, strict=True)}
 
 

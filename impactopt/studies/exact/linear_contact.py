@@ -83,13 +83,14 @@ def target_modes(target: Target, p: Mapping[str, float]) -> tuple[TargetMode, ..
         )
     if isinstance(target, Board):
         k, d, m = p["stiffness"], p["damping"], p["mass"]
+        surface = np.array([1.0, 0.0, 0.0, p["initial_velocity"]])
         v, w = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0, 0.0])
         bent = np.array([[-d / m, -k / m, 1 / m, 0.0], v])
         free = np.array([[0.0, 0.0, 1 / m, 0.0], v])
         limit = (-np.inf, p["breaking_force"] / k)
         return (
-            TargetMode(derivative=bent, velocity=v, watched=w, bounds=limit, following=1),
-            TargetMode(derivative=free, velocity=v),
+            TargetMode(derivative=bent, velocity=surface, watched=w, bounds=limit, following=1),
+            TargetMode(derivative=free, velocity=surface),
         )
     return (_smooth_target(target, p),)
 

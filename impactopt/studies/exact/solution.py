@@ -20,7 +20,7 @@ from scipy.linalg import expm
 
 from impactopt.collision.bernstein import bernstein_matrix, first_negative, largest
 from impactopt.collision.course import Segment, relative_to
-from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_yield
+from impactopt.collision.graph import frozen_dynamics, joint_space_model, target_start
 from impactopt.collision.outputs import Outputs, frozen_for
 from impactopt.collision.result import Collision
 from impactopt.collision.stepped import SteppedModel
@@ -92,7 +92,7 @@ class ExactCollision:
     def __call__(self, q: Array, v: Array, torque: Array | None, values: dict[str, Array]) -> Collision:
         """Of all of the model's settings, by name."""
         model, collision = self.model, self.collision
-        gives_way = target_yield(model.target, model.target_numbers(values))
+        gives_way = target_start(model.target, model.target_numbers(values))
         found = self._freeze.call([ca.DM(x) for x in (q, v, values["normal"], gives_way)])
         data: dict[str, Any] = dict(zip(self._freeze.name_out(), found, strict=True))
         data |= {"q": q, "v": v, "joint_velocity": v[-collision.robot.n :], **values}

@@ -72,14 +72,14 @@ def measure(robot: Robot, q: Array, v: Array, striker: str, *, full: bool = True
     """
     sdc = SDC.paper(robot, striker=striker, normal=[1.0, 0.0, 0.0])
     freeze, steps = _sdc_functions(sdc)
-    numbers = {**sdc.settings, "target_yield": np.array(0.2)}
-    frozen = freeze.call([q, v, numbers["normal"], numbers["target_yield"]])
+    numbers = {**sdc.settings, "target_start": np.array([0.2, 0.0])}
+    frozen = freeze.call([q, v, numbers["normal"], numbers["target_start"]])
     frozen = [np.array(x)[:, :1] for x in frozen]
     start = np.zeros(steps.size1_in(0))
     given = dict(zip(freeze.name_out(), frozen, strict=True)) | dict(sdc.settings)
     tau = np.zeros(robot.n)
     runs: dict[str, Callable[[], Any]] = {
-        "freeze": runner(freeze, [_many(x) for x in (q, v, numbers["normal"], numbers["target_yield"])]),
+        "freeze": runner(freeze, [_many(x) for x in (q, v, numbers["normal"], numbers["target_start"])]),
         "stage": runner(steps, [start, *(given[name] for name in steps.name_in()[1:])]),
         **_pinocchio(robot.model, q, v),
     }

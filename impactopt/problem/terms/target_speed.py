@@ -1,0 +1,60 @@
+"""How fast the target is after the blow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.contact.targets.base import Target
+from impactopt.errors import InputError
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import Measure
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetSpeed(Term):
+    """The target's speed at separation is bounded.
+
+    Along the normal: what comes towards the striker has one below zero. Zero at both ends is a catch.
+    """
+
+    name: ClassVar[str] = "target speed"
+    unit: ClassVar[str] = "m/s"
+    least: float | None = field(default=None, metadata=about("smallest speed", unit="m/s"))
+    most: float | None = field(default=None, metadata=about("largest speed", unit="m/s"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.least is None and self.most is None:
+            raise InputError("TargetSpeed bounds nothing: give least, most, or both [m/s]")
+        if self.least is not None and self.most is not None and self.least > self.most:
+            raise InputError(f"TargetSpeed: least is {self.least:g} m/s, most {self.most:g} m/s; swap them")
+
+    def blocks(self, problem: Any, coordinates: Any) -> dict[str, BlockRecipe]:
+        return {"target_speed": BlockRecipe(lambda: speed(problem.target), problem.target.formula())}
+
+    def add_rows(self, program: Any) -> None:
+        target = program.problem.target
+        numbers = np.array(list(target.parameters.values()))
+        at = program.add_block("target_speed", [[program.expected.target_state]], numbers)
+        program.rows.add(
+            term=self.name,
+            place="separation",
+            components=["normal"],
+            outputs=np.array([at]),
+            lower=-np.inf if self.least is None else self.least,
+            upper=np.inf if self.most is None else self.most,
+            measure=Measure("m/s", 1.0, "off"),
+        )
+
+
+def speed(target: Target) -> BlockExpression:
+    """z = the target's state;  p = its numbers;  out = speed of its surface along the normal [m/s]."""
+    state, numbers = ca.SX.sym("state", target.n_states), ca.SX.sym("numbers", len(target.parameters))
+    named = {name: numbers[i] for i, name in enumerate(target.parameters)}
+    return make_block([state], [numbers], {"speed": ca.SX(target.velocity(state, named))}, lanes=2)

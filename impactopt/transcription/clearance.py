@@ -24,9 +24,9 @@ def add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase) -> None:
         motions += [follow.at(s)[0] for s in after]
     first = b.add_block("approach", [[y] for y in motions], p.normal)
     ahead = float(np.mean(p.swing.duration))
-    there, coming = float(p.normal @ p.point), float(p.target.speed_before())
+    surface, coming = Affine.constant(float(p.normal @ p.point)), float(p.target.speed_before())
     for i, s in enumerate(before):
-        plane = Affine.constant(there) - swing.T[0] * (coming * (1 - s))
+        plane = surface - swing.T[0] * (coming * (1 - s))
         _add_rows(b, "no touch before contact", [(first + i, swing.place_at(s), (1 - s) * ahead)], plane)
     if not p.target.stays:
         return

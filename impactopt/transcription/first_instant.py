@@ -45,7 +45,7 @@ class FirstInstant:
         b, state = self._b, self.contact.state
         slots = [state.y, state.legs, self.contact.u0[0], self.change[0], self.w[0], self.f[0]]
         law, robot = np.array([*self.law.values()]), b.robot
-        before = [float(b.problem.target.speed_before())]
+        before = np.array([float(b.problem.target.speed_before())])
         numbers = [b.problem.normal, law, before, robot.armature, robot.torque_limit, b.limits.units]
         return slots, np.concatenate(numbers)
 

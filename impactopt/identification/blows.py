@@ -70,19 +70,22 @@ def find_blows(log: ImpactLog) -> tuple[Blow, ...]:
             "force on the target counts along the blow: turn its sign"
         )
     # unlike a blow, noise is as often below the median as above
-    if peak <= 0 or peak - np.median(log.force) < 4 * max(noise, np.median(log.force) - log.force.min()):
+    middle = float(np.median(log.force))
+    if peak <= 0 or peak - middle < max(6 * noise, 2 * (middle - float(log.force.min()))):
         raise InputError(f"{name}: no contact: {FORCE} is at most {peak:.4g} N, which its noise is too")
-    inside = log.force > max(_LEAST * peak, 6 * noise)
-    spans = [span for span in _spans(inside) if log.force[slice(*span)].max() > _SMALL * peak]
+    spans = _spans(log.force, max(_LEAST * peak, 4.5 * noise))
+    spans = [span for span in spans if log.force[slice(*span)].max() > _SMALL * peak]
     return tuple(_blow(log, span, spans, noise) for span in spans)
 
 
-def _spans(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """(begin, end) of what is in contact; gaps of a sample or two are noise."""
+def _spans(force: Array, least: float) -> list[tuple[int, int]]:
+    """(begin, end) of what is above a force [N]; gaps of a sample or two, or with force in them, are noise."""
+    inside = force > least
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
     spans: list[tuple[int, int]] = []
     for begin, end in edges.reshape(-1, 2):
-        if spans and begin - spans[-1][1] <= 2:
+        gap = force[spans[-1][1] : begin] if spans else force
+        if spans and (len(gap) <= 2 or gap.mean() > least / 2):
             spans[-1] = (spans[-1][0], int(end))
         else:
             spans.append((int(begin), int(end)))

@@ -79,7 +79,7 @@ def find_blows(log: ImpactLog) -> tuple[Blow, ...]:
 
 
 def _spans(force: Array, least: float) -> list[tuple[int, int]]:
-    """(begin, end) of what is above a force [N]; gaps of a sample or two, or with force in them, are noise."""
+    """(begin, end) of what is above a force [N]; gaps are noise if they are short, or have force in them."""
     inside = force > least
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
     spans: list[tuple[int, int]] = []

@@ -105,7 +105,7 @@ def _blow(log: ImpactLog, span: tuple[int, int], spans: list[tuple[int, int]], n
     if begin == 0 or end == len(t):
         raise InputError(
             f"{where}: the log {'begins' if begin == 0 else 'ends'} in contact; it has to begin before the "
-            "touch, and to end after the hand has left"
+            "touch, and to end after the hand has left; take an offset off the force first"
         )
     duration = float(t[end] - t[begin])
     if duration > _LONGEST:

@@ -75,8 +75,8 @@ class _Fit:
     @property
     def bounds(self) -> tuple[Array, Array]:
         low = [each.lower for each in self.free]
-        high = [np.inf] * len(self.free)
-        high[-1] = np.log(0.5 * HEAVIEST_HAND / self.free[-1].scale)
+        high = [each.upper for each in self.free]
+        high[-1] = min(high[-1], float(np.log(0.5 * HEAVIEST_HAND / self.free[-1].scale)))
         for k in range(len(self.blows)):
             places = [self._scaled(k, touch) for touch in self.touches[k]]
             low += [0.1, places[0], -np.inf][: self.own]

@@ -147,7 +147,10 @@ def _numbers(cells: list[str]) -> Array:
 
 def _npz(file: Path, name: str) -> dict[str, Array]:
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        loaded = np.load(file, allow_pickle=False)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise ValueError("a single array")
+        with loaded as arrays:
             found = {key: arrays[key] for key in arrays.files}
     except OSError as error:
         raise InputError(f"{name}: cannot be read: {error.strerror or error}") from None

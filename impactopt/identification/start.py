@@ -18,6 +18,7 @@ __all__ = ["MASS", "Free", "free_numbers", "sample_law", "starts"]
 
 Array = NDArray[np.float64]
 MASS = "effective_mass"
+_FARTHEST = 14.0  # a factor of a million from a start
 _NOTHING = 1e-9  # of a scale: laws refuse numbers that are nearly 0
 # of what a start is tried with: stiffness and mass, as factors; dampers, as a share of the force
 _FACTORS, _SHARES = (0.3, 1.0, 3.0), (0.03, 0.3, 0.8)
@@ -33,9 +34,15 @@ class Free:
     logarithmic: bool
     lower: float = -np.inf
 
+    @property
+    def upper(self) -> float:
+        """Bound of z."""
+        return _FARTHEST if self.logarithmic else np.inf
+
     def number(self, z: Array) -> Array:
         if self.logarithmic:
-            return np.asarray(self.scale * np.exp(z))
+            with np.errstate(over="ignore"):  # the end of an interval may be nowhere
+                return np.asarray(self.scale * np.exp(z))
         return np.asarray(self.scale * np.where(np.abs(z) < _NOTHING, 0.0, z))
 
     def place(self, number: float) -> float:
@@ -57,14 +64,14 @@ def free_numbers(law: ContactLaw, blow: Blow) -> tuple[Free, ...]:
     ------
     InputError : a number of one's own law is 0, which says nothing of its size.
     """
-    mass = Free(MASS, "kg", blow.mass, True)
+    mass = Free(MASS, "kg", blow.mass, True, -_FARTHEST)
     if isinstance(law, CustomLaw) or "stiffness" not in law.parameters:
         return (*_own(law), mass)
     units = {f.name: told.unit for f, told in abouts(type(law)) if f.name not in _defaulted(type(law))}
     stiff, out = _stiffness(law, blow, units), []
     for name, unit in units.items():
         if name == "stiffness":
-            out.append(Free(name, unit, stiff, True))
+            out.append(Free(name, unit, stiff, True, -_FARTHEST))
         else:
             out.append(Free(name, unit, _damper(law, blow, name, stiff, units), False, 0.0))
     return (*out, mass)

@@ -192,6 +192,7 @@ def test_logs_that_cannot_be_used_are_refused() -> None:
         ({"force": 1e-6 * f}, "as of a mass of"),
         ({"time": np.zeros(0), "force": np.zeros(0), "speed": np.zeros(0)}, "is empty"),
         ({"time": t[210:], "force": f[210:], "speed": v[210:]}, "begins in contact"),
+        ({"force": f + 200.0}, "take an offset off"),
         ({"time": t[:300], "force": f[:300], "speed": v[:300]}, "ends in contact"),
         ({"time": t[::40], "force": f[::40], "speed": v[::40]}, "samples in contact"),
         ({"speed": None}, "one of them"),
@@ -237,6 +238,10 @@ def test_files_that_are_no_logs_are_refused(tmp_path: Path, text: str, message: 
     (tmp_path / "bad.npz").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="no npz file"):
         read_log(tmp_path / "bad.npz")
+    with open(tmp_path / "one.npz", "wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(InputError, match="a single array"):
+        read_log(tmp_path / "one.npz")
 
 
 # ---------------------------------------------------------------- command

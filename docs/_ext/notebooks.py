@@ -22,7 +22,8 @@ They are in `notebooks/`. `make notebooks` executes them, and these pages then s
 
 def gather(app: Sphinx, config: Config) -> None:
     """Copy what is newer, and drop pages whose notebook is gone."""
-    sources = {file.name: file for file in sorted((ROOT / "notebooks").glob("*.ipynb"))}
+    found = sorted((ROOT / "notebooks").glob("*.ipynb"), key=lambda file: int(file.name.split("_")[0]))
+    sources = {file.name: file for file in found}
     PAGES.mkdir(exist_ok=True)
     for page in PAGES.glob("*.ipynb"):
         if page.name not in sources:

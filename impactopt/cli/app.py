@@ -19,6 +19,7 @@ from impactopt.cli.compare import compare
 from impactopt.cli.drive import drive
 from impactopt.cli.export import export
 from impactopt.cli.files import check, new, problems, robots
+from impactopt.cli.identify import identify
 from impactopt.cli.options import (
     NOT_SOLVED,
     AsJson,
@@ -200,6 +201,13 @@ app.command(
         "impactopt export results/punch --to mujoco",
     )
 )(export)
+app.command(
+    epilog=examples(
+        "impactopt identify blow.csv",
+        "impactopt identify blows.npz --target-mass 2 --out contact.toml",
+        "impactopt identify joints.csv --problem arm7 --law Hunt-Crossley --json",
+    )
+)(identify)
 app.command(epilog=examples("impactopt drive arm7 --depth 0.05"))(drive)
 app.command(
     epilog=examples(

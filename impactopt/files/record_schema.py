@@ -69,6 +69,7 @@ _TOUCHES: _Kinds = (
     ],
     type(None),
 )
+_CUT: dict[str, _Kinds] = {"joint": _TEXT, **dict.fromkeys(("ms", "most_Nm", "since_s"), _NUMBER)}
 _BLOW: dict[str, _Kinds] = {
     **dict.fromkeys(("impulse_Ns?", "peak_force_N?", "contact_ms?", "hand_speed_m_s?"), _NUMBER),
     "target?": ({"*": (int, float, bool, type(None))}, type(None)),
@@ -87,6 +88,9 @@ _LOADS: dict[str, _Kinds] = {
     **dict.fromkeys(
         ("gear_joint?", "motor_joint?", "power_joint?", "velocity_jump_joint?"), (str, type(None))
     ),
+    "motor_cut_ms?": _NUMBER,
+    "motor_cut_joint?": (str, type(None)),
+    "motor_cuts?": ([_CUT],),
 }
 _ANY_REPLAY: dict[str, _Kinds] = {
     **_BLOW,

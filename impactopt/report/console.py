@@ -32,6 +32,7 @@ __all__ = [
     "SolveConsole",
     "collision_table",
     "comparison_tables",
+    "identified_table",
     "multistart_table",
     "nail_driving_table",
     "replay_table",
@@ -167,6 +168,25 @@ def torques_table(joints: Sequence[Mapping[str, Any]], most: int = 5) -> Table:
     for joint in joints[:most]:
         numbers = (f"{joint['torque_Nm']:.1f}", f"{joint['limit_Nm']:.1f}", f"{joint['ratio']:.2f}")
         table.add_row(_plain(str(joint["joint"])), *numbers)
+    return table
+
+
+def identified_table(found: Mapping[str, Any]) -> Table:
+    """Contact laws and their numbers, the best law first; `found` as in `impactopt identify --json`."""
+    blows = "one blow" if found["blows"] == 1 else f"{found['blows']} blows"
+    table = Table(title=_plain(f"{found['log']}: {blows}"), title_justify="left")
+    for name in ("", "value", f"{100 * found['level']:g} % interval"):
+        table.add_column(name, justify="right" if name else "left")
+    for law in found["laws"]:
+        more = law["aic"] - found["laws"][0]["aic"]
+        left = f"leaves {law['force_left_pct']:.2g} % of the peak force, AIC {more:+.0f}"
+        table.add_row(_plain(f"{law['law']}: {left}"), end_section=False)
+        for name, each in law["estimates"].items():
+            ends = [f"{x:.4g}" if x is not None else "?" for x in (each["low"], each["high"])]
+            label = f"  {name} [{each['unit']}]" if each["unit"] else f"  {name}"
+            cells = [*map(_plain, (label, f"{each['value']:.4g}", " to ".join(ends)))]
+            cells[-1] = cells[-1] if each["determined"] else f"[bold red]! {cells[-1]}[/]"
+            table.add_row(*cells, end_section=name == [*law["estimates"]][-1])
     return table
 
 

@@ -71,13 +71,15 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
     for label, key, joint, digits, most in (
         ("gear load / torque limit", "gear_ratio", "gear_joint", 2, np.inf),
         ("motor's use of its line", "motor_ratio", "motor_joint", 2, 1.0),
+        ("cut by the motor's line [ms]", "motor_cut_ms", "motor_cut_joint", 1, 0.0),
         ("power of a motor [W]", "power_W", "power_joint", 0, np.inf),
         ("jump of a joint's speed [rad/s]", "velocity_jump_rad_s", "velocity_jump_joint", 2, np.inf),
     ):
         row = number_row(label, [source.get(key) for source in sources], digits, most=most)
         if row is not None:  # names in a line of their own: beside the numbers they would fill a terminal
             yield row
-            yield _of_joints([source.get(joint) for source in sources])
+            if any(names := [source.get(joint) for source in sources]):
+                yield _of_joints(names)
     for label, key, digits in (
         ("least normal force [N]", "min_normal_force_N", 0),
         ("largest slip of a sole [mm]", "sole_slip_mm", 2),

@@ -19,6 +19,7 @@ __all__ = ["MOMENTARY_PEAK", "Actuator", "numbers_of", "with_classes"]
 
 # of a gear over the joint's torque limit, where nothing better is known: see docs/howto/gears.md
 MOMENTARY_PEAK = 2.0
+FASTEST, LATEST = 1e6, 1.0  # [Hz], [s] of a motor: beyond, it is none, or in other units
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,16 @@ class Actuator(Described):
     )
     power_limit: float | None = field(
         default=None, metadata=about("mechanical power of the motor", unit="W", above=0, most=STRONGEST)
+    )
+    bandwidth: float | None = field(
+        default=None,
+        metadata=about(
+            "of the motor's torque, a lag of first order; left out: at once", unit="Hz", above=0, most=FASTEST
+        ),
+    )
+    delay: float | None = field(
+        default=None,
+        metadata=about("from reading the joint to setting its torque", unit="s", least=0, most=LATEST),
     )
 
     def __post_init__(self) -> None:

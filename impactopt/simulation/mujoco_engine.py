@@ -19,6 +19,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.besides import Besides
 from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.mujoco_robot import MujocoRobot
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file
 from impactopt.simulation.perturbation import Perturbation
@@ -234,10 +235,12 @@ def simulate_mujoco(
     hold = max(1, round(world.period / step))
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
     lag = round(world.delay / step)
-    demand = torque = np.zeros(robot.n)
+    told = np.zeros((2, robot.n))  # what the servo tells the motors: demand, and what saturation leaves of it
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
+    motors, delay, cuts = Motors(robot), Delay(robot), CutWatch(robot)
+    drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
     impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
     with no_log_file():
@@ -252,7 +255,14 @@ def simulate_mujoco(
                 # at rest before the start, it asked for the same
                 waiting.append((k + lag if k else 0, asked))
             while waiting and waiting[0][0] <= k:
-                demand, torque = waiting.popleft()[1]
+                told = np.array(waiting.popleft()[1])
+            demand, wanted = delay.at(t, told)
+            delay.keep(t, told)
+            rates = data.qvel[replay.dof]
+            cut = motors.cut(wanted, rates)
+            cuts.look(t, wanted, cut, step)
+            drive = cut if drive is None else drive
+            torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
             speed = replay.hand_speed()
             target_speed = replay.struck.speed(replay.target)
             push = replay.push(speed, step)
@@ -291,6 +301,7 @@ def simulate_mujoco(
         peak_force=peak,
         outcome=replay.scene.target.outcome(left),
         saturated=saturated,
+        cuts=cuts.told() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
         fall=fall or replay.not_standing(ground, weight_of(robot)),
         touched=replay.besides.touched(),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.robots.robot import Robot
 from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
@@ -33,6 +34,7 @@ class _State:
     x: float  # the target's travel [m]
     target: Array  # and state
     impulse: float  # that it was given [N s]
+    drive: Array  # torque of the motors [N m]
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,11 @@ class _Rates:
     vt: float  # the target's speed [m/s]
     force: float
     hand_speed: float
-    demand: Array
-    torque: Array
+    asked: Array  # (2, n) of the servos: demand, and what saturation leaves of it
+    demand: Array  # that reaches the motors
+    wanted: Array  # of it, after saturation
+    cut: Array  # what the motors' lines leave of that
+    torque: Array  # of the motors, as they are in the state
     push: Push | None  # what the contact comes to in the step that begins here
 
 
@@ -53,6 +58,14 @@ class _World:
         self.model, self.base = robot.model, robot.model.nv - robot.n
         self.body = PinocchioBody(robot, scene.soles, np.zeros(6), scene.striker, scene.normal)
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
+        self.motors, self.delay = Motors(robot), Delay(robot)
+
+    def at_start(self, reference: Any) -> _State:
+        """Where the motion begins: at rest, with motors that give what is asked for."""
+        q, v, struck = np.array(reference.q[0]), np.zeros(self.model.nv), self.struck
+        first = np.array(self.servo.torque(0.0, self.servo.angles(q), v[self.base :]))
+        drive = self.motors.cut(first[1], v[self.base :])
+        return _State(q, v, struck.travel_at_start(reference), struck.untouched, 0.0, drive)
 
     def depth(self, s: _State) -> float:
         """[m] of the striking point in the target, at the state at which the body has been last."""
@@ -63,7 +76,11 @@ class _World:
         body = self.body
         speed = body.look(s.q, s.v)
         depth = self.depth(s)
-        demand, torque = self.servo.torque(t, self.servo.angles(s.q), s.v[self.base :])
+        joints = s.v[self.base :]
+        asked = np.array(self.servo.torque(t, self.servo.angles(s.q), joints))
+        demand, wanted = self.delay.at(t, asked)
+        cut = self.motors.cut(wanted, joints)
+        torque = self.motors.now(s.drive, cut)
         push, struck = None, self.struck
         if force is None:
             force = struck.force(depth, speed, s.target)
@@ -77,7 +94,10 @@ class _World:
             vt=struck.speed(s.target),
             force=force,
             hand_speed=speed,
+            asked=asked,
             demand=demand,
+            wanted=wanted,
+            cut=cut,
             torque=torque,
             push=push,
         )
@@ -112,6 +132,7 @@ class _World:
             x=s.x,
             target=s.target,
             impulse=s.impulse,
+            drive=self.motors.after(s.drive, first.cut, h / 2),
         )
         middle = self.rates(t + h / 2, half, force=push.force if push is not None else 0.0)
         after = _State(
@@ -120,6 +141,7 @@ class _World:
             x=s.x + h * first.vt,
             target=self.struck.moved(s.target, 0.0, h) if push is None else push.state,
             impulse=s.impulse + h * middle.force,
+            drive=self.motors.after(s.drive, middle.cut, h),
         )
         if push is None:
             return after
@@ -152,18 +174,18 @@ def simulate_pinocchio(
     InputError : the simulation diverges (with the time at which it did).
     """
     world = _World(robot, scene, reference)
-    struck = world.struck
-    start_travel = struck.travel_at_start(reference)
-    state = _State(np.array(reference.q[0]), np.zeros(robot.model.nv), start_travel, struck.untouched, 0.0)
+    state = world.at_start(reference)
     left = state.target  # as the last touch has left it
     end = min(float(reference.end) + settle, until)
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     start: list[Array] | None = None
-    touches, gears = Touches(), GearWatch(robot)
+    touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
     for k in range(round(end / step)):
         t = k * step
         first = world.rates(t, state, step=step)
+        world.delay.keep(t, first.asked)
+        cuts.look(t, first.wanted, first.cut, step)
         push = first.push
         saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
         if push is None:
@@ -193,6 +215,7 @@ def simulate_pinocchio(
         peak_force=peak,
         outcome=scene.target.outcome(left),
         saturated=saturated,
+        cuts=cuts.told() if world.motors.lines else None,
         posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
         fall=None,
     )

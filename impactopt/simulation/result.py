@@ -12,6 +12,7 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads
+from impactopt.simulation.motors import MotorCut
 from impactopt.simulation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
@@ -41,6 +42,9 @@ REPORT = (
     "power_joint",
     "velocity_jump_rad_s",
     "velocity_jump_joint",
+    "motor_cut_ms",
+    "motor_cut_joint",
+    "motor_cuts",
     "sole_lift_collision_mm",
     "min_normal_force_N",
     "hand_speed_m_s",
@@ -102,7 +106,8 @@ class Simulation:
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
-    before.  loads: what gears and motors bear at most.
+    before.  loads: what gears and motors bear at most.  cuts: joints whose demand the line of their motor
+    has cut, the longest first; None where no motor's line is known.
     """
 
     engine: str
@@ -135,6 +140,7 @@ class Simulation:
     step_error: float = np.nan
     gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     loads: DriveLoads | None = field(default=None, repr=False)
+    cuts: tuple[MotorCut, ...] | None = None
 
     @property
     def ground(self) -> Array:
@@ -198,6 +204,7 @@ class Simulation:
             "nearest": " and ".join(self.nearest),
             "contacts_besides": [touched.summary() for touched in self.touched] if known else None,
             **({} if self.loads is None else self.loads.summary()),
+            **self._cut_numbers(),
         }
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {
@@ -221,6 +228,20 @@ class Simulation:
             collision = self.lift[phase == 1]
             out["sole_lift_collision_mm"] = 1e3 * float(collision.max()) if collision.size else 0.0
         return out
+
+    def _cut_numbers(self) -> dict[str, Any]:
+        """Of the joint that was cut longest; None where no motor's line is known, 0 where none was cut."""
+        if not self.cuts:
+            return {
+                "motor_cut_ms": None if self.cuts is None else 0.0,
+                "motor_cut_joint": None,
+                "motor_cuts": [],
+            }
+        return {
+            "motor_cut_ms": 1e3 * self.cuts[0].duration,
+            "motor_cut_joint": self.cuts[0].joint,
+            "motor_cuts": [cut.describe() for cut in self.cuts],
+        }
 
     def report(self, *, torque_limit: Array, polygon: Array, planned_impulse: float) -> dict[str, Any]:
         """The summary with one number for the whole motion where that one has one for each phase.

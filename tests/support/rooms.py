@@ -27,6 +27,7 @@ ROOMS_IN_ORDER = (
     "planning",
     "files",
     "sweeps",
+    "identification",
     "report",
     "studies",
     "cli",

@@ -1,0 +1,84 @@
+"""The command `impactopt identify`: contact laws from a measured log of blows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import AsJson, Verbose, complete_problem
+from impactopt.report.plain_errors import plain_errors
+
+
+def identify(
+    log: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG",
+            help="CSV with a header, or npz: time_s, force_N, and hand_speed_m_s or joint positions "
+            "(JOINT_rad, with --problem).",
+        ),
+    ],
+    law: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="A contact law, as problem files call it; may be repeated; all."),
+    ] = None,
+    target_mass: Annotated[
+        float | None,
+        typer.Option(metavar="KG", help="Mass of a target that is free; left out: it stays, as a load cell."),
+    ] = None,
+    problem: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PROBLEM",
+            help="Problem whose robot, striker and normal the joint positions are of.",
+            autocompletion=complete_problem,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="FILE", help="Write [contact] of the law that fits best there."),
+    ] = None,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find stiffness, damping and effective mass from a log of one blow or several, with 95 % intervals.
+
+    Each contact law is fitted by least squares on the collision of two masses. Prints the laws, the best
+    first, and what not to believe. Exit code: 0 done, 2 bad input.
+    """
+    with plain_errors("interrupted before the laws were fitted", verbose=verbose):
+        import numpy as np
+
+        from impactopt.contact.laws import LAWS
+        from impactopt.errors import printable
+        from impactopt.files.output import write_file
+        from impactopt.files.problem_file import load_problem
+        from impactopt.identification import identify as fit
+        from impactopt.identification import read_log
+
+        if problem is None:
+            measured = read_log(log)
+        else:
+            of = load_problem(problem)
+            measured = read_log(log, robot=of.robot, striker=of.striker, normal=of.normal)
+        mass = np.inf if target_mass is None else target_mass
+        found = fit(measured, target_mass=mass, laws=law or LAWS)
+        if out is not None:
+            text = found.best.toml()
+            write_file(out, lambda file: file.write(text.encode()))
+        if as_json:
+            typer.echo(json.dumps(found.describe(), indent=2))
+            return
+        from rich.console import Console
+
+        from impactopt.report.console import identified_table
+
+        console = Console()
+        console.print(identified_table(found.describe()))
+        for caution in found.cautions:
+            console.print(printable(f"caution: {caution}"), markup=False, highlight=False, soft_wrap=True)
+        if out is not None:
+            console.print(printable(str(out)), markup=False, highlight=False, soft_wrap=True)

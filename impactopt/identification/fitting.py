@@ -1,0 +1,324 @@
+"""One law's numbers by least squares on our own collision, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from impactopt.contact.laws import ContactLaw
+from impactopt.identification.blows import Blow, noise_of
+from impactopt.identification.lump import HEAVIEST_HAND, Course, Lump
+from impactopt.identification.result import Estimate, LawFit
+from impactopt.identification.start import MASS, Free, free_numbers, starts
+
+__all__ = ["fit_law"]
+
+Array = NDArray[np.float64]
+_LONGEST = 2.5  # durations of the longest contact that a search may try
+_DIFFERENCE = 1e-4  # of numbers, for central differences
+_ROUNDS = 2  # in which the weights of force and motion follow from what the fit has left
+_CLEAN = 1e-5  # of the peak, and of the hand's motion: no log has less noise than our interpolation
+_ROUGH, _FINE = 1e-5, 1e-10  # tolerances of a search among starts, and of the last one
+_ABOUT = 2  # samples to each side of a first estimate between which the touch may be
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """Standard deviations: force [N], motion [m/s] or [m]."""
+
+    force: float
+    motion: float
+
+
+@dataclass
+class _Fit:
+    """Residuals of blows that share a law and a mass; z has the shared numbers, and then those of each blow:
+    speed, touch, and where travel is measured, its begin, each in its own scale."""
+
+    lump: Lump
+    free: tuple[Free, ...]
+    blows: Sequence[Blow]
+    target_mass: float
+    weights: _Weights
+    held: dict[str, float]
+    touches: list[tuple[float, float]] = field(default_factory=list)  # [s] bounds of each blow's
+
+    @property
+    def own(self) -> int:
+        """Numbers of each blow."""
+        return 3 if self.blows[0].travels else 2
+
+    def of_blow(self, k: int) -> slice:
+        begin = len(self.free) + k * self.own
+        return slice(begin, begin + self.own)
+
+    def first(self, shared: Array) -> Array:
+        """z with the shared numbers and a start for each blow."""
+        return np.concatenate([shared, *(self._start_of(k) for k in range(len(self.blows)))])
+
+    def _start_of(self, k: int) -> Array:
+        low, high = self.touches[k]
+        touch = self._scaled(k, np.clip(_guess(self.blows[k]), low, high))
+        return np.array([1.0, touch, 0.0][: self.own])
+
+    def _scaled(self, k: int, touch: float) -> float:
+        return float((touch - _guess(self.blows[k])) / self.blows[k].duration)
+
+    def _touch(self, k: int, z: Array) -> float:
+        return float(_guess(self.blows[k]) + z[self.of_blow(k)][1] * self.blows[k].duration)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        low = [each.lower for each in self.free]
+        high = [each.upper for each in self.free]
+        high[-1] = min(high[-1], float(np.log(0.5 * HEAVIEST_HAND / self.free[-1].scale)))
+        for k in range(len(self.blows)):
+            places = [self._scaled(k, touch) for touch in self.touches[k]]
+            low += [0.1, places[0], -np.inf][: self.own]
+            high += [10.0, places[1], np.inf][: self.own]
+        return np.array(low), np.array(high)
+
+    # ------------------------------------------------------------ collisions
+    def _courses(self, shared: Array, speed: Array) -> tuple[list[Course], Array]:
+        """Collisions and masses [kg] of rows (N, shared) at speeds (N,)."""
+        numbers = {each.name: each.number(z) for each, z in zip(self.free, shared.T, strict=True)}
+        mass = numbers.pop(MASS)
+        numbers |= {name: np.full(len(shared), value) for name, value in self.held.items()}
+        return self.lump.courses(numbers, 1.0 / (1.0 / mass + 1.0 / self.target_mass), speed), mass
+
+    def _at(self, k: int, z: Array, course: Course, mass: float, speed: float) -> Array:
+        """Force and motion of one blow at its samples, weighted."""
+        blow = self.blows[k]
+        t = blow.time - self._touch(k, z)
+        if blow.travels:
+            begin = z[self.of_blow(k)][2] * blow.speed * blow.duration + blow.motion[blow.touch]
+            motion = begin + speed * t - course.carried_at(t) / mass
+        else:
+            motion = speed - course.impulse_at(t) / mass
+        return np.concatenate([course.force_at(t) / self.weights.force, motion / self.weights.motion])
+
+    def _speed(self, k: int, z: Array) -> float:
+        return float(z[self.of_blow(k)][0] * self.blows[k].speed)
+
+    def measured(self) -> Array:
+        both = [(b.force / self.weights.force, b.motion / self.weights.motion) for b in self.blows]
+        return np.concatenate([part for pair in both for part in pair])
+
+    def residuals(self, z: Array) -> Array:
+        n = len(self.blows)
+        speeds = np.array([self._speed(k, z) for k in range(n)])
+        courses, mass = self._courses(np.tile(z[: len(self.free)], (n, 1)), speeds)
+        return (
+            np.concatenate([self._at(k, z, courses[k], mass[k], speeds[k]) for k in range(n)])
+            - self.measured()
+        )
+
+    def best_of(self, tried: Sequence[Array]) -> Array:
+        """The z of least squares for the first blow."""
+        speeds = np.array([self._speed(0, z) for z in tried])
+        courses, mass = self._courses(np.array(tried)[:, : len(self.free)], speeds)
+        rows = zip(tried, courses, mass, speeds, strict=True)
+        measured = self.measured()[: 2 * len(self.blows[0].time)]
+        costs = [float(np.sum((self._at(0, *row) - measured) ** 2)) for row in rows]
+        return tried[int(np.argmin(costs))]
+
+    def jacobian(self, z: Array) -> Array:
+        """(samples, z): by central differences of collisions; by the touch, and by where travel begins,
+        in closed form."""
+        shared, n = len(self.free), len(self.blows)
+        low = self.bounds[0]
+        rows: list[Array] = []
+        for k in range(n):
+            for j in range(shared + 1):
+                place = j if j < shared else self.of_blow(k).start
+                for side in (-1, 1):
+                    moved = z.copy()
+                    moved[place] = max(moved[place] + side * _DIFFERENCE, low[place])
+                    rows.append(moved)
+        owner = [k for k in range(n) for _ in range(2 * (shared + 1))]
+        speeds = np.array([self._speed(k, row) for k, row in zip(owner, rows, strict=True)])
+        courses, mass = self._courses(np.array(rows)[:, :shared], speeds)
+        values = [
+            self._at(k, row, c, m, s)
+            for k, row, c, m, s in zip(owner, rows, courses, mass, speeds, strict=True)
+        ]
+        blocks, begin = np.zeros((sum(2 * len(b.time) for b in self.blows), len(z))), 0
+        base, base_mass = self._courses(
+            np.tile(z[:shared], (n, 1)), np.array([self._speed(k, z) for k in range(n)])
+        )
+        for k, blow in enumerate(self.blows):
+            end, at = begin + 2 * len(blow.time), 2 * (shared + 1) * k
+            for j in range(shared + 1):
+                place = j if j < shared else self.of_blow(k).start
+                less, more = at + 2 * j, at + 2 * j + 1
+                step = rows[more][place] - rows[less][place]
+                blocks[begin:end, place] = (values[more] - values[less]) / step
+            blocks[begin:end, self.of_blow(k)][:, 1:] = self._in_time(k, z, base[k], base_mass[k])
+            begin = end
+        return blocks
+
+    def _in_time(self, k: int, z: Array, course: Course, mass: float) -> Array:
+        blow, speed = self.blows[k], self._speed(k, z)
+        t = blow.time - self._touch(k, z)
+        out = np.zeros((2 * len(t), self.own - 1))
+        out[: len(t), 0] = -course.slope_at(t) / self.weights.force
+        moves = -speed + course.impulse_at(t) / mass if blow.travels else course.force_at(t) / mass
+        out[len(t) :, 0] = moves / self.weights.motion
+        out[:, 0] *= blow.duration
+        if blow.travels:
+            out[len(t) :, 1] = blow.speed * blow.duration / self.weights.motion
+        return out
+
+    def solve(self, z: Array, tolerance: float) -> tuple[Array, float]:
+        """The best z, and half its sum of squares."""
+        low, high = self.bounds
+        edge = 1e-9 * np.minimum(high - low, 1.0)
+        inside = np.clip(z, low + edge, high - edge)
+        found = least_squares(
+            self.residuals,
+            inside,
+            self.jacobian,
+            bounds=(low, high),
+            ftol=tolerance,
+            xtol=tolerance,
+            gtol=None,
+            max_nfev=80,
+        )
+        return np.asarray(found.x), float(found.cost)
+
+
+def fit_law(law: ContactLaw, blows: Sequence[Blow], target_mass: float, level: float) -> LawFit:
+    """The numbers of a law, the effective mass and the speeds that fit all blows together best.
+
+    law : its held numbers, and of one's own law all as a start.  target_mass : [kg], infinite for a target
+    that stays.  level : of the intervals, 0 to 1.
+    """
+    lump = Lump(law, _LONGEST * max(blow.duration for blow in blows))
+    free = free_numbers(law, blows[0])
+    names = {each.name for each in free}
+    held = {name: value for name, value in law.parameters.items() if name not in names}
+    alone = [_alone(_Fit(lump, free, (blow,), target_mass, _first_weights(blow), held)) for blow in blows]
+    weights = _Weights(*np.median([(w.force, w.motion) for w in map(_first_weights, blows)], axis=0))
+    fit = _Fit(lump, free, blows, target_mass, weights, held, [touch for _, touch in alone])
+    shared = np.mean([z[: len(free)] for z, _ in alone], axis=0)
+    z = np.concatenate([shared, *(z[len(free) :] for z, _ in alone)])
+    for _ in range(_ROUNDS):
+        z, _ = fit.solve(z, _FINE)
+        fit.weights = _weights_left(fit, z)
+    z, _ = fit.solve(z, _FINE)
+    return _told(law, fit, z, level)
+
+
+def _guess(blow: Blow) -> float:
+    """[s] of the touch."""
+    return float((blow.time[blow.touch - 1] + blow.time[blow.touch]) / 2)
+
+
+def _first_weights(blow: Blow) -> _Weights:
+    moved = blow.speed * (blow.duration if blow.travels else 1.0)
+    return _Weights(max(noise_of(blow.force), _CLEAN * blow.peak), max(noise_of(blow.motion), _CLEAN * moved))
+
+
+def _alone(fit: _Fit) -> tuple[Array, tuple[float, float]]:
+    """z of a single blow, and the bounds [s] within which its touch is.
+
+    A force that jumps at the touch has a residual that jumps where the touch passes a sample. So each gap
+    between two samples is a search of its own, and smooth.
+    """
+    (blow,) = fit.blows
+    first = blow.time[0], blow.time[blow.touch] + 0.3 * blow.duration
+    fit.touches = [first]
+    z, _ = fit.solve(fit.best_of([fit.first(z) for z in starts(fit.free)]), _ROUGH)
+    numbers = {each.name: float(each.number(z[j])) for j, each in enumerate(fit.free)}
+    numbers.pop(MASS)
+    law = type(fit.lump.law)(**{**fit.lump.law.parameters, **fit.held, **numbers})
+    if not float(law.force(0.0, fit._speed(0, z))) > 0:
+        return z, first
+    near = int(np.searchsorted(blow.time, fit._touch(0, z)))
+    gaps = range(max(near - _ABOUT, 1), min(near + _ABOUT, len(blow.time) - 1) + 1)
+    found = []
+    for k in {*gaps, blow.touch}:
+        fit.touches = [(float(blow.time[k - 1]), float(blow.time[k]))]
+        found.append((*fit.solve(z, _ROUGH), fit.touches[0]))
+    z, _, touches = min(found, key=lambda each: each[1])
+    return z, touches
+
+
+# ---------------------------------------------------------------- what is told
+def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
+    """What is left of force [N] and motion [m/s] or [m], all blows."""
+    force, motion, begin = [], [], 0
+    for blow in fit.blows:
+        n = len(blow.time)
+        force.append(residuals[begin : begin + n] * fit.weights.force)
+        motion.append(residuals[begin + n : begin + 2 * n] * fit.weights.motion)
+        begin += 2 * n
+    return np.concatenate(force), np.concatenate(motion)
+
+
+def _correlation(fit: _Fit, force: Array) -> float:
+    """Of what is left of the force at neighbouring samples."""
+    ends = np.cumsum([len(blow.time) for blow in fit.blows])[:-1]
+    together = sum(float(r[1:] @ r[:-1]) for r in np.split(force, ends))
+    return together / max(float(force @ force), 1e-300)
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def _weights_left(fit: _Fit, z: Array) -> _Weights:
+    force, motion = _parts(fit, fit.residuals(z))
+    spread = np.sqrt(2 * len(force) / max(2 * len(force) - len(z), 1))
+    least = [_first_weights(blow) for blow in fit.blows]
+    clean = _CLEAN * max(blow.peak for blow in fit.blows)
+    return _Weights(
+        max(spread * _rms(force), clean),
+        max(spread * _rms(motion), 1e-3 * min(weights.motion for weights in least)),
+    )
+
+
+def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
+    residuals, jacobian = fit.residuals(z), fit.jacobian(z)
+    force, motion = _parts(fit, residuals)
+    n, p = len(force), len(z)
+    spread = _standard_errors(jacobian) * float(student.ppf(0.5 + level / 2, max(2 * n - p, 1)))
+    estimates = {}
+    for each, at, off in zip(fit.free, z, spread, strict=False):
+        low, high = (float(each.number(np.asarray(at + side * off))) for side in (-1, 1))
+        if not each.logarithmic:
+            low = max(low, 0.0) if each.lower == 0 else min(low, high)
+        estimates[each.name] = Estimate(float(each.number(at)), low, max(low, high), each.unit)
+    speeds = []
+    for k, blow in enumerate(fit.blows):
+        at, off = fit._speed(k, z), spread[fit.of_blow(k)][0] * blow.speed
+        speeds.append(Estimate(at, at - off, at + off, "m/s"))
+    numbers = {name: each.value for name, each in estimates.items() if name != MASS}
+    peak = max(blow.peak for blow in fit.blows)
+    floor = (_CLEAN * peak, fit.weights.motion * 1e-6)
+    return LawFit(
+        law=type(law)(**{**law.parameters, **numbers}),
+        estimates=estimates,
+        speeds=tuple(speeds),
+        touches=tuple(fit._touch(k, z) for k in range(len(fit.blows))),
+        held=dict(fit.held),
+        force_left=_rms(force),
+        force_left_pct=100 * _rms(force) / peak,
+        motion_left=_rms(motion),
+        correlation=_correlation(fit, force),
+        aic=2 * n * (np.log(max(_rms(force), floor[0])) + np.log(max(_rms(motion), floor[1]))) + 2 * p,
+    )
+
+
+def _standard_errors(jacobian: Array) -> Array:
+    """Of z, with residuals of deviation one; infinite for what the samples say nothing of."""
+    _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
+    known = s > 1e-10 * s[0]
+    out = np.sqrt(np.sum((vt[known] / s[known, None]) ** 2, axis=0))
+    lost = np.sum(vt[~known] ** 2, axis=0) > 1e-12
+    return np.where(lost, np.inf, out)

@@ -1,0 +1,195 @@
+"""What is identified: numbers with intervals, for each law."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from impactopt.contact.fields import abouts
+from impactopt.contact.laws import ContactLaw
+from impactopt.errors import InputError
+from impactopt.files.problem_file.toml import write_toml
+from impactopt.identification.start import MASS
+
+__all__ = ["Estimate", "Identification", "LawFit"]
+
+_WIDE = 1.0  # of the value: an interval wider than that determines nothing
+_DIGITS = 5  # of numbers in a file
+_WHITE = 4.0  # standard deviations of a correlation
+_EXACT = 0.05  # [% of the peak] that our interpolation may leave of a log without noise
+_TIE = 10.0  # of AIC: laws nearer to each other than that cannot be told apart
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number, its confidence interval, and its unit."""
+
+    value: float
+    low: float
+    high: float
+    unit: str = ""
+
+    @property
+    def determined(self) -> bool:
+        """Whether the interval is narrower than the number is large, and leaves out 0."""
+        return bool(self.high - self.low <= _WIDE * abs(self.value) and self.low * self.high > 0)
+
+    def describe(self) -> dict[str, Any]:
+        """value, low, high, unit, determined; None for an end that is nowhere."""
+        ends = {name: x if np.isfinite(x) else None for name, x in (("low", self.low), ("high", self.high))}
+        return {"value": self.value, **ends, "unit": self.unit, "determined": self.determined}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawFit:
+    """One law, fitted to all blows of a log together.
+
+    law : with the numbers that fit best.  estimates : its numbers and `effective_mass`, by name; speeds: of
+    each blow at the touch [m/s]; touches: when [s].  held : numbers that were not looked for.
+    force_left [N], motion_left [m/s] (or [m], of joint positions) : root mean square of what the fit leaves
+    of all samples; force_left_pct : of the largest force; correlation : of the force's residuals at
+    neighbouring samples, about 0 for white noise, and nearer to 1 the less the law fits.  aic : Akaike's
+    information criterion, with the noise of force and motion unknown; only differences between laws mean
+    something.
+    """
+
+    law: ContactLaw
+    estimates: Mapping[str, Estimate]
+    speeds: tuple[Estimate, ...]
+    touches: tuple[float, ...]
+    held: Mapping[str, float]
+    force_left: float
+    force_left_pct: float
+    motion_left: float
+    correlation: float
+    aic: float
+
+    @property
+    def name(self) -> str:
+        """What problem files call the law, or its class."""
+        return self.law.word or type(self.law).__name__
+
+    @property
+    def effective_mass(self) -> Estimate:
+        """[kg] of the hand."""
+        return self.estimates[MASS]
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Names of the numbers that the log does not determine."""
+        return tuple(name for name, each in self.estimates.items() if not each.determined)
+
+    def describe(self) -> dict[str, Any]:
+        """All of it, as JSON has it."""
+        return {
+            "law": self.name,
+            "estimates": {name: each.describe() for name, each in self.estimates.items()},
+            "undetermined": list(self.undetermined),
+            "held": dict(self.held),
+            "speed_m_s": [each.describe() for each in self.speeds],
+            "touch_s": list(self.touches),
+            "force_left_N": self.force_left,
+            "force_left_pct": self.force_left_pct,
+            "motion_left": self.motion_left,
+            "correlation": self.correlation,
+            "aic": self.aic,
+        }
+
+    def toml(self) -> str:
+        """The section `[contact]` of a problem file.
+
+        Raises
+        ------
+        InputError : a law of one's own, which a file cannot have.
+        """
+        if not self.law.word:
+            raise InputError(f"{type(self.law).__name__}: a file cannot have it; use it in Python")
+        keys = {f.name: told.key_of(f.name) for f, told in abouts(type(self.law))}
+        section: dict[str, Any] = {"law": self.law.word}
+        section |= {keys[name]: float(f"{x:.{_DIGITS}g}") for name, x in self.law.parameters.items()}
+        comments = {}
+        for name, each in self.estimates.items():
+            if name in keys:
+                unsure = "" if each.determined else "; not determined by the log"
+                comments[keys[name]] = f"{each.low:.4g} to {each.high:.4g}{unsure}"
+        return write_toml(
+            {"contact": section}, lambda place: comments.get(str(place[-1]), "") if len(place) == 2 else ""
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identification:
+    """Contact laws fitted to a log: `fits`, the best first.
+
+    log : its name.  samples : that were fitted.  level : of the intervals.  target_mass [kg] : infinite for
+    one that stays.  model_mass : [kg]
+    of each blow, by the robot's model; nan where it is not known.
+    """
+
+    log: str
+    fits: tuple[LawFit, ...]
+    samples: int
+    level: float
+    target_mass: float
+    model_mass: tuple[float, ...] = field(default=())
+
+    @property
+    def best(self) -> LawFit:
+        """The law of the least AIC."""
+        return self.fits[0]
+
+    def fit(self, law: str | type[ContactLaw]) -> LawFit:
+        """Of one law, by its word in problem files or its class.
+
+        Raises
+        ------
+        InputError : one that was not fitted.
+        """
+        for each in self.fits:
+            if law in (each.name, type(each.law)):
+                return each
+        known = ", ".join(each.name for each in self.fits)
+        raise InputError(f"the law {law!r} was not fitted; there are {known}")
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """What not to believe, in words."""
+        best, out = self.best, []
+        near = [each.name for each in self.fits[1:] if each.aic - best.aic < _TIE]
+        if near:
+            out.append(f"the log cannot tell {best.name} from {', '.join(near)}; blows at other speeds may")
+        if best.correlation > _WHITE / np.sqrt(self.samples) and best.force_left_pct > _EXACT:
+            out.append(
+                f"what {best.name} leaves of the force, {best.force_left_pct:.2g} % of the peak, is no "
+                f"white noise (neighbouring samples correlate by {best.correlation:.2f}): the law is "
+                "another one, or the log is filtered; intervals are too narrow then"
+            )
+        elif len(self.fits) > 1:
+            out.append("a law that fits best among these is not thereby true")
+        if best.undetermined:
+            out.append(f"the log does not determine {', '.join(best.undetermined)} of {best.name}")
+        mass = best.effective_mass
+        known = [x for x in self.model_mass if np.isfinite(x)]
+        if known and not mass.low <= float(np.mean(known)) <= mass.high:
+            out.append(
+                f"the robot's model has an effective mass of {np.mean(known):.3g} kg there, and the log "
+                f"{mass.value:.3g} kg ({mass.low:.3g} to {mass.high:.3g}): servos, or a wrong model"
+            )
+        return tuple(out)
+
+    def describe(self) -> dict[str, Any]:
+        """All of it, as `impactopt identify --json` prints it."""
+        return {
+            "log": self.log,
+            "best": self.best.name,
+            "blows": len(self.best.speeds),
+            "samples": self.samples,
+            "level": self.level,
+            "target_mass_kg": self.target_mass if np.isfinite(self.target_mass) else None,
+            "model_mass_kg": [x for x in self.model_mass if np.isfinite(x)],
+            "cautions": list(self.cautions),
+            "laws": [each.describe() for each in self.fits],
+        }

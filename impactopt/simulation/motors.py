@@ -1,0 +1,155 @@
+"""Motors between the servo's demand and the joints: late, limited by their line, and slow."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.robots.actuators import numbers_of
+from impactopt.robots.robot import Robot
+
+__all__ = ["CutWatch", "Delay", "MotorCut", "Motors"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorCut:
+    """What its motor's line took of a joint's demand: how long [s], at most [N m], and from when on [s]."""
+
+    joint: str
+    duration: float
+    most: float
+    since: float
+
+    def describe(self) -> dict[str, float | str]:
+        """Of ``summary.json``."""
+        return {
+            "joint": self.joint,
+            "ms": 1e3 * self.duration,
+            "most_Nm": self.most,
+            "since_s": self.since,
+        }
+
+
+class Motors:
+    """What motors make of a torque that they are asked for; joints of which nothing is known give it.
+
+    A motor under its full voltage has the torque stall_torque (1 - w / no_load_speed), and braked by it
+    -stall_torque (1 + w / no_load_speed): at speed, it can brake harder than it can drive. Friction takes its
+    part of both. The torque goes to what is asked for, inside that, as a current does through an inductance:
+    with the rate 2 pi bandwidth.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        stall, idle, coulomb, viscous, bandwidth = (
+            numbers_of(robot.actuators, name)
+            for name in (
+                "stall_torque",
+                "no_load_speed",
+                "coulomb_friction",
+                "viscous_friction",
+                "bandwidth",
+            )
+        )
+        known = ~np.isnan(stall)
+        self.lines = bool(known.any())
+        self._stall = np.where(known, stall, np.inf)
+        # friction is part of the line where there is one
+        self._slope = np.where(known, stall / idle + viscous, 0.0)
+        self._coulomb = np.where(known, coulomb, 0.0)
+        self._rate = np.where(np.isnan(bandwidth), np.inf, 2 * np.pi * bandwidth)
+        self._slow = bool(np.isfinite(self._rate).any())
+
+    def cut(self, torque: Array, rates: Array) -> Array:
+        """(n,) [N m] what the motors' lines leave of a torque (n,) at joint rates (n,)."""
+        if not self.lines:
+            return torque
+        lost = self._slope * rates + self._coulomb * np.sign(rates)
+        return np.clip(torque, -self._stall - lost, self._stall - lost)
+
+    def now(self, torque: Array, wanted: Array) -> Array:
+        """(n,) [N m] the torque of motors whose torque is `torque` where it cannot change at once."""
+        return np.where(np.isfinite(self._rate), torque, wanted) if self._slow else wanted
+
+    def after(self, torque: Array, wanted: Array, time: float) -> Array:
+        """(n,) [N m] the torque (n,) a time [s] later, if one (n,) is wanted all the while."""
+        if not self._slow:
+            return wanted
+        return wanted + np.exp(-self._rate * time) * (torque - wanted)
+
+    def mean(self, torque: Array, wanted: Array, time: float) -> Array:
+        """(n,) [N m] of `after`, its mean in that time."""
+        if not self._slow:
+            return wanted
+        turns = self._rate * time
+        return wanted - np.expm1(-turns) / turns * (torque - wanted)
+
+
+class Delay:
+    """What was asked for some time ago, by joint: from reading the joints to setting their torque."""
+
+    def __init__(self, robot: Robot) -> None:
+        delay = numbers_of(robot.actuators, "delay")
+        self._delay = np.where(np.isnan(delay), 0.0, delay)
+        self._longest = float(self._delay.max())
+        self._kept: deque[tuple[float, Array]] = deque()
+
+    def keep(self, t: float, values: Array) -> None:
+        """Values (..., n) that are asked for at a time [s], after those kept before."""
+        if not self._longest:
+            return
+        while len(self._kept) > 1 and self._kept[1][0] <= t - self._longest:
+            self._kept.popleft()
+        self._kept.append((t, values))
+
+    def at(self, t: float, now: Array) -> Array:
+        """What reaches the motors at a time [s] at which `now` (..., n) is asked for.
+
+        Linear between the instants that are kept; before the first, the same was asked for.
+        """
+        if not self._longest:
+            return now
+        out = np.array(now)
+        times = np.array([*(time for time, _ in self._kept), t])
+        values = [*(value for _, value in self._kept), now]
+        for delay in np.unique(self._delay[self._delay > 0]):
+            then, late = t - delay, self._delay == delay
+            k = min(max(int(np.searchsorted(times, then)), 1), len(times) - 1)
+            span = times[k] - times[k - 1]
+            share = min(max((then - times[k - 1]) / span, 0.0), 1.0) if span > 0 else 1.0
+            out[..., late] = ((1 - share) * values[k - 1] + share * values[k])[..., late]
+        return out
+
+
+class CutWatch:
+    """Where, and for how long, the line of a motor has cut what was asked for."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._names, n = robot.joint_names, robot.n
+        self._limit = robot.torque_limit
+        self._time, self._most, self._since = np.zeros(n), np.zeros(n), np.full(n, np.inf)
+
+    def look(self, t: float, wanted: Array, cut: Array, step: float) -> None:
+        """Torque (n,) [N m] before and after the line, for a step [s] from a time [s]."""
+        lost = np.abs(wanted - cut)
+        some = lost > 1e-9 * self._limit
+        self._time += step * some
+        self._most = np.maximum(self._most, lost)
+        self._since = np.where(some, np.minimum(self._since, t), self._since)
+
+    def told(self) -> tuple[MotorCut, ...]:
+        """The joints that were cut, the longest first."""
+        order = [int(k) for k in np.argsort(-self._time, kind="stable") if self._time[k] > 0]
+        return tuple(
+            MotorCut(
+                joint=self._names[k],
+                duration=float(self._time[k]),
+                most=float(self._most[k]),
+                since=float(self._since[k]),
+            )
+            for k in order
+        )

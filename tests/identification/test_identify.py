@@ -1,0 +1,272 @@
+"""Contact laws from logs: numbers and intervals are right on blows that SciPy has integrated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.measured_blows import TRUE, TrueBlow, log_of
+from typer.testing import CliRunner
+
+from impactopt import (
+    CustomLaw,
+    FreeMass,
+    HuntCrossley,
+    ImpactLog,
+    InputError,
+    SpringDamper,
+    VirtualMass,
+    effective_mass,
+    identify,
+    load_problem,
+    planar_arm,
+    read_log,
+)
+from impactopt.cli.app import app
+from impactopt.contact.laws import LAWS
+from impactopt.files.problem_file import problem_data, problem_from_data, read_toml
+from impactopt.identification.lump import Lump
+
+MASS = 3.0
+
+
+def test_laws_of_the_package_are_all_looked_for() -> None:
+    assert {law.word for law in LAWS} == set(TRUE)
+
+
+def test_two_free_masses_collide_as_their_reduced_mass() -> None:
+    """What is fitted is our own collision of a robot with a free target, with its effective mass in it."""
+    arm, normal = planar_arm(), [0.0, 0.0, -1.0]
+    q, law = arm.posture("ready"), SpringDamper(stiffness=2e4, damping=60.0)
+    m = float(effective_mass(arm, striker="hammer", normal=normal)(q))
+    model = VirtualMass(
+        robot=arm, striker="hammer", normal=normal, law=law, target=FreeMass(mass=2.0), horizon=0.2, step=1e-3
+    )
+    data = arm.model.createData()
+    pin.computeJointJacobians(arm.model, data, q)
+    frame = arm.model.getFrameId("striker:hammer")
+    row = np.array(normal) @ pin.getFrameJacobian(arm.model, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+    whole = model.collide(q, row / (row @ row))  # at 1 m/s
+    numbers = {name: np.array([x]) for name, x in law.parameters.items()}
+    (course,) = Lump(law, 0.2).courses(numbers, np.array([1 / (1 / m + 1 / 2.0)]), np.ones(1))
+    np.testing.assert_allclose(course.impulse[-1], whole.impulse, rtol=1e-6)
+    np.testing.assert_allclose(course.time[-1], whole.duration, rtol=1e-6)
+
+
+@pytest.mark.parametrize("law", TRUE)
+def test_numbers_come_out_of_a_log_with_noise(law: str) -> None:
+    found = identify(log_of(TrueBlow(law, mass=MASS), seed=3))
+    assert found.best.name == law
+    true = {**TRUE[law][1], "effective_mass": MASS}
+    for name, value in true.items():
+        assert found.best.estimates[name].value == pytest.approx(value, rel=0.05), name
+    assert found.best.undetermined == ()
+    assert found.best.force_left_pct == pytest.approx(2.0, rel=0.2)  # the noise, and no more
+    assert abs(found.best.correlation) < 0.3 < found.fits[-1].correlation
+
+
+@pytest.mark.parametrize("law", TRUE)
+def test_without_noise_numbers_are_exact(law: str) -> None:
+    found = identify(log_of(TrueBlow(law, mass=MASS), noise=0.0), laws=[law]).best
+    for name, value in {**TRUE[law][1], "effective_mass": MASS}.items():
+        assert found.estimates[name].value == pytest.approx(value, rel=2e-3), name
+    assert found.speeds[0].value == pytest.approx(1.0, rel=1e-4)
+
+
+def test_intervals_of_95_percent_are_such() -> None:
+    """Errors over standard errors have a deviation of one, within three of their own for so many draws."""
+    blow, draws = TrueBlow("spring damper", mass=MASS), 36
+    true = {**TRUE["spring damper"][1], "effective_mass": MASS}
+    fits = [identify(log_of(blow, seed=seed, rate=5e3), laws=[SpringDamper]).best for seed in range(draws)]
+    for name, value in true.items():
+        each = [fit.estimates[name] for fit in fits]
+        off = [3.92 * (one.value - value) / (one.high - one.low) for one in each]
+        assert 0.66 < np.sqrt(np.mean(np.square(off))) < 1.34, name
+        # less than one chance in a thousand, where 95 % cover
+        assert sum(one.low <= value <= one.high for one in each) >= 29, name
+
+
+def test_several_blows_share_law_and_mass_and_leave_a_free_target() -> None:
+    blows = [TrueBlow("Hunt-Crossley", mass=MASS, speed=v, target_mass=2.0) for v in (0.5, 1.0, 1.5)]
+    found = identify(log_of(*blows, seed=1), laws=[HuntCrossley], target_mass=2.0).best
+    assert [speed.value for speed in found.speeds] == pytest.approx([0.5, 1.0, 1.5], rel=0.02)
+    for name, value in {**TRUE["Hunt-Crossley"][1], "effective_mass": MASS}.items():
+        assert found.estimates[name].value == pytest.approx(value, rel=0.05), name
+    one = identify(log_of(blows[1], seed=1), laws=[HuntCrossley], target_mass=2.0).best
+    wide, narrow = (fit.estimates["dissipation"] for fit in (one, found))
+    assert narrow.high - narrow.low < 0.8 * (wide.high - wide.low)
+
+
+def test_what_a_log_does_not_determine_is_said() -> None:
+    none = TrueBlow("spring damper", mass=MASS, numbers={"stiffness": 1e5, "damping": 0.0})
+    found = identify(log_of(none, seed=2), laws=[SpringDamper])
+    assert found.best.undetermined == ("damping",)
+    assert found.best.estimates["stiffness"].value == pytest.approx(1e5, rel=0.05)
+    assert any("does not determine damping" in caution for caution in found.cautions)
+    assert "not determined" in found.best.toml()
+
+
+def test_a_law_that_does_not_fit_is_told() -> None:
+    found = identify(log_of(TrueBlow("Hunt-Crossley")), laws=[SpringDamper])
+    assert any("no white noise" in caution for caution in found.cautions)
+
+
+def test_a_law_of_ones_own() -> None:
+    law = CustomLaw(
+        compression=lambda x, rate, k, d: k * x + d * rate,
+        analytic=True,
+        k=5e4,
+        d=100.0,
+    )
+    found = identify(log_of(TrueBlow("Kelvin-Voigt", mass=MASS), seed=3), laws=[law]).best
+    assert found.law.parameters["k"] == pytest.approx(1e5, rel=0.05)
+    assert found.law.parameters["d"] == pytest.approx(150.0, rel=0.05)
+    with pytest.raises(InputError, match="a file cannot have it"):
+        found.toml()
+
+
+# ---------------------------------------------------------------- joint positions
+def test_joint_positions_are_as_good_as_a_speed(tmp_path: Path) -> None:
+    """An arm's joints go along a line through its posture so that its hand moves as the blow has it."""
+    problem = load_problem("arm_planar")
+    arm, n, q = problem.robot, np.asarray(problem.normal), problem.robot.posture("ready")
+    data, frame = arm.model.createData(), arm.model.getFrameId(arm.striker(problem.striker).model_frame)
+
+    def height(s: float) -> float:
+        pin.framesForwardKinematics(arm.model, data, q + s * np.array([0.3, 0.5, 0.4]))
+        return float(n @ data.oMf[frame].translation)
+
+    s = np.linspace(-0.2, 0.2, 801)
+    along = np.array([height(x) for x in s])
+    assert (np.diff(along) > 0).all()
+    t = np.arange(-0.02, 0.04, 1e-4)
+    force, _, travel = TrueBlow("spring damper", mass=MASS).at(t - 3.7e-5)
+    drawn = np.random.default_rng(4)
+    force = force + 0.02 * force.max() * drawn.normal(size=len(t))
+    angles = q + np.interp(travel + height(0.0), along, s)[:, None] * np.array([0.3, 0.5, 0.4])
+    angles = angles + 2e-5 * drawn.normal(size=angles.shape)  # an encoder of 17 bits
+    joints = {f"{name}_rad": angles[:, k] for k, name in enumerate(arm.joint_names)}
+    path = tmp_path / "joints.npz"
+    np.savez(path, time_s=t, force_N=force, **joints)
+    log = read_log(path, robot=arm, striker=problem.striker, normal=n)
+    assert log.model_mass is not None and log.travel is not None
+    touch = int(np.searchsorted(t, 0.0))
+    expected = float(effective_mass(arm, striker=problem.striker, normal=n)(angles[touch]))
+    assert log.model_mass[touch] == pytest.approx(expected, rel=1e-9)
+    found = identify(log, laws=[SpringDamper])
+    for name, value in {**TRUE["spring damper"][1], "effective_mass": MASS}.items():
+        assert found.best.estimates[name].value == pytest.approx(value, rel=0.05), name
+    assert any("robot's model has an effective mass" in caution for caution in found.cautions)
+    np.savez(path, time_s=t, force_N=force, **{name: np.rad2deg(x) for name, x in joints.items()})
+    with pytest.raises(InputError, match="degrees"):
+        read_log(path, robot=arm, striker=problem.striker, normal=n)
+
+
+# ---------------------------------------------------------------- bad logs
+def changed(**changes: Any) -> ImpactLog:
+    log = log_of(TrueBlow("spring damper"))
+    assert log.speed is not None
+    return ImpactLog(**{"time": log.time, "force": log.force, "speed": log.speed, **changes})
+
+
+def test_logs_that_cannot_be_used_are_refused() -> None:
+    log = changed()
+    t, f, v = log.time, log.force, log.speed
+    assert v is not None
+    still = np.where(t < -0.01, np.nan, f)
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"force": still}, "force_N: nan at index 0"),
+        ({"time": t[::-1]}, "does not increase"),
+        ({"time": np.repeat(t[::2], 2)}, "does not increase"),
+        ({"force": f[1:]}, "expected shape"),
+        ({"force": 0.0 * f}, "no contact"),
+        ({"force": np.random.default_rng(0).normal(size=len(f))}, "no contact"),
+        ({"force": -f}, "turn its sign"),
+        ({"speed": -v}, "turn its sign"),
+        ({"speed": 1e3 * v}, "mm/s"),
+        ({"time": 1e3 * t}, "milliseconds"),
+        ({"force": 1e-6 * f}, "as of a mass of"),
+        ({"time": np.zeros(0), "force": np.zeros(0), "speed": np.zeros(0)}, "is empty"),
+        ({"time": t[210:], "force": f[210:], "speed": v[210:]}, "begins in contact"),
+        ({"force": f + 200.0}, "take an offset off"),
+        ({"time": t[:300], "force": f[:300], "speed": v[:300]}, "ends in contact"),
+        ({"time": t[::40], "force": f[::40], "speed": v[::40]}, "samples in contact"),
+        ({"speed": None}, "one of them"),
+    ]
+    for changes, message in cases:
+        with pytest.raises(InputError, match=message):
+            identify(changed(**changes))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"laws": ["Hunt-Crosley"]}, "did you mean 'Hunt-Crossley'"),
+        ({"laws": []}, "at least one"),
+        ({"level": 1.0}, "between 0 and 1"),
+        ({"target_mass": 0.0}, "a number > 0"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        identify(changed(), **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("time_s,force_N,hand_speed_m_s\n", "no rows"),
+        ("time_s,force,hand_speed_m_s\n0,1,2\n", "did you mean 'force'"),
+        ("time_s,force_N\n0,1\n", "no column hand_speed_m_s"),
+        ("time_s,force_N,hand_speed_m_s\n0,1\n", "row 2: 2 cells under 3"),
+        ("time_s,force_N,hand_speed_m_s\n0,many,2\n1,1,1\n", "force_N: nan at index 0"),
+        ("time_s,time_s,force_N\n0,0,1\n", "two columns"),
+    ],
+)
+def test_files_that_are_no_logs_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        read_log(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_log(tmp_path / "none.npz")
+    (tmp_path / "bad.npz").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="no npz file"):
+        read_log(tmp_path / "bad.npz")
+    with open(tmp_path / "one.npz", "wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(InputError, match="a single array"):
+        read_log(tmp_path / "one.npz")
+
+
+# ---------------------------------------------------------------- command
+def test_the_command_prints_numbers_and_writes_a_section(tmp_path: Path) -> None:
+    log, path, out = log_of(TrueBlow("Hunt-Crossley"), seed=3), tmp_path / "blow.csv", tmp_path / "law.toml"
+    columns = np.column_stack([log.time, log.force, log.speed])
+    np.savetxt(path, columns, delimiter=",", header="time_s,force_N,hand_speed_m_s", comments="")
+    words = ["identify", str(path), "--law", "Hunt-Crossley", "--law", "spring damper", "--out", str(out)]
+    result = CliRunner().invoke(app, [*words, "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert [law["law"] for law in told["laws"]] == ["Hunt-Crossley", "spring damper"]
+    assert told["best"] == "Hunt-Crossley" and told["blows"] == 1
+    section = read_toml(out.read_text(encoding="utf-8"))["contact"]
+    best = told["laws"][0]["estimates"]
+    assert section["law"] == "Hunt-Crossley"
+    assert section["dissipation_s_m"] == pytest.approx(best["dissipation"]["value"], rel=1e-4)
+    data = {**problem_data(load_problem("arm_planar")), "contact": section}
+    law = problem_from_data(data, where=tmp_path / "problem.toml").law
+    assert isinstance(law, HuntCrossley)
+    assert law.stiffness == pytest.approx(best["stiffness"]["value"], rel=1e-4)
+    shown = CliRunner().invoke(app, words)
+    assert shown.exit_code == 0 and "dissipation [s/m]" in shown.stdout and "AIC +0" in shown.stdout
+
+
+def test_the_command_refuses_in_words(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["identify", str(tmp_path / "none.csv")])
+    assert result.exit_code == 2 and "none.csv: cannot be read" in result.stderr

@@ -72,7 +72,7 @@ def _key(alone: bool) -> list[Line2D | Patch]:
         Line2D([], [], color=BLUE, linewidth=1.8, label="limb that strikes"),
         *others,
         Line2D([], [], color=VERMILION, linewidth=0.8, label="path of the striking point"),
-        Patch(facecolor="#dddddd", edgecolor=GREY, label="target before the blow"),
+        Patch(facecolor="#dddddd", edgecolor=GREY, label="target when contact begins"),
     ]
 
 

@@ -57,7 +57,8 @@ class Struck:
 
     def travel_at_start(self, reference: Any) -> float:
         """[m] that it has to go until contact is planned, below zero, as it moves before contact already."""
-        return -self.speed(self.untouched) * float(reference.contact_start)
+        before = self.speed(self.untouched)
+        return -before * float(reference.contact_start) if before else 0.0
 
     def depth(self, place: Array, travel: float) -> float:
         """[m] of a striking point at a place (3,) [m] in a target that has gone so far [m]; beside its face

@@ -20,7 +20,7 @@ _ROUNDED = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class HertzDamped(ContactLaw):
-    """f = k x^1.5 + d x^0.25 dx/dt.
+    """A sphere on a plane, with damping: k x^1.5 + d x^0.25 dx/dt.
 
     Hertz's elastic contact, and a restitution that speed does not change. With d = a sqrt(k mu), 1/mu = 1/m_1
     + 1/m_2, two masses part with e = exp(-2 zeta acos(zeta) / sqrt(1 - zeta^2)) of their speed of approach,

@@ -14,7 +14,7 @@ __all__ = ["HuntCrossley"]
 
 @dataclass(frozen=True, kw_only=True)
 class HuntCrossley(ContactLaw):
-    """f = k x^p (1 + 1.5 alpha dx/dt).
+    """A force that grows with depth and rate: k x^p (1 + 1.5 alpha dx/dt).
 
     Damping grows with penetration, so that f starts and ends at 0. Bodies that meet at the speed v part with
     e of it, whatever k, p and their masses: l v - ln(1 + l v) = -l e v - ln(1 - l e v) with l = 1.5 alpha,

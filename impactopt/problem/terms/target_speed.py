@@ -25,14 +25,12 @@ class TargetSpeed(Term):
 
     name: ClassVar[str] = "target speed"
     unit: ClassVar[str] = "m/s"
-    least: float | None = field(default=None, metadata=about("smallest speed", unit="m/s"))
-    most: float | None = field(default=None, metadata=about("largest speed", unit="m/s"))
+    least: float = field(metadata=about("smallest speed; -inf: any", unit="m/s", endless=True))
+    most: float = field(metadata=about("largest speed; inf: any", unit="m/s", endless=True))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.least is None and self.most is None:
-            raise InputError("TargetSpeed bounds nothing: give least, most, or both [m/s]")
-        if self.least is not None and self.most is not None and self.least > self.most:
+        if self.least > self.most:
             raise InputError(f"TargetSpeed: least is {self.least:g} m/s, most {self.most:g} m/s; swap them")
 
     def blocks(self, problem: Any, coordinates: Any) -> dict[str, BlockRecipe]:
@@ -47,8 +45,8 @@ class TargetSpeed(Term):
             place="separation",
             components=["normal"],
             outputs=np.array([at]),
-            lower=-np.inf if self.least is None else self.least,
-            upper=np.inf if self.most is None else self.most,
+            lower=self.least,
+            upper=self.most,
             measure=Measure("m/s", 1.0, "off"),
         )
 

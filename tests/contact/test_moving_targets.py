@@ -20,6 +20,7 @@ from impactopt.codegen.compiler import find_compiler
 from impactopt.collision import SDC, VirtualMass
 from impactopt.contact import Board, FreeMass, HuntCrossley, Nail, RigidWall, SpringDamper, Target
 from impactopt.simulation.reference import FullDynamics
+from impactopt.simulation.result import travelled
 
 pytestmark = [
     pytest.mark.skipif(find_compiler() is None, reason="no C compiler"),
@@ -127,3 +128,9 @@ def test_freezes_on_the_way_bring_a_blow_at_a_ball_nearer_to_full_dynamics() -> 
         errors.append(abs(model.collide(q, v, torque).impulse / full - 1))
     assert errors[0] < 0.02
     assert errors[1] < 0.3 * errors[0]
+
+
+def test_a_targets_travel_is_counted_from_where_it_is_hit() -> None:
+    time = np.array([0.0, 0.5, 1.0, 1.5])
+    assert travelled(time, np.full(4, -5.0), 1.0) == pytest.approx([5.0, 2.5, 0.0, -2.5])
+    assert travelled(time, np.zeros(4), np.nan) == pytest.approx(np.zeros(4))

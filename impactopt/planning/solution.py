@@ -122,12 +122,14 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
+    statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
     Its other attributes are those of :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
     contact_error: ContactError | None = None
+    statement: str = ""
 
     @property
     def impulse(self) -> float:

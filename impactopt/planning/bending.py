@@ -66,13 +66,12 @@ def moved_solution(
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, solution.apart, None)
     old = solution.result
-    there = max_violation(t.program, old.x, t.program.constraints(old.x))
-    # a first-order plan that meets the rows worse than the plan itself is no start
-    if first.status.usable:
+    # a first-order plan that is far off its rows is a worse start than the plan itself
+    if near := first.status.usable:
         result = budget.run(t.program, first, _BARRIER)
     else:
-        result = budget.run(t.program, first if first.max_violation < there else old)
-    if not result.status.usable and budget.left != 0:
+        result = budget.run(t.program, old)
+    if near and not result.status.usable and budget.left != 0:
         result = one_after_the_other(result, budget.run(t.program, old))
     if refine:
         t, result, _ = refining.rounds(t, result, old.x)

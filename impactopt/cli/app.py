@@ -40,6 +40,7 @@ from impactopt.cli.show import show
 from impactopt.cli.strike import strike
 from impactopt.cli.sweep import sweep
 from impactopt.cli.validate import validate
+from impactopt.cli.verify import EXAMPLES, verify
 from impactopt.report.plain_errors import plain_errors
 from impactopt.studies.bench_command import app as bench_app
 from impactopt.studies.figures import figures
@@ -187,6 +188,7 @@ app.command(
         "impactopt validate results/punch --animation punch.gif",
     )
 )(validate)
+app.command(epilog=EXAMPLES)(verify)
 app.command(epilog=examples("impactopt show results/punch --open", "impactopt show talos --open"))(show)
 app.command(
     epilog=examples(

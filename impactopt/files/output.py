@@ -72,7 +72,7 @@ class Record:
         with an abort motion, `missed_*`, `plan_*` (`Plan`), `swing_*`, `follow_*` (its splines),
         `collision_*` (`PlannedCollision`), `pose_*` (`Poses`), `simulated_*` (`Simulation`), `replayed_*`
         (`Simulation` on free soles, without velocities and torques), `solver_*` (`SolverResult`),
-        `history_*` (its iterations).
+        `history_*` (its iterations); `program_statement`, names of the program's variables and rows, as JSON.
     problem_path : where the problem file was, for the files that it names; None if there was none.
     """
 
@@ -133,6 +133,8 @@ def record_of(
     for prefix in {"reference", "simulated"} & parts.keys():
         arrays[f"{prefix}_angle"] = np.array([robot.joint_positions(q) for q in parts[prefix].q])
     arrays |= _parts_arrays(parts, result)
+    if solution.statement:
+        arrays["program_statement"] = solution.statement
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     return Record(summary=plain(summary), problem=problem, arrays=arrays, problem_path=problem_path)
 

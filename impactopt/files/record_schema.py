@@ -46,7 +46,7 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "point": "3", "normal": "3", "contact": ""},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),
 }
-_TEXTS = ("joints", "replayed_soles")
+_TEXTS = ("joints", "replayed_soles", "program_statement")
 _ROBOT = ("n", "nq", "nv")
 # of the motion; what there is none of may be NaN
 _FINITE = ("time", "q", "posture", "velocity", "angle", "torque", "links", "path")

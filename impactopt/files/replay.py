@@ -21,7 +21,7 @@ from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.accuracy import check_steps
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "replay"]
+__all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "replay"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +76,7 @@ def load_planned(
         usual = "it is a strike, the blow alone" if strike else "the solve was stopped before there was one"
         note = record.summary.get("note", usual)
         raise InputError(f"{result} holds no motion to replay: {note}")
-    problem = _problem(record, Path(result), problem_file, settings)
+    problem = problem_of(record, Path(result), problem_file, settings)
     a, robot = record.arrays, problem.robot
     if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
         raise InputError(
@@ -93,12 +93,18 @@ def _trajectory(record: Record, prefix: str) -> Trajectory:
     return Trajectory(**fields)
 
 
-def _problem(
+def problem_of(
     record: Record,
     result: Path,
     problem_file: str | os.PathLike[str] | None,
     settings: Mapping[str, Any] | None,
 ) -> ImpactProblem:
+    """The problem of a record, built again; arguments as of `load_planned`.
+
+    Raises
+    ------
+    InputError : the record has no problem file, or it cannot be built again.
+    """
     if problem_file is not None:
         return read_problem_file(problem_file, settings).build()
     if not record.problem:

@@ -34,6 +34,7 @@ from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.rattle import rattle
 from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate
+from impactopt.transcription.statement import statement_of
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 
@@ -137,6 +138,7 @@ def solve(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         rattle=rattle(t, result.x) if result.status.usable else None,
         apart=t.apart_rows,
+        statement=statement_of(t),
         **fields,
     )
 

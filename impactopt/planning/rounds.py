@@ -123,11 +123,11 @@ class Refining:
         if self._stuck(result) and t.apart_rows and self.budget.left != 0:
             t, result = self._led_out(free, t, result, x0)
         else:
-            t, result = self._judged(*self.rounds(t, result, x0)[:2])
+            t, result = self.judged(*self.rounds(t, result, x0)[:2])
         looked = self._looked_at(t, result, x0)
         if looked is result or not looked.status.usable:
             return t, looked
-        return self._judged(*self.rounds(t, looked, x0)[:2])
+        return self.judged(*self.rounds(t, looked, x0)[:2])
 
     def _stuck(self, result: SolverResult) -> bool:
         """Whether the solver has ended without a solution, and not at a limit that the caller has set."""
@@ -146,7 +146,7 @@ class Refining:
         """
         if self.report is not None:
             self.report("no motion was found from there with rows between bodies: first without them")
-        last, result = self._judged(*self.rounds(free, self.budget.run(free.program, x0), x0)[:2])
+        last, result = self.judged(*self.rounds(free, self.budget.run(free.program, x0), x0)[:2])
         if result.status.usable:
             return last, one_after_the_other(stuck, result)
         return t, one_after_the_other(result, stuck)
@@ -180,7 +180,7 @@ class Refining:
         """Whether a result has been looked at, and nothing touches anything."""
         return self._apart is not None and self._apart[1] is result
 
-    def _judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
+    def judged(self, t: Transcription, result: SolverResult) -> tuple[Transcription, SolverResult]:
         """A result that could not be mended is a solution only if nothing touches anything; else the last one
         is that was, if any.
         """

@@ -122,12 +122,14 @@ class Solution(Solved):
     nodes : nodes that mesh refinement has added to the ends and middles of the splines' intervals.
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
+    statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
     Its other attributes are those of :class:`Solved`.
     """
 
     plan: Plan
     nodes: MoreNodes = NO_MORE
     contact_error: ContactError | None = None
+    statement: str = ""
 
     @property
     def impulse(self) -> float:
@@ -186,6 +188,39 @@ class Solution(Solved):
         if engine == "mujoco" and self.plan.abort is not None:
             options.setdefault("missed", self.missed_trajectory)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
+
+    def moved(self, *, polish: bool = True, **changes: Any) -> Solution:
+        """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
+        ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
+
+        First come Newton steps with the KKT system of this plan and its active set, factored once; then the
+        solver goes on from there, with this plan's mesh. ``polish=False``: the first alone. They are quick
+        and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
+        ``refine=True`` refines the mesh too, as `impactopt.solve` does.
+
+        Raises
+        ------
+        InputError : this is no solution; nothing is changed, or what target and law do not have; the program
+            has other rows or bodies then.
+        """
+        # by the public name: what solves comes after solutions in the order of imports
+        from impactopt import moved_solution
+
+        found: Solution = moved_solution(self, polish=polish, **changes)
+        return found
+
+    def sensitivity(self, parameter: str) -> Any:
+        """How impulse and objective answer to a number of the problem, such as ``"target.mass"``,
+        ``"contact.stiffness"``, ``"point.x"`` or ``"terms.torque_limit.fraction"``, and which rows bind, with
+        their shadow prices: a :class:`impactopt.planning.sensitivity.Sensitivity`.
+
+        Raises
+        ------
+        InputError : there is no such number; this is no solution, or its KKT system is singular.
+        """
+        from impactopt import sensitivity_of
+
+        return sensitivity_of(self, parameter)
 
     def animate(self, *, simulation: Any | None = None, replay: Any | None = None) -> Any:
         """The motion in 3D, in a notebook or as a file: ``solution.animate().save("punch.html")``.

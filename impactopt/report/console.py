@@ -110,6 +110,18 @@ def replay_table(report: Mapping[str, Any], summary: Mapping[str, Any]) -> Table
     return _table(summary, replay_columns(report, summary))
 
 
+def verdict_table(verdict: Mapping[str, Any]) -> Table:
+    """What was verified, the worst first; `verdict` as in `impactopt verify --json`."""
+    kkt = "not computed" if verdict["kkt"] is None else f"KKT residual {verdict['kkt']:.2g}"
+    words = "ok" if verdict["ok"] else "not ok"
+    table = Table(title=_plain(f"{words}; {kkt}"), title_justify="left")
+    for name in ("rows", "violation", "where"):
+        table.add_column(name, justify="right" if name == "violation" else "left")
+    for name, row in sorted(verdict["rows"].items(), key=lambda item: -item[1]["violation"]):
+        table.add_row(_plain(name), f"{row['violation']:.2g}", _plain(row["where"]))
+    return table
+
+
 def strike_table(summary: Mapping[str, Any]) -> Table:
     """The planned blow; `summary` as of a :class:`impactopt.StrikeSolution`."""
     table = _table(summary, {"planned": summary}, PHASES_OF_STRIKE)

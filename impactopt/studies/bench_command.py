@@ -111,6 +111,15 @@ def _models(
     """Plan time against plan truth: every model of the collision in a push, a hammer's blow, G1, an arm."""
 
 
+@_command("moved")
+def _moved(
+    shifts: Annotated[int, typer.Option(min=1, help="Number of shifts of each problem.")] = 200,
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="The planar arm only.")] = False,
+) -> None:
+    """Plans bent for other points, masses and stiffnesses: first order, and polished by the solver."""
+
+
 @_command("fidelity")
 def _fidelity(
     workers: Compilers = 2,
@@ -229,6 +238,7 @@ def _all(
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
         "models": {"quick": True},
+        "moved": {"shifts": min(draws, FEW_DRAWS), "quick": True, "seed": seed},
         "fidelity": {"workers": workers, "quick": True},
         "freezes": drawn,
         "gains": {"quick": True},

@@ -22,6 +22,7 @@ BENCHES = {
     "baselines": "baselines",
     "margins": "margins",
     "models": "models",
+    "moved": "moved",
     "fidelity": "fidelity",
     "freezes": "freezes",
     "gains": "gains",

@@ -21,8 +21,10 @@ import scipy.sparse as sp
 from impactopt.bodies.fit import PLANES
 from impactopt.codegen.cache import cached
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.robots.robot import Robot
+from impactopt.transcription.batched import Block
 from impactopt.transcription.blocks import BlockExpression, make_block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, stack
@@ -308,6 +310,24 @@ def add_apart_rows(
             for row, spot in zip(group.rows, group.spots, strict=True)
         ]
         b.rows.add_each(origins, outputs=first + np.arange(len(counts)), lower=0.0)
+
+
+def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
+    """Blocks of these rows with the world's bodies where this problem has them; none is turned."""
+    of_name = {block.name: block for block in blocks}
+    numbers = {name: block.parameters.copy() for name, block in of_name.items()}
+    seen = dict.fromkeys(of_name, 0)
+    for row, held in rows.items():
+        chain = _chain(problem.robot, row.joint, max(row.other, 0))
+        name = f"apart{chain.length}"
+        if row.other < 0:
+            placed = chain.places[0]
+            body, normal = problem.bodies.world[-1 - row.other], problem.bodies.normal
+            at = pin.SE3(body.rotation, body.place + held.travel * normal * body.moves)
+            numbers[name][seen[name], :12] = _placement(at.inverse() * placed)
+        seen[name] += 1
+    for name, block in of_name.items():
+        block.take_parameters(numbers[name])
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from impactopt.problem.objectives import Objective
 from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
-from impactopt.transcription.apart import ApartRow, Held, add_apart_rows
+from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, move_apart
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -220,6 +220,29 @@ class ContactProgram(ABC):
         other.builder, other.apart_rows = self._bare.copy(), dict(rows)
         add_apart_rows(other.builder, [*self.swing_spots(), *self.follow_spots()], other.apart_rows)
         return other
+
+    def take_program(self, other: ContactProgram) -> None:
+        """Have the program of another one, which differs in numbers only, and its rows between bodies.
+
+        One of its own would take longer to build. The other has none from then on.
+
+        Raises
+        ------
+        ValueError : it differs in more.
+        """
+        program = other.program
+        del other.__dict__["program"]
+        first = list(program.blocks[: len(self.blocks)])
+        if program.n != self.layout.n or [(b.name, b.count) for b in first] != [
+            (b.name, b.count) for b in self.blocks
+        ]:
+            raise ValueError("the other program has other variables or blocks")
+        objective, quadratic, linear = self._worth
+        program.take_numbers(
+            self.layout, self.blocks, self.rows, objective=objective, quadratic=quadratic, linear=linear
+        )
+        move_apart(self.problem, program.blocks[len(self.blocks) :], other.apart_rows)
+        self.__dict__["program"], self.apart_rows = program, other.apart_rows
 
     def with_lifted(self, x: Array) -> Array:
         """The variables (n,) with lifted ones made equal to what they stand for."""

@@ -31,12 +31,16 @@ class BatchedFunction:
         self._buffer, self._run = self._mapped.buffer()
         # instances beyond `count` fill the last call up: they are the last one, again
         self.inputs = [np.zeros((calls * columns, function.size1_in(i))) for i in range(function.n_in())]
-        self.inputs[1][...] = parameters[np.minimum(np.arange(calls * columns), count - 1)]
         self.count, self._shape = count, (calls * columns, function.nnz_out(0) // columns)
+        self.take_parameters(parameters)
         for i, a in enumerate(self.inputs):
             if a.size:
                 self._buffer.set_arg(i, a.data)
         self.write_to(np.zeros(self.size))
+
+    def take_parameters(self, parameters: Array) -> None:
+        """Others (count, n_p) from now on."""
+        self.inputs[1][...] = parameters[np.minimum(np.arange(len(self.inputs[1])), self.count - 1)]
 
     def copy(self) -> BatchedFunction:
         """The same, with numbers of its own."""
@@ -94,6 +98,16 @@ class Block:
     lift: Affine  # (count * n_in)
     jac_pattern: tuple[Index, Index]
     hess_pattern: tuple[Index, Index]
+
+    @property
+    def parameters(self) -> Array:
+        """(count, n_p)"""
+        return self.value.inputs[1][: self.count]
+
+    def take_parameters(self, parameters: Array) -> None:
+        """Others (count, n_p) from now on."""
+        for function in (self.value, self.jacobian, self.hessian):
+            function.take_parameters(parameters)
 
     def copy(self) -> Block:
         """The same for another program: a program tells its functions where to write."""

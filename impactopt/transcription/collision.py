@@ -65,7 +65,7 @@ class Collision(Collocated):
             self.law, self.target = scenario.numbers(p.law, p.target)
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
-        n = len(stages)
+        n, self._switches = len(stages), switches(p.law)
 
         def add(name: str, size: int, **options: Any) -> Group:
             return b.layout.add(named + name, n, size, **options)
@@ -281,7 +281,7 @@ class Collision(Collocated):
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
         if i in self.end:
             return
-        if switches(b.problem.law) and target.guards:
+        if self._switches and target.guards:
             back = self._restitution(i)
             b.rows.add(
                 term="approach speed",

@@ -36,6 +36,7 @@ class MotionPhase(ABC):
     def __init__(self, name: str, phase: Phase, breaks: Array, nodes: Array, more: tuple[float, ...]) -> None:
         self.name, self.phase = name, phase
         self.breaks, self.nodes, self.more = breaks, nodes, more
+        self._at: dict[float, tuple[Affine, Affine, Affine]] = {}
 
     def _add_variables(self, b: Builder, kind: str, points: int) -> None:
         """``points`` control points, and all else; ``kind``: their names' first word."""
@@ -51,11 +52,13 @@ class MotionPhase(ABC):
 
     def at(self, s: float) -> tuple[Affine, Affine, Affine]:
         """y, y', y'' at s."""
-        y, yd, ydd = (
-            add([self.control(int(j)) * row[0, j] for j in np.flatnonzero(row[0])])
-            for row in basis(self.breaks, s)
-        )
-        return y, yd, ydd
+        if s not in self._at:  # rows, prices and places ask for the same few
+            y, yd, ydd = (
+                add([self.control(int(j)) * row[0, j] for j in np.flatnonzero(row[0])])
+                for row in basis(self.breaks, s)
+            )
+            self._at[s] = y, yd, ydd
+        return self._at[s]
 
     # ------------------------------------------------------------------ nodes
     def place_at(self, s: float) -> Place:

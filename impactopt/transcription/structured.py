@@ -67,6 +67,38 @@ class StructuredProgram:
         self.seconds = 0.0
         self._x: Array | None = None
 
+    def take_numbers(
+        self,
+        layout: Layout,
+        blocks: Sequence[Block],
+        rows: Rows,
+        *,
+        objective: Affine,
+        quadratic: sp.spmatrix | sp.sparray,
+        linear: Array,
+    ) -> None:
+        """The numbers of another program of the same structure, whose blocks and rows are the first of this
+        one's; the others keep theirs.
+
+        Blocks and rows touch the same variables, with the same weights: what differs are bounds, constants
+        and parameters.
+        """
+        self.x_lower, self.x_upper = layout.lower, layout.upper
+        for mine, other in zip(self.blocks, blocks, strict=False):
+            mine.take_parameters(other.parameters)
+        offset = np.concatenate([np.zeros(0), *(b.lift.const for b in blocks)])
+        self._lift_const = np.concatenate([offset, self._lift_const[len(offset) :]])
+        for name, given in (("g_lower", rows.lower), ("g_upper", rows.upper)):
+            found = np.concatenate([np.zeros(0), *given])
+            setattr(self, name, np.concatenate([found, getattr(self, name)[len(found) :]]))
+        constants = np.concatenate([np.zeros(0), *(affine.const for affine in rows.affine)])
+        self._rows_const = np.concatenate([constants, self._rows_const[len(constants) :]])
+        self._c = np.zeros(self.n)
+        np.add.at(self._c, objective.cols, objective.vals)
+        self._c += linear
+        self._c0 = float(objective.const.sum())
+        self._Q = sp.csc_array(quadratic)
+
     # ------------------------------------------------------------------ evaluation
     def _lifted(self, x: Array) -> list[Array]:
         z = self._lift @ x + self._lift_const

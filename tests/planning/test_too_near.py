@@ -110,10 +110,10 @@ def test_a_result_that_touches_nothing_goes_before_a_later_one_that_does(free: S
     problem = with_peg(free.problem, x, z)
     t, later = program_of(free, problem), dataclasses.replace(free.result, iterations=1000)
     rounds = refining(problem)
-    assert rounds._judged(t, later)[1].status is Status.FAILED
+    assert rounds.judged(t, later)[1].status is Status.FAILED
     before = program_of(free, free.problem), free.result
     rounds._apart = before
-    kept, result = rounds._judged(t, later)
+    kept, result = rounds.judged(t, later)
     assert kept is before[0] and result.status is Status.SOLVED and result.iterations == 1000
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from impactopt.contact.laws import SpringDamper
 from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
+from impactopt.files.output import record_of
 from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
@@ -26,6 +27,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.studies.bench.kept import Kept
 from impactopt.studies.bench.planning import DEMO, solved
 from impactopt.studies.report import Report, Say, columns_table
+from impactopt.verification.verdict import verify_record
 
 __all__ = ["BASES", "ROWS", "Base", "cleanliness", "draw", "drawn_problem", "row", "run"]
 
@@ -266,11 +268,21 @@ def row(name: str, plan: PlanOf) -> dict[str, Any]:
             "stands": said["standing"],
             "reason": said["reason"],
             **cleanliness(solution, replay),
+            **_verified(solution),
         }
     except Exception as error:  # one of a hundred must not end the others
         out["status"] = out["status"] or "error"
         out["error"] = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     return out
+
+
+def _verified(solution: Solution) -> dict[str, Any]:
+    """What `impactopt verify` would say of it."""
+    if not solution.statement:
+        return {}
+    record = record_of(solution)
+    verdict = verify_record(solution.problem, record.arrays, record.summary)
+    return {"verified": verdict.ok, "kkt": verdict.kkt, "not_verified": verdict.reason or None}
 
 
 def cleanliness(solution: Solution, replay: Any) -> dict[str, Any]:

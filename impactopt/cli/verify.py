@@ -1,0 +1,57 @@
+"""The command `impactopt verify`: is a result what it says, computed anew by code of its own?"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from impactopt.cli.options import AsJson, Quiet, Verbose, check_loudness, examples
+from impactopt.report.plain_errors import plain_errors
+
+NOT_OK = 1  # exit code
+EXAMPLES = examples("impactopt verify results/punch", "impactopt verify results/punch --json")
+
+
+def verify(
+    result: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RESULT", help="Directory that `impactopt solve` wrote, such as results/punch."
+        ),
+    ],
+    problem: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Problem file, instead of the one stored in RESULT.")
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Compute every row, the objective and the KKT residual of a result anew, trusting nothing of the solver.
+
+    Exit code: 0 all is as it says, 1 it is not, or part of it could not be computed, 2 bad input.
+    """
+    with plain_errors("interrupted before the result was verified", verbose=verbose) as stderr:
+        from impactopt.files.output import plain
+        from impactopt.files.verify import verify as verified
+        from impactopt.report.console import SolveConsole, verdict_table
+
+        check_loudness(quiet, verbose)
+        with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
+            progress.say(f"{result}: computing its rows, and their slopes by differences")
+            verdict = verified(result, problem_file=problem)
+        if as_json:
+            typer.echo(json.dumps(plain(verdict.describe()), indent=2))
+        else:
+            from rich.console import Console
+
+            from impactopt.errors import printable
+
+            console = Console()
+            console.print(verdict_table(verdict.describe()))
+            if verdict.reason:
+                console.print(printable(verdict.reason), markup=False, highlight=False)
+        if not verdict.ok:
+            raise typer.Exit(NOT_OK)

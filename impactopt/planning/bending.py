@@ -1,0 +1,148 @@
+"""Plans bent for other numbers of their problem: first by the KKT system of the plan, then by the solver."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impactopt.planning.bent_program import bent_of
+from impactopt.planning.changes import moved_problem
+from impactopt.planning.keeping_apart import Margins
+from impactopt.planning.models import model_error
+from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after_the_other, violations_of
+from impactopt.planning.rounds import Refining
+from impactopt.planning.solution import Solution
+from impactopt.solvers.active import ActiveSystem, Change, Offset
+from impactopt.solvers.program import SolverResult, Status, max_violation
+from impactopt.transcription.rattle import rattle
+from impactopt.transcription.statement import statement_of
+from impactopt.transcription.transcription import Transcription
+
+__all__ = ["moved_solution"]
+
+_FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
+_ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
+_BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near as that
+
+
+def moved_solution(
+    solution: Solution,
+    *,
+    point: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+    mass: float | None = None,
+    stiffness: float | None = None,
+    damping: float | None = None,
+    margin: float | None = None,
+    polish: bool = True,
+    refine: bool = False,
+    options: Mapping[str, Any] | None = None,
+    time_limit: float | None = None,
+) -> Solution:
+    """The plan for a problem with other numbers: `Solution.moved`."""
+    problem = moved_problem(
+        solution.problem,
+        point=point,
+        normal=normal,
+        mass=mass,
+        stiffness=stiffness,
+        damping=damping,
+        margin=margin,
+    )
+    bent = bent_of(solution)
+    system, own = bent.steady
+    began = time.perf_counter()
+    t = bent.program_for(problem)
+    built = time.perf_counter()
+    budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=None).started()
+    first = _first_order(solution, t, system, own)
+    if not polish:
+        return _solution(solution, t, first, (built - began, time.perf_counter() - built))
+    margins = Margins(problem) if problem.keeps_apart else None
+    refining = Refining(budget, margins, solution.apart, None)
+    old = solution.result
+    # a first-order plan that is far off its rows is a worse start than the plan itself
+    if near := first.status.usable:
+        result = budget.run(t.program, first, _BARRIER)
+    else:
+        result = budget.run(t.program, old)
+    if near and not result.status.usable and budget.left != 0:
+        result = one_after_the_other(result, budget.run(t.program, old))
+    if refine:
+        t, result, _ = refining.rounds(t, result, old.x)
+    t, result = refining.judged(t, result)
+    return _solution(solution, t, result, (built - began, time.perf_counter() - built))
+
+
+def _first_order(solution: Solution, t: Transcription, system: ActiveSystem, own: Offset) -> SolverResult:
+    """Newton steps on the changed program's KKT conditions with the solution's own matrix and active set,
+    clipped to bounds: the first is the plan of first order, more of them while rows are off and they help.
+
+    What the solver had left at the solution is not made up for.
+    """
+    program, began = t.program, time.perf_counter()
+    at, best, worst = Change(x=system.x, y=system.y, z=system.z), None, np.inf
+    for taken in range(1 + _CORRECTIONS):
+        off = system.offset(program, at)
+        step = system.step(off.less(own))
+        x = np.clip(at.x + step.x, program.x_lower, program.x_upper)
+        at = Change(x=x, y=at.y + step.y, z=at.z + step.z)
+        found = max_violation(program, x, program.constraints(x))
+        if not found < worst:
+            break
+        best, worst, steps = at, found, taken + 1
+        if worst <= _ENOUGH:
+            break
+    assert best is not None
+    unequal, moves = program.g_lower < program.g_upper, program.x_lower < program.x_upper
+    gone_y, gone_z = unequal & (system.rows * best.y < 0), moves & (system.bounds * best.z < 0)
+    turned = int(gone_y.sum() + gone_z.sum())
+    words = f"By {steps} steps of first order: rows are off by {worst:.1g} at most"
+    words += f"; {turned} of those that held should not any more." if turned else "."
+    seconds = time.perf_counter() - began
+    return replace(
+        solution.result,
+        x=best.x,
+        multipliers=np.where(gone_y, 0.0, best.y),
+        bound_multipliers=np.where(gone_z, 0.0, best.z),
+        objective=program.objective(best.x),
+        status=Status.ACCEPTABLE if worst <= _FIRST_ORDER else Status.ITERATION_LIMIT,
+        iterations=steps,
+        seconds=seconds,
+        seconds_functions=0.0,
+        seconds_qp=seconds,
+        max_violation=worst,
+        kkt=float("nan"),
+        message=words,
+        history=(),
+    )
+
+
+def _solution(
+    old: Solution, t: Transcription, result: SolverResult, seconds: tuple[float, float]
+) -> Solution:
+    usable = result.status.usable
+    attempt: Attempt = replace(attempt_of(t, "moved", result), kept=True)
+    return Solution(
+        problem=t.problem,
+        plan=t.decode(result.x),
+        result=result,
+        solver=old.solver,
+        build_seconds=seconds[0],
+        solve_seconds=seconds[1],
+        violations=violations_of(t, result.x, t.program.constraints(result.x)),
+        objectives=t.achieved(result.x),
+        attempts=(attempt,),
+        rattle=rattle(t, result.x) if usable else None,
+        model_error=model_error(t, result.x) if usable else None,
+        apart=t.apart_rows,
+        elements=t.hit.elements if t.hit.guarded else (),
+        shares=t.hit.shares,
+        nodes=t.nodes,
+        statement=statement_of(t) if len(t.rows.origins) == t.program.m else old.statement,
+    )

@@ -1,0 +1,101 @@
+"""A solution's program with other numbers, and its KKT system: what bent plans and sensitivities need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from functools import cached_property
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from impactopt.errors import InputError
+from impactopt.planning.keeping_apart import same_bodies
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.active import ActiveSystem, Offset
+from impactopt.transcription.transcription import Transcription, block_functions
+
+__all__ = ["Bent", "bent_of"]
+
+_PROXIMAL = 1e-2  # [N s] beside the objective's curvature, per square of a variable of order one
+
+
+class Bent:
+    """A solution's own program, and its KKT system, factored once."""
+
+    def __init__(self, solution: Solution) -> None:
+        self.solution = solution
+        self._spare: Transcription | None = None
+        self.program = self.program_for(solution.problem)
+        self._spare = self.program_for(solution.problem)
+
+    def program_for(
+        self, problem: ImpactProblem, report: Callable[[str], None] | None = None
+    ) -> Transcription:
+        """The solution's program with the numbers of another problem: the same variables and rows.
+
+        Where point, contact law and target alone are others it is good until the next one is asked for.
+
+        Raises
+        ------
+        InputError : they are others.
+        """
+        s = self.solution
+        if self._spare is not None and _alike(problem, s.problem):
+            functions = self._spare.functions
+            t = Transcription(problem, problem.coordinates, functions, s.nodes, s.elements, s.shares)
+            t.take_program(self._spare)
+            self._spare = t
+            return t
+        functions = block_functions(problem, problem.coordinates, report, s.elements)
+        t = Transcription(problem, problem.coordinates, functions, s.nodes, s.elements, s.shares)
+        if s.apart:
+            if not same_bodies(problem, s.problem):
+                raise InputError("the world has other bodies then: use solve(problem, start=solution)")
+            t = t.with_apart(s.apart)
+        if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
+            raise InputError("the program has other rows then: use solve(problem, start=solution)")
+        return t
+
+    @cached_property
+    def system(self) -> ActiveSystem:
+        r = self.solution.result
+        return ActiveSystem(self.program.program, r.x, r.multipliers, r.bound_multipliers)
+
+    @cached_property
+    def steady(self) -> tuple[ActiveSystem, Offset]:
+        """The same for steps that are not small, and leave alone what hardly matters; and what the solver has
+        left, which is no part of what a change does.
+        """
+        r = self.solution.result
+        common = r.x, r.multipliers, r.bound_multipliers
+        system = ActiveSystem(self.program.program, *common, proximal=_PROXIMAL)
+        return system, system.offset(self.program.program)
+
+
+def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
+    """Whether programs of the two differ in bounds, constants and parameters only."""
+    changing = {"point", "law", "target", "name"}
+    pairs = [
+        (getattr(problem, f.name), getattr(other, f.name)) for f in fields(problem) if f.name not in changing
+    ]
+    same = all(
+        one is two or (np.array_equal(one, two) if isinstance(one, np.ndarray) else one == two)
+        for one, two in pairs
+    )
+    kinds = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)
+    return same and kinds and (not problem.keeps_apart or same_bodies(problem, other))
+
+
+_known: WeakKeyDictionary[Solution, Bent] = WeakKeyDictionary()
+
+
+def bent_of(solution: Solution) -> Bent:
+    if not solution.status.usable:
+        raise InputError(
+            f"this plan is no solution ({solution.status.value}): it has no sensitivities; solve it first"
+        )
+    if solution not in _known:
+        _known[solution] = Bent(solution)
+    return _known[solution]

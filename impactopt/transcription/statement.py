@@ -1,0 +1,43 @@
+"""What a saved result says of its program: names of variables and rows, and what the mesh has more."""
+
+from __future__ import annotations
+
+import json
+from itertools import groupby
+from typing import Any
+
+from impactopt.transcription.collision import Collision
+from impactopt.transcription.transcription import Transcription
+
+__all__ = ["statement_of"]
+
+
+def statement_of(t: Transcription) -> str:
+    """As JSON, for a reader that knows nothing of this package.
+
+    `groups`: name, count and size of the variables, in their order. `rows`: term, place and the number of a
+    list of `components`. `more`: nodes beside those of the mesh. `elements`, `guarded`, `shortest`: of the
+    contact, its least durations [s] by collision. `apart`: rows between bodies.
+    """
+    lists: dict[tuple[str, ...], int] = {}
+    rows = []
+    for (term, place), found in groupby(t.rows.origins, lambda row: (row.term, row.place.name)):
+        components = tuple(row.component for row in found)
+        rows.append([term, place, lists.setdefault(components, len(lists))])
+    collisions = [c for c in t.hit.collisions if isinstance(c, Collision)]
+    held: list[dict[str, Any]] = [
+        {"place": row.place, "joint": row.joint, "other": row.other, **kept._asdict()}
+        for row, kept in t.apart_rows.items()
+    ]
+    return json.dumps(
+        {
+            "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],
+            "rows": rows,
+            "components": list(lists),
+            "more": [list(t.nodes.swing), list(t.nodes.follow)],
+            "elements": t.hit.elements if collisions else [],
+            "guarded": t.hit.guarded,
+            "shortest": [c.shortest for c in collisions],
+            "apart": held,
+        }
+    )

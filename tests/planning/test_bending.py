@@ -1,0 +1,117 @@
+"""Plans bent for other numbers, and what numbers are worth: against problems that are solved again."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impactopt.errors import InputError
+from impactopt.files.problem_file import load_problem
+from impactopt.planning.bent_program import bent_of
+from impactopt.planning.changes import parameter_of
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.solvers.program import Status
+
+TIGHT: dict[str, Any] = {"kkt_tolerance": 1e-8, "complementarity_tolerance": 1e-8}
+
+
+@pytest.fixture(scope="module")
+def arm() -> Solution:
+    problem = load_problem(Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml")
+    return solve(problem, options=TIGHT, refine=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "half"),
+    [
+        ("target.mass", 2e-4),
+        ("contact.stiffness", 2e3),
+        ("point.z", 2e-4),
+        ("terms.torque_limit.collision", 1e-3),
+    ],
+)
+def test_sensitivities_are_those_of_problems_solved_again(arm: Solution, name: str, half: float) -> None:
+    number = parameter_of(arm.problem, name)
+    sides = [
+        solve(number.at(number.value + sign * half), start=arm, options=TIGHT, refine=False)
+        for sign in (1, -1)
+    ]
+    wanted = (sides[0].impulse - sides[1].impulse) / (2 * half)
+    found = arm.sensitivity(name)
+    assert found.value == number.value
+    assert found.impulse == pytest.approx(wanted, rel=1e-4)
+    # the least durations of the contact, from a point mass, leave 1e-3 of the objective's slope uncertain
+    worth = -(sides[0].result.objective - sides[1].result.objective) / (2 * half)
+    assert found.objective == pytest.approx(worth, rel=3e-3)
+
+
+def test_a_shadow_price_is_what_the_bound_is_worth(arm: Solution) -> None:
+    """Torque in contact binds at one place, so its limit is worth its price."""
+    found = arm.sensitivity("terms.torque_limit.collision")
+    torques = [b for b in found.binding if b.row.startswith("torque limit in collision")]
+    percent = found.value / 100
+    assert sum(b.price for b in torques) == pytest.approx(found.objective * percent, rel=1e-3)
+    assert {b.unit for b in torques} == {"%"}
+    prices = [b.price for b in found.binding]
+    assert all(price > 0 for price in prices) and prices == sorted(prices, reverse=True)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"mass": 0.055},
+        {"stiffness": 4.5e5},
+        {"point": [0.705, 0.0, 0.745]},
+        {"damping": 220.0, "mass": 0.045},
+    ],
+    ids=lambda changes: " ".join(changes),
+)
+def test_a_bent_plan_is_that_of_the_changed_problem(arm: Solution, changes: dict[str, Any]) -> None:
+    bent = arm.moved(**changes)
+    again = solve(bent.problem, start=arm, refine=False)
+    assert bent.status is Status.SOLVED and again.status is Status.SOLVED
+    assert bent.impulse == pytest.approx(again.impulse, rel=1e-5)
+    assert bent.result.objective == pytest.approx(again.result.objective, rel=1e-6)
+    first = arm.moved(**changes, polish=False)
+    assert abs(first.impulse - bent.impulse) < abs(arm.impulse - bent.impulse) + 1e-6
+    assert abs(first.impulse / bent.impulse - 1) < 1e-3
+    assert first.result.iterations <= 5 and "first order" in first.result.message
+
+
+def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> None:
+    """What takes the numbers of another program has its functions."""
+    bent = bent_of(arm)
+    problem = dataclasses.replace(
+        arm.problem,
+        point=arm.problem.point + np.array([0.01, 0.0, 0.02]),
+        target=dataclasses.replace(arm.problem.target, mass=0.07, depth=0.004),
+        law=dataclasses.replace(arm.problem.law, stiffness=3e5),
+    )
+    quick = bent.program_for(problem).program
+    spare, bent._spare = bent._spare, None  # from here on everything is built
+    whole = bent.program_for(problem).program
+    bent._spare = spare
+    x, y = arm.result.x, arm.result.multipliers
+    for name in ("x_lower", "x_upper", "g_lower", "g_upper"):
+        assert np.array_equal(getattr(quick, name), getattr(whole, name)), name
+    assert np.array_equal(quick.constraints(x), whole.constraints(x))
+    assert quick.objective(x) == whole.objective(x)
+    assert np.array_equal(quick.jacobian(x).toarray(), whole.jacobian(x).toarray())
+    assert np.array_equal(quick.hessian(x, 1.0, y).toarray(), whole.hessian(x, 1.0, y).toarray())
+
+
+def test_what_cannot_be_bent_is_said(arm: Solution) -> None:
+    with pytest.raises(InputError, match="nothing is moved"):
+        arm.moved()
+    with pytest.raises(InputError, match=r"target\.mas.*target\.mass"):
+        arm.sensitivity("target.mas")
+    stopped = dataclasses.replace(arm, result=dataclasses.replace(arm.result, status=Status.ITERATION_LIMIT))
+    with pytest.raises(InputError, match="no solution"):
+        stopped.moved(mass=0.06)
+    with pytest.raises(InputError, match="margin"):
+        arm.moved(margin=-1.0)

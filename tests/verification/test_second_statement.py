@@ -1,0 +1,103 @@
+"""The program written down a second time has the rows, bounds and objective of the first, at any point."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.rooms import FILES, imports, room, rooms_imported
+from support.small_plans import arm_problem, transcribed
+
+from impactopt.files.problem_file import load_problem
+from impactopt.problem.scenario import Scenario
+from impactopt.transcription.start import first_iterate
+from impactopt.transcription.statement import statement_of
+from impactopt.transcription.transcription import Transcription, block_functions
+from impactopt.verification.kkt import lagrangian_gradient
+from impactopt.verification.program import Program
+from impactopt.verification.variables import Variables
+from impactopt.verification.verdict import claims_of
+
+PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
+ALLOWED = {"bodies", "contact", "errors", "kinematics", "problem", "robots", "verification"}
+# those of `kinematics` that are numbers alone
+NUMBERS = {"impactopt.kinematics.splines", "impactopt.kinematics.support", "impactopt.kinematics.wrench_cone"}
+
+
+def test_it_shares_no_code_with_program_and_solver() -> None:
+    own = [file for file in FILES if room(file) == "verification"]
+    assert own
+    for file in own:
+        assert rooms_imported(file) <= ALLOWED, file
+        used = {name for name in imports(file) if name.startswith("impactopt.kinematics")}
+        assert used <= NUMBERS, file
+
+
+def away_from_start(t: Transcription) -> np.ndarray:
+    x, draw = first_iterate(t), np.random.default_rng(0)
+    return x + 1e-2 * draw.standard_normal(len(x)) * np.clip(np.abs(x), 1e-3, 1.0)
+
+
+def second(t: Transcription, x: np.ndarray) -> tuple[Program, Variables]:
+    claims = claims_of({"program_statement": np.array(statement_of(t))})
+    program = Program(t.problem, claims)
+    return program, Variables(claims.groups, program.scales, x)
+
+
+def check_rows(t: Transcription) -> None:
+    x = away_from_start(t)
+    program, v = second(t, x)
+    assert program.missing == []
+    found: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for piece in program.rows:
+        for name, g, low, high in zip(piece.names, piece.value(v), piece.lower, piece.upper, strict=True):
+            if np.isfinite(low) or np.isfinite(high):
+                found.setdefault(name, []).append((g - low, high - g))
+    g, lower, upper = t.program.constraints(x), t.program.g_lower, t.program.g_upper
+    for row, below, above in zip(t.rows.origins, g - lower, upper - g, strict=True):
+        own = found[row.term, row.place.name, row.component].pop(0)
+        assert own == pytest.approx((below, above), abs=1e-9, rel=1e-9), str(row)
+    assert not any(found.values())
+    worth = sum(float(part.value(v)[0]) for part in program.worth)
+    assert worth == pytest.approx(t.program.objective(x), rel=1e-10)
+    for name, (low, high) in program.bounds.items():
+        if name in v and v.count(name):
+            assert v.scaled(name, low) == pytest.approx(t.program.x_lower[v.span(name)])
+            assert v.scaled(name, high) == pytest.approx(t.program.x_upper[v.span(name)])
+    bounded = np.isfinite(t.program.x_lower) | np.isfinite(t.program.x_upper)
+    for name in v.names:
+        assert name in program.bounds or not bounded[v.span(name)].any(), name
+
+
+def test_of_a_robot_on_two_soles(biped_transcription: Transcription) -> None:
+    check_rows(biped_transcription)
+
+
+def test_with_scenarios() -> None:
+    others = (Scenario(name="soft", stiffness=0.5, torque=0.9), Scenario(name="heavy", mass=2.0))
+    check_rows(transcribed(dataclasses.replace(arm_problem(), scenarios=others)))
+
+
+@pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])
+def test_of_targets_with_events(name: str) -> None:
+    problem = load_problem(PROBLEMS / f"{name}.toml")
+    functions = block_functions(problem, problem.coordinates)
+    check_rows(Transcription(problem, problem.coordinates, functions))
+
+
+def test_slopes_are_those_of_the_program(arm_transcription: Transcription) -> None:
+    t = arm_transcription
+    x = away_from_start(t)
+    program, v = second(t, x)
+    y = np.random.default_rng(1).standard_normal(t.program.m)
+    left: dict[tuple[str, str, str], list[float]] = {}
+    for row, weight in zip(t.rows.origins, y, strict=True):
+        left.setdefault((row.term, row.place.name, row.component), []).append(weight)
+    weights = [np.array([left[n].pop(0) if n in left else 0.0 for n in p.names]) for p in program.rows]
+    pieces = [*program.rows, *program.worth]
+    found, doubt = lagrangian_gradient(pieces, [*weights, *[np.ones(1)] * len(program.worth)], v)
+    wanted = t.program.gradient(x) + t.program.jacobian(x).T @ y
+    assert found == pytest.approx(wanted, rel=1e-7, abs=1e-6)
+    assert np.abs(found - wanted).max() <= 10 * doubt.max() + 1e-7 * np.abs(wanted).max()

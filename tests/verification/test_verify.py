@@ -1,0 +1,127 @@
+"""`impactopt verify`: a result is what it says, and one that was tampered with is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from impactopt.cli.app import app
+from impactopt.files.output import Record, load_record, record_of, save_record
+from impactopt.files.problem_file import load_problem
+from impactopt.planning.planner import solve
+
+ARM = Path(__file__).resolve().parents[2] / "problems" / "arm_planar.toml"
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return record_of(solve(load_problem(ARM)), problem=ARM.read_text("utf-8"), problem_path=ARM)
+
+
+def verified(directory: Path, *, code: int) -> dict[str, Any]:
+    result = runner.invoke(app, ["verify", str(directory), "--json"])
+    assert result.exit_code == code, result.output
+    found: dict[str, Any] = json.loads(result.stdout)
+    return found
+
+
+def test_a_result_is_verified(record: Record, tmp_path: Path) -> None:
+    save_record(record, tmp_path)
+    found = verified(tmp_path, code=0)
+    assert found["ok"] is True and found["reason"] == ""
+    assert found["max_violation"] < 1e-5 and found["kkt"] < 1e-5
+    assert found["objective"] == pytest.approx(float(record.arrays["solver_objective"]), abs=1e-9)
+    terms = {
+        "torque limit",
+        "contact law",
+        "collision dynamics",
+        "hit point",
+        "distance of bodies",
+        "summary",
+    }
+    assert terms <= found["rows"].keys()
+    assert set(found["rows"]["contact law"]) == {"violation", "where"}
+
+
+def turned(name: str, by: float) -> Callable[[dict[str, Any]], None]:
+    """One joint angle of an array moved [rad], or one number of it."""
+
+    def change(arrays: dict[str, Any]) -> None:
+        arrays[name].flat[arrays[name].size // 2] += by
+
+    return change
+
+
+def emptied(name: str) -> Callable[[dict[str, Any]], None]:
+    def change(arrays: dict[str, Any]) -> None:
+        arrays[name] *= 0.0
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (turned("reference_q", 1e-3), "reference posture"),
+        (turned("reference_angle", 1e-3), "reference angles"),
+        (turned("swing_control", 1e-3), "spline"),
+        (turned("reference_torque", 1.0), "reference torque"),
+        (turned("collision_force", 1e3), "blow"),
+        (turned("solver_x", 1e-3), ""),
+        (emptied("solver_multipliers"), "KKT residual"),
+        (emptied("solver_bound_multipliers"), "KKT residual"),
+    ],
+)
+def test_what_was_tampered_with_is_not(
+    record: Record, tmp_path: Path, change: Callable[[dict[str, Any]], None], word: str
+) -> None:
+    arrays = {name: np.array(array) for name, array in record.arrays.items()}
+    change(arrays)
+    save_record(dataclasses.replace(record, arrays=arrays), tmp_path)
+    found = verified(tmp_path, code=1)
+    assert found["ok"] is False and word in found["reason"]
+
+
+@pytest.mark.parametrize("key", ["impulse_Ns", "hand_speed_m_s", "contact_ms"])
+def test_a_number_of_the_summary_is_not_believed(record: Record, tmp_path: Path, key: str) -> None:
+    summary = {**record.summary, key: 1.001 * record.summary[key]}
+    save_record(dataclasses.replace(record, summary=summary), tmp_path)
+    assert f"summary, {key}" in verified(tmp_path, code=1)["reason"]
+
+
+def test_the_summary_beside_is_the_one_inside(record: Record, tmp_path: Path) -> None:
+    save_record(record, tmp_path)
+    path = tmp_path / "summary.json"
+    path.write_text(path.read_text().replace('"impulse_Ns"', '"impulse_Ns_too"'))
+    assert "summary.json" in verified(tmp_path, code=1)["reason"]
+
+
+def test_multipliers_of_other_rows_do_not_fit(record: Record, tmp_path: Path) -> None:
+    arrays = {name: np.array(array) for name, array in record.arrays.items()}
+    arrays["solver_multipliers"] = np.roll(arrays["solver_multipliers"], 1)
+    save_record(dataclasses.replace(record, arrays=arrays), tmp_path)
+    assert "KKT residual" in verified(tmp_path, code=1)["reason"]
+
+
+def test_a_result_that_says_nothing_of_its_program(record: Record, tmp_path: Path) -> None:
+    arrays = {name: a for name, a in record.arrays.items() if name != "program_statement"}
+    save_record(dataclasses.replace(record, arrays=arrays), tmp_path)
+    result = runner.invoke(app, ["verify", str(tmp_path)])
+    assert result.exit_code == 2 and "solve again" in result.output
+
+
+def test_what_is_not_known_is_said(record: Record, tmp_path: Path) -> None:
+    """A model that is frozen is not computed here, so nothing is called right that was not looked at."""
+    text = ARM.read_text("utf-8").replace("[collision]", '[collision]\nmodel = "sdc"\nfreezes = 1')
+    save_record(dataclasses.replace(record, problem=text), tmp_path)
+    found = verified(tmp_path, code=1)
+    assert found["kkt"] is None and "not known to verify" in found["reason"]
+    assert load_record(tmp_path).problem == text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,19 +14,19 @@ from impactopt.kinematics.support import support_polygon
 from impactopt.kinematics.wrench_cone import inward_edges
 from impactopt.problem.objectives import AngularMomentum, Impulse, PeakForce, Penetration, TargetEnergy
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import DEFAULT_TERMS, Balance, HandOrientation, Incidence
+from impactopt.problem.terms import DEFAULT_TERMS, Balance, HandOrientation, Incidence, TargetSpeed
 from impactopt.verification.apart import apart_pieces
 from impactopt.verification.blow import Blow
 from impactopt.verification.motions import Limits, Way, node_piece, rate_pieces
 from impactopt.verification.robot_motion import GRAVITY, RobotMotion
 from impactopt.verification.variables import Piece, Variables
-from impactopt.verification.worth import orientation_pieces, price_pieces, worth_pieces
+from impactopt.verification.worth import orientation_pieces, price_pieces, speed_pieces, worth_pieces
 
 __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
 CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
-_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), HandOrientation)
+_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), HandOrientation, TargetSpeed)
 _KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum)
 
 
@@ -93,7 +94,7 @@ class Program:
             self._links()
             self._balance()
             rows, self.worth = worth_pieces(problem, self.blows[0])
-            self.rows += rows
+            self.rows += [*rows, *speed_pieces(problem, self.blows[0])]
             self.worth += price_pieces(problem, self.robot, self.ways, self.blows)
 
     # ------------------------------------------------------------------ parts
@@ -177,7 +178,7 @@ class Program:
         tangents = ["tangent 1", "tangent 2"]
         rows: list[Any] = [
             ("hit point", "contact", ["x", "y", "z"], p.point, p.point),
-            ("approach speed", "contact", ["normal"], 0.05, np.inf),
+            ("approach speed", "contact", ["normal"], 0.05 + float(p.target.speed_before()), np.inf),
             (incidence.name, "contact", tangents, -incidence.speed, incidence.speed),
         ]
         self.rows.append(Piece.of(value, rows))
@@ -200,9 +201,13 @@ class Program:
             most = -min(nearest, HASTE * apart)
             self.rows.append(Piece.of(value, [(term, way.place(s), [p.striker], -np.inf, most)]))
 
+        def surface(s: float, v: Variables) -> float:
+            """[m] of the target along the normal at a fraction of the swing, which it may come in."""
+            return float(p.normal @ p.point) - float(p.target.speed_before()) * (1 - s) * v.one(swing.T)
+
         ahead, behind = float(np.mean(p.swing.duration)), float(np.mean(p.follow.duration))
         for s in map(float, swing.nodes[:-1]):
-            add("no touch before contact", swing, s, (1 - s) * ahead, lambda v: float(p.normal @ p.point))
+            add("no touch before contact", swing, s, (1 - s) * ahead, partial(surface, s))
         if not p.target.stays:
             return
         for s in map(float, follow.nodes[1:]):

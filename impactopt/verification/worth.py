@@ -17,13 +17,13 @@ from impactopt.problem.objectives import (
     TargetEnergy,
 )
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import HandOrientation
+from impactopt.problem.terms import HandOrientation, TargetSpeed
 from impactopt.verification.blow import DEPTH, Blow
 from impactopt.verification.motions import Way
 from impactopt.verification.robot_motion import RobotMotion
 from impactopt.verification.variables import Piece, Variables
 
-__all__ = ["orientation_pieces", "price_pieces", "worth_pieces"]
+__all__ = ["orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
 
 Array = NDArray[np.float64]
 PEAK = 100.0  # [N] of which the peak force is a multiple
@@ -44,6 +44,19 @@ def orientation_pieces(
         return np.array([direction @ turn @ axis / np.sin(angle)])
 
     return [Piece.of(value, [(term.name, "contact", [problem.striker], 1 / np.tan(angle), np.inf)])]
+
+
+def speed_pieces(problem: ImpactProblem, blow: Blow) -> list[Piece]:
+    """How fast the target is after the blow."""
+    term, target = problem.extra(TargetSpeed), problem.target
+    if term is None:
+        return []
+    last = len(blow.stages) - 1
+
+    def value(v: Variables) -> Array:
+        return np.array([float(target.velocity(blow.get(v, "target state", last)))])
+
+    return [Piece.of(value, [(term.name, "separation", ["normal"], term.least, term.most)])]
 
 
 def worth_pieces(problem: ImpactProblem, blow: Blow) -> tuple[list[Piece], list[Piece]]:

@@ -10,8 +10,10 @@ import pytest
 from support.rooms import FILES, imports, room, rooms_imported
 from support.small_plans import arm_problem, transcribed
 
+from impactopt.contact import FreeMass
 from impactopt.files.problem_file import load_problem
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -78,6 +80,13 @@ def test_of_a_robot_on_two_soles(biped_transcription: Transcription) -> None:
 def test_with_scenarios() -> None:
     others = (Scenario(name="soft", stiffness=0.5, torque=0.9), Scenario(name="heavy", mass=2.0))
     check_rows(transcribed(dataclasses.replace(arm_problem(), scenarios=others)))
+
+
+def test_of_a_ball_that_comes_and_is_caught() -> None:
+    p = arm_problem()
+    still = TargetSpeed(least=-0.1, most=0.2)
+    ball = FreeMass(mass=0.5, initial_velocity=-3.0)
+    check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
 
 
 @pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])

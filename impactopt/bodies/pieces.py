@@ -98,7 +98,7 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
     model = robot.model
     held = [pin.Inertia.Zero() for _ in range(model.njoints)]
     for tool in robot.tools:
-        frame = model.frames[model.getFrameId(tool.frame)]
+        frame = model.frames[model.getFrameId(tool.own_frame)]
         own = pin.Inertia(tool.mass, tool.center, tool.inertia)
         held[frame.parentJoint] += frame.placement.act(own)
     for j in range(1, model.njoints):
@@ -137,7 +137,7 @@ def inertia_box(inertia: Any) -> Solid:
 
 
 def _rod(robot: Robot, tool: Tool) -> Piece:
-    frame = robot.model.frames[robot.model.getFrameId(tool.frame)]
+    frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
     length = max(float(np.linalg.norm(tool.head)), 2 * ROD)
     along = np.asarray(tool.head) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()

@@ -164,7 +164,7 @@ def simulate_pinocchio(
         t = k * step
         first = world.rates(t, state, step=step)
         push = first.push
-        saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
+        saturated += step * bool(np.any(np.abs(first.demand) > world.servo.limit))
         if push is None:
             touches.add(t, 0.0, step)
         else:

@@ -26,6 +26,7 @@ from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
+from impactopt.transcription.springs import add_springs
 from impactopt.transcription.shot import Shot
 from impactopt.transcription.structured import StructuredProgram
 
@@ -189,7 +190,8 @@ class ContactProgram(ABC):
 
     # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
-        """Rows that these terms bring, and the objective."""
+        """Rows that these terms bring, those of springs, and the objective."""
+        add_springs(self)
         for term in terms:
             if type(term).add_rows is not Term.add_rows:  # those of the others are there
                 term.add_rows(self)
@@ -237,6 +239,10 @@ class ContactProgram(ABC):
     @abstractmethod
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         """Places of nodes, torques over limit there, and slots of the block ``node``."""
+
+    def spring_nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
+        """Those of `_nodes` at which springs are held to their law: as many as a spline can follow."""
+        return self._nodes()
 
     @abstractmethod
     def _prices(self) -> Prices:

@@ -71,7 +71,8 @@ def block_functions(
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     out: dict[str, Any] = {}
-    keys = {"force": contact, "first": contact[:1], "collision": frozen, "coasting": frozen}
+    springs = tuple(np.flatnonzero(robot.passive).tolist())
+    keys = {"force": contact, "first": contact[:1], "collision": (*frozen, *springs), "coasting": frozen}
     found = {
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()
@@ -198,6 +199,8 @@ class Transcription(ContactProgram):
     def torques_lifted(self) -> bool:
         """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
         p = self.problem
+        if self.robot.passive.any():
+            return True
         return any(term.needs_torques for term in p.terms) or any(o.needs_torques for o in p.objectives)
 
     def _add_torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
@@ -259,6 +262,13 @@ class Transcription(ContactProgram):
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         slots, places = self._slots
         return list(zip(places, self.torques, slots, strict=True))
+
+    def spring_nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
+        """At the ends of the splines' intervals."""
+        nodes = self._nodes()
+        parts = [(part.nodes, part.breaks) for part in (self.swing, *self.follows)]
+        chosen = np.concatenate([np.isclose(s[:, None], breaks).any(axis=1) for s, breaks in parts])
+        return [nodes[k] for k in np.flatnonzero(chosen)]
 
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]

@@ -27,6 +27,7 @@ from impactopt.files.problem_file.values import (
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import check_count
 from impactopt.robots.presets import load_robot
+from impactopt.robots.parts import SoftGrip
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 
@@ -66,8 +67,19 @@ class StrikerSection(Section):
     point: Vector = required("position in the frame [m]", "point_m")
 
 
+class GripSection(Section):
+    """A hand that holds a tool by a spring and a damper about one axis; left out: it holds it firmly."""
+
+    kind = SoftGrip
+    axis: Vector = required("unit vector in the frame that the tool turns about")
+    stiffness: Positive = required("of the spring [N m/rad]", "stiffness_N_m_rad")
+    damping: Positive = required("of the damper [N m s/rad]", "damping_N_m_s_rad")
+    point: Vector = optional("on the axis, in the frame; left out: its origin [m]", "point_m")
+    range: Positive = optional("how far the tool may turn either way; left out: 1 [rad]", "range_rad")
+
+
 class ToolSection(Section):
-    """A rigid body that a link holds firmly, and the striker that it makes."""
+    """A rigid body that a link holds, and the striker that it makes."""
 
     kind = Tool
     name: str = required("name of the tool and of its striker")
@@ -78,6 +90,11 @@ class ToolSection(Section):
         "about the centre of mass [kg m2]: its diagonal, or a matrix by rows", "inertia_kg_m2"
     )
     head: Vector = required("the point that hits, in the frame [m]", "head_m")
+    grip: GripSection = optional("how softly it is held")
+
+    def build(self) -> Any:
+        given = self.given()
+        return Tool(**given | ({"grip": self.grip.build()} if "grip" in given else {}))
 
 
 _OfActuator: Any = section_of(Actuator)

@@ -155,7 +155,7 @@ def _striker(striker: Striker) -> dict[str, Any]:
 
 
 def _tool(tool: Tool) -> dict[str, Any]:
-    return {
+    data = {
         "name": tool.name,
         "frame": tool.frame,
         "mass_kg": float(tool.mass),
@@ -163,3 +163,13 @@ def _tool(tool: Tool) -> dict[str, Any]:
         "inertia_kg_m2": tool.inertia.tolist(),
         "head_m": tool.head.tolist(),
     }
+    if tool.grip is None:
+        return data
+    grip = {
+        "axis": tool.grip.axis.tolist(),
+        "stiffness_N_m_rad": tool.grip.stiffness,
+        "damping_N_m_s_rad": tool.grip.damping,
+        "point_m": tool.grip.point.tolist(),
+        "range_rad": tool.grip.range,
+    }
+    return data | {"grip": grip}

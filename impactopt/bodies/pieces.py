@@ -20,6 +20,7 @@ from impactopt.bodies.solids import Solid, cylinder, rounded_box
 from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
 from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot, Tool
+from impactopt.robots.tools import without
 
 __all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of"]
 
@@ -104,27 +105,11 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
     for j in range(1, model.njoints):
         inertia = model.inertias[j]
         if held[j].mass > 0:
-            inertia = _without(inertia, held[j])
+            inertia = without(inertia, held[j])
         if inertia.mass > 1e-6:
             piece = _hull(model.names[j], j, inertia_box(inertia))
             if piece is not None:
                 yield piece
-
-
-def _without(whole: Any, part: Any) -> Any:
-    """The inertia that is left of a link when what it holds is taken away."""
-    mass = whole.mass - part.mass
-    if mass <= 1e-6:
-        return pin.Inertia.Zero()
-    lever = (whole.mass * whole.lever - part.mass * part.lever) / mass
-
-    def about_origin(body: Any) -> Array:
-        c = np.array(body.lever)
-        return np.array(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
-
-    left = about_origin(whole) - about_origin(part)
-    left -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-    return pin.Inertia(mass, lever, left)
 
 
 def inertia_box(inertia: Any) -> Solid:

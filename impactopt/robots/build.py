@@ -18,13 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
 from impactopt.robots.checks import HEAVIEST, check_frame
-from impactopt.robots.parts import SoftGrip, Striker, Tool
+from impactopt.robots.parts import Striker
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools
 # [kg m2] of moments of inertia, and relative: in a URDF decimals are rounded, and antennas are guessed
 _ROUNDED = 1e-6
-GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip; no bound of a blow
 
 
 def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
@@ -218,64 +217,6 @@ def add_striker(model: pin.Model, striker: Striker) -> None:
     frame = model.frames[model.getFrameId(striker.model_frame)]
     frame.parentJoint, frame.placement = above.parentJoint, above.placement * placement
     frame.parentFrame = model.getFrameId(striker.frame)
-
-
-def with_tool(model: pin.Model, tool: Tool) -> pin.Model:
-    """The model with the tool's mass on the link that holds it, or on a joint of its soft grip, and with its
-    striker's frame.
-    """
-    frame = model.frames[check_frame(model, tool.frame, f"tool {tool.name!r}")]
-    if frame.parentJoint == 0:
-        raise InputError(
-            f"tool {tool.name!r}: no joint moves the frame {tool.frame!r}; give one of a link that moves"
-        )
-    body = pin.Inertia(tool.mass, tool.center, tool.inertia)
-    if tool.grip is None:
-        model = model.copy()
-        model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
-    else:
-        model = _hung(model, tool, body)
-    add_striker(model, tool.striker)
-    return model
-
-
-def _hung(model: pin.Model, tool: Tool, body: Any) -> pin.Model:
-    """The model with one more joint, a soft grip's; joints are in depth-first order, as Pinocchio has to have
-    them.
-    """
-    grip: Any = tool.grip
-    if tool.grip_joint in joint_names(model):
-        raise InputError(
-            f"tool {tool.name!r}: the robot has a joint {tool.grip_joint!r} already; rename the tool"
-        )
-    held, back = pin.Model(), grip.placement.inverse()
-    bounds = [np.array([x]) for x in (*grip_limits(grip), -grip.range, grip.range)]
-    joint = held.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), tool.grip_joint, *bounds)
-    held.appendBodyToJoint(joint, body, back)
-    held.addFrame(pin.Frame(tool.own_frame, joint, 0, back, pin.FrameType.BODY))
-    held.gravity = model.gravity
-    whole = pin.appendModel(model, held, check_frame(model, tool.frame, "tool"), grip.placement)
-    whole.name = model.name
-    for name, old in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):  # it leaves them behind
-        at = whole.joints[whole.getJointId(name)].idx_v
-        whole.armature[at : at + old.nv] = model.armature[old.idx_v : old.idx_v + old.nv]
-    return whole
-
-
-def grip_limits(grip: SoftGrip) -> tuple[float, float]:
-    """Largest torque [N m] of a soft grip, that of its spring and damper at the ends of their ranges; largest
-    speed [rad/s].
-    """
-    return grip.stiffness * grip.range + grip.damping * GRIP_SPEED, GRIP_SPEED
-
-
-def mapped(old: pin.Model, new: pin.Model, q: Array) -> Array:
-    """A configuration of a model with fewer joints: the others are at zero."""
-    out = pin.neutral(new)
-    for name, joint in zip(list(old.names)[1:], list(old.joints)[1:], strict=True):
-        at = new.joints[new.getJointId(name)].idx_q
-        out[at : at + joint.nq] = q[joint.idx_q : joint.idx_q + joint.nq]
-    return out
 
 
 def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:

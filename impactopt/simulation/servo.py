@@ -35,9 +35,9 @@ class Servo:
         angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
         rates, torques = np.array(reference.v[:, -robot.n :]), np.array(reference.torque)
         # a spring does not know of a plan: it bears the tool at rest at first, and gives way from there
-        passive = robot.passive
-        angles[:, passive], rates[:, passive], torques[:, passive] = angles[0, passive], 0.0, torques[0, passive]
-        self.limit[passive] = np.inf
+        own = robot.passive
+        angles[:, own], rates[:, own], torques[:, own] = angles[0, own], 0.0, torques[0, own]
+        self.limit[own] = np.inf
         self.reference = np.hstack([angles, rates, torques])
 
     def angles(self, q: Array) -> Array:

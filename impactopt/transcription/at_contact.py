@@ -26,8 +26,8 @@ from impactopt.transcription.impulse import InstantImpact
 from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
-from impactopt.transcription.springs import add_springs
 from impactopt.transcription.shot import Shot
+from impactopt.transcription.springs import add_springs
 from impactopt.transcription.structured import StructuredProgram
 
 Program = TypeVar("Program", bound="ContactProgram")

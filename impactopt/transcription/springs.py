@@ -27,8 +27,8 @@ def add_springs(program: ContactProgram) -> None:
     nodes = program.spring_nodes()
     slots: list[list[Any]] = [[y, y1, T] for _, _, (y, y1, _, _, _, T) in nodes]
     own = c.independent
-    numbers = [program.y0[c.base :], (robot.kp / robot.torque_limit)[own], (robot.kd / robot.torque_limit)[own]]
-    at = program.add_block("spring", slots, np.concatenate(numbers))
+    gains = [(gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd)]
+    at = program.add_block("spring", slots, np.concatenate([program.y0[c.base :], *gains]))
     rest, m = start_torque(b)[passive], b.ny - c.base
     which = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])
     names = [robot.joint_names[k] for k in passive]

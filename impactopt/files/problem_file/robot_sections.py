@@ -26,8 +26,8 @@ from impactopt.files.problem_file.values import (
 )
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import check_count
-from impactopt.robots.presets import load_robot
 from impactopt.robots.parts import SoftGrip
+from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 
@@ -90,11 +90,6 @@ class ToolSection(Section):
         "about the centre of mass [kg m2]: its diagonal, or a matrix by rows", "inertia_kg_m2"
     )
     head: Vector = required("the point that hits, in the frame [m]", "head_m")
-    grip: GripSection = optional("how softly it is held")
-
-    def build(self) -> Any:
-        given = self.given()
-        return Tool(**given | ({"grip": self.grip.build()} if "grip" in given else {}))
 
 
 _OfActuator: Any = section_of(Actuator)
@@ -135,6 +130,7 @@ class RobotSection(Section):
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
     strikers: list[StrikerSection] = optional("points that hit")
     tools: list[ToolSection] = optional("what the robot holds")
+    grips: dict[str, GripSection] = optional("tools that are held softly, by name")
     actuators: list[ActuatorSection] = optional("motors and gears; joints that none names keep the preset's")
     postures: dict[str, dict[str, float]] = optional(
         "named postures: joint angles by joint, the others 0 or the SRDF's [rad]", "postures_rad"
@@ -160,6 +156,8 @@ class RobotSection(Section):
             options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
         strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
         tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
+        held = self.grips if options.pop("grips", None) else {}
+        grips = {name: grip.build() for name, grip in held.items()}
         drives = {
             joint: section.build()
             for section in (self.actuators if options.pop("actuators", None) else ())
@@ -175,6 +173,8 @@ class RobotSection(Section):
             robot = robot.with_striker(striker)
         for tool in tools:
             robot = robot.with_tool(tool)
+        for name, grip in grips.items():
+            robot = robot.with_grip(name, grip)
         return robot
 
     def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:

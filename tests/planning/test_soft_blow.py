@@ -1,0 +1,92 @@
+"""Blows with a tool that is held softly: planned, and replayed in both engines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impactopt import GearLoad, ImpactProblem, SoftGrip, Solution, load_problem, solve
+
+GRIP = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.08])
+
+
+def _problem(intervals: int = 24) -> ImpactProblem:
+    firm = load_problem("arm_planar")
+    return replace(
+        firm,
+        robot=firm.robot.with_grip("hammer", GRIP),
+        swing=replace(firm.swing, intervals=intervals),
+        follow=replace(firm.follow, intervals=16),
+    )
+
+
+@pytest.fixture(scope="module")
+def soft() -> Solution:
+    solution = solve(_problem())
+    assert solution.status.usable
+    return solution
+
+
+def _law_error(solution: Solution) -> float:
+    """[N m] how far the planned torque of the grip is from that of its spring and damper in the swing."""
+    robot, way = solution.problem.robot, solution.plan.trajectory()
+    (own,) = np.flatnonzero(robot.passive)
+    swing = way.phase == 0
+    q, v, torque = way.q[swing, own], way.v[swing, own], way.torque[swing, own]
+    return float(np.abs(torque - (torque[0] - GRIP.stiffness * (q - q[0]) - GRIP.damping * v)).max())
+
+
+def test_the_plan_keeps_to_the_spring_better_the_finer_it_is(soft: Solution) -> None:
+    """Of second order, as accelerations that are linear between nodes are."""
+    fine, coarse = _law_error(soft), _law_error(solve(_problem(12)))
+    assert fine < 0.03 * GRIP.stiffness * 1.0
+    assert coarse > 2.5 * fine
+
+
+def test_a_blow_through_it_keeps_the_momentum_of_arm_and_hammer(soft: Solution) -> None:
+    """M dv = the torques' impulse less that of the contact, joint by joint; gravity is small in 8 ms."""
+    plan, robot = soft.plan, soft.problem.robot
+    hit, model = plan.collision, robot.model
+    way = plan.trajectory()
+    q = way.q[np.flatnonzero(way.phase == 0)[-1]] / 2 + way.q[np.flatnonzero(way.phase == 2)[0]] / 2
+    data = model.createData()
+    upper = pin.crba(model, data, q, pin.Convention.WORLD)
+    inertia = np.triu(upper) + np.triu(upper, 1).T
+    hand = model.getFrameId("striker:hammer")
+    row = soft.problem.normal @ pin.computeFrameJacobian(model, data, q, hand, pin.LOCAL_WORLD_ALIGNED)[:3]
+    pushed = np.trapezoid(hit.torque, hit.time, axis=0) - np.trapezoid(hit.force, hit.time) * row
+    bias = pin.rnea(model, data, q, hit.velocity.mean(axis=0), np.zeros(robot.nv)) * hit.time[-1]
+    change = inertia @ (hit.velocity[-1] - hit.velocity[0])
+    np.testing.assert_allclose(change, pushed - bias, atol=0.03 * np.abs(soft.impulse * row).max())
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
+def test_what_is_planned_happens(soft: Solution, engine: str) -> None:
+    replay = soft.validate(engine=engine)
+    assert replay.impulse == pytest.approx(soft.impulse, rel=0.01)
+    assert replay.outcome["depth_m"] == pytest.approx(soft.plan.collision.outcome["depth_m"], rel=0.02)
+    assert soft.loads is not None
+    planned, found = soft.loads.gear, replay.loads.gear
+    assert np.nanmax(found) == pytest.approx(np.nanmax(planned), rel=0.05)
+    assert np.isnan(planned[-1])
+    assert np.isnan(found[-1]), "a spring has no gear"
+    assert replay.saturated == 0.0
+
+
+def test_it_spares_the_gears_and_drives_the_nail_deeper(soft: Solution) -> None:
+    firm = solve(load_problem("arm_planar"))
+    assert soft.loads is not None
+    assert firm.loads is not None
+    assert np.nanmax(soft.loads.gear) < 0.5 * np.nanmax(firm.loads.gear)
+    assert soft.plan.collision.outcome["depth_m"] > firm.plan.collision.outcome["depth_m"]
+
+
+def test_a_bound_of_the_gears_leaves_the_grip_out(soft: Solution) -> None:
+    problem = soft.problem
+    kept = solve(replace(problem, terms=(*problem.terms, GearLoad(limit=0.6))))
+    assert kept.status.usable
+    assert kept.loads is not None
+    assert np.nanmax(kept.loads.gear) < 1.03 * 0.6

@@ -40,6 +40,7 @@ from impactopt.transcription.objective import Prices, motion_prices
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.rows import Index, Place, along, degrees, percent, rates
 from impactopt.transcription.simd import in_lanes
+from impactopt.transcription.springs import SpringPoint, follow_springs, swing_springs
 from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.swing import Swing
 from impactopt.transcription.touch import add_touch_rows
@@ -263,12 +264,16 @@ class Transcription(ContactProgram):
         slots, places = self._slots
         return list(zip(places, self.torques, slots, strict=True))
 
-    def spring_nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
-        """At the ends of the splines' intervals."""
-        nodes = self._nodes()
-        parts = [(part.nodes, part.breaks) for part in (self.swing, *self.follows)]
-        chosen = np.concatenate([np.isclose(s[:, None], breaks).any(axis=1) for s, breaks in parts])
-        return [nodes[k] for k in np.flatnonzero(chosen)]
+    def _spring_points(self) -> list[SpringPoint]:
+        if not self.robot.passive.any():
+            return []
+        first = len(self.swing.nodes)
+        out = swing_springs(self.builder, self.swing, self.torques[:first])
+        for follow in self.follows:
+            last = first + len(follow.nodes)
+            out += follow_springs(follow, self.torques[first:last])
+            first = last
+        return out
 
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]

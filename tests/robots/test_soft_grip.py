@@ -22,9 +22,11 @@ from impactopt import (
     effective_mass,
     planar_arm,
     striking_velocity,
+    talos,
 )
 from impactopt.collision import Effects
 from impactopt.robots.tools import mapped
+from impactopt.simulation.reference.meshes import Meshes
 from impactopt.simulation.servo import Servo
 
 ONLY_SERVO = Effects(bias=False, jdot=False, saturation=False, feedforward=False)
@@ -145,6 +147,17 @@ def test_its_servo_is_a_spring_whatever_the_reference_says() -> None:
     np.testing.assert_allclose(demand[own], spring)
     np.testing.assert_allclose(torque[own], spring, err_msg="nothing saturates")
     assert (np.abs(torque[~own]) == robot.torque_limit[~own]).all()
+
+
+def test_the_meshes_of_its_urdf_do_not_need_the_grip() -> None:
+    robot = talos().with_tool(Tool.hammer(frame="gripper_right_base_link")).with_grip("hammer", grip())
+    rest = robot.posture("half_sitting")
+    through = rest.copy()
+    for joint in ("arm_left_4_joint", "arm_left_2_joint", "head_2_joint"):  # the last is beyond the grip
+        through[robot.model.joints[robot.model.getJointId(joint)].idx_q] = 0.0
+    meshes = Meshes(robot, rest)
+    assert meshes.touching(rest[None]) == []
+    assert any("arm_left" in one or "arm_left" in two for one, two in meshes.touching(through[None]))
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ _EXPORTS = {
     "PerturbationRanges": "simulation.robustness",
     "Status": "solvers.program",
     "StrikeSolution": "planning.strike",
+    "SoftGrip": "robots.parts",
     "Striker": "robots.robot",
     "TargetBody": "bodies.shapes",
     "Effects": "collision",

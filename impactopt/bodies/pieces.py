@@ -20,6 +20,7 @@ from impactopt.bodies.solids import Solid, cylinder, rounded_box
 from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
 from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot, Tool
+from impactopt.robots.tools import without
 
 __all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of"]
 
@@ -98,33 +99,17 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
     model = robot.model
     held = [pin.Inertia.Zero() for _ in range(model.njoints)]
     for tool in robot.tools:
-        frame = model.frames[model.getFrameId(tool.frame)]
+        frame = model.frames[model.getFrameId(tool.own_frame)]
         own = pin.Inertia(tool.mass, tool.center, tool.inertia)
         held[frame.parentJoint] += frame.placement.act(own)
     for j in range(1, model.njoints):
         inertia = model.inertias[j]
         if held[j].mass > 0:
-            inertia = _without(inertia, held[j])
+            inertia = without(inertia, held[j])
         if inertia.mass > 1e-6:
             piece = _hull(model.names[j], j, inertia_box(inertia))
             if piece is not None:
                 yield piece
-
-
-def _without(whole: Any, part: Any) -> Any:
-    """The inertia that is left of a link when what it holds is taken away."""
-    mass = whole.mass - part.mass
-    if mass <= 1e-6:
-        return pin.Inertia.Zero()
-    lever = (whole.mass * whole.lever - part.mass * part.lever) / mass
-
-    def about_origin(body: Any) -> Array:
-        c = np.array(body.lever)
-        return np.array(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
-
-    left = about_origin(whole) - about_origin(part)
-    left -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-    return pin.Inertia(mass, lever, left)
 
 
 def inertia_box(inertia: Any) -> Solid:
@@ -137,7 +122,7 @@ def inertia_box(inertia: Any) -> Solid:
 
 
 def _rod(robot: Robot, tool: Tool) -> Piece:
-    frame = robot.model.frames[robot.model.getFrameId(tool.frame)]
+    frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
     length = max(float(np.linalg.norm(tool.head)), 2 * ROD)
     along = np.asarray(tool.head) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
 from impactopt.robots.checks import HEAVIEST, check_frame
-from impactopt.robots.parts import Striker, Tool
+from impactopt.robots.parts import Striker
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools
@@ -217,18 +217,6 @@ def add_striker(model: pin.Model, striker: Striker) -> None:
     frame = model.frames[model.getFrameId(striker.model_frame)]
     frame.parentJoint, frame.placement = above.parentJoint, above.placement * placement
     frame.parentFrame = model.getFrameId(striker.frame)
-
-
-def add_tool(model: pin.Model, tool: Tool) -> None:
-    """Add the tool's mass to the link that holds it, and its striker's frame."""
-    frame = model.frames[check_frame(model, tool.frame, f"tool {tool.name!r}")]
-    if frame.parentJoint == 0:
-        raise InputError(
-            f"tool {tool.name!r}: no joint moves the frame {tool.frame!r}; give one of a link that moves"
-        )
-    body = pin.Inertia(tool.mass, tool.center, tool.inertia)
-    model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
-    add_striker(model, tool.striker)
 
 
 def link_pairs(model: pin.Model, pairs: Sequence[tuple[str, str]]) -> tuple[tuple[str, str], ...]:

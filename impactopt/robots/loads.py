@@ -48,7 +48,7 @@ def _efforts(robot: Robot, torque: ArrayLike, velocity: ArrayLike) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DriveLoads:
-    """What gears and motors bear at most in a motion, by joint; nan where it is not known.
+    """What gears and motors bear at most in a motion, by joint; nan where it is not known, or nothing drives.
 
     joints : their names.  gear_limit (n,) : `Robot.gear_limit`.
     gear (n,) : torque through the gear over the torque limit.  motor (n,) : as of `motor_use`.  power (n,)
@@ -69,13 +69,14 @@ class DriveLoads:
         """From histories: gear [N m] of torque through the gears, torque [N m] of the servos, velocity
         [rad/s], each (k, n); jump (n,) [rad/s].
         """
+        driven = np.where(robot.passive, np.nan, 1.0)
         return cls(
             joints=robot.joint_names,
             gear_limit=robot.gear_limit,
-            gear=_most(np.asarray(gear) / robot.torque_limit, robot.n),
+            gear=driven * _most(np.asarray(gear) / robot.torque_limit, robot.n),
             motor=_most(motor_use(robot, torque, velocity), robot.n),
-            power=_most(motor_power(robot, torque, velocity), robot.n),
-            velocity_jump=np.abs(np.asarray(jump, dtype=np.float64)),
+            power=driven * _most(motor_power(robot, torque, velocity), robot.n),
+            velocity_jump=driven * np.abs(np.asarray(jump, dtype=np.float64)),
         )
 
     def summary(self) -> dict[str, Any]:

@@ -81,8 +81,52 @@ class Striker:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SoftGrip:
+    """A hand that holds a tool by a spring and a damper about one axis, as one that grips a handle loosely.
+
+    Where the tool is at rest in the start posture, the spring bears its weight. Nothing drives it: what a
+    blow does to the tool comes to the hand by the spring and the damper alone.
+
+    Attributes
+    ----------
+    axis (3,) : that the tool turns about, a unit vector; point (3,) [m] : on it. Both in the tool's `frame`.
+    stiffness [N m/rad], damping [N m s/rad].
+    range [rad] : how far the tool may turn either way.
+
+    Raises
+    ------
+    InputError : an axis that is no unit vector; numbers that are not positive.
+    """
+
+    axis: Array
+    stiffness: float
+    damping: float
+    point: Array = field(default_factory=lambda: np.zeros(3))
+    range: float = 1.0
+
+    def __post_init__(self) -> None:
+        axis = check_array("soft grip: axis", self.axis, (3,))
+        if not np.isclose(np.linalg.norm(axis), 1.0, rtol=0, atol=1e-6):
+            raise InputError(f"soft grip: the axis {axis} is no unit vector; divide it by its length")
+        object.__setattr__(self, "axis", read_only(axis / np.linalg.norm(axis)))
+        point = check_array("soft grip: point [m]", self.point, (3,), most=FARTHEST)
+        object.__setattr__(self, "point", read_only(point))
+        for name, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad"), ("range", "rad")):
+            number = float(check_array(f"soft grip: {name} [{unit}]", getattr(self, name), (), most=HEAVIEST))
+            if not number > 0:
+                raise InputError(f"soft grip: {name} is {number:g} {unit}; give a number > 0")
+            object.__setattr__(self, name, number)
+
+    @property
+    def placement(self) -> Any:
+        """pin.SE3 of the joint in the tool's frame: it turns about z."""
+        turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(self.axis))
+        return pin.SE3(turn.matrix(), np.array(self.point))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Tool:
-    """A rigid body that a link holds firmly, and the point of it that hits. All in the model's frame `frame`.
+    """A rigid body that a link holds, and the point of it that hits. All in the model's frame `frame`.
 
     Attributes
     ----------
@@ -91,6 +135,8 @@ class Tool:
     mass [kg], center (3,) [m] : its centre of mass; inertia (3, 3) [kg m2] : about that, in the axes of
         `frame`; three numbers are its diagonal.
     head (3,) [m] : the point that hits.
+    grip : how a link holds it that does not hold it firmly. It makes a joint, called as the tool with
+        ``_grip`` behind, and a frame ``tool:<name>``, where `frame` is while the spring is at rest.
 
     Raises
     ------
@@ -104,6 +150,7 @@ class Tool:
     center: Array
     inertia: Array
     head: Array
+    grip: SoftGrip | None = None
 
     def __post_init__(self) -> None:
         what = f"tool {self.name!r}"
@@ -176,7 +223,17 @@ class Tool:
     @property
     def striker(self) -> Striker:
         """The striker that the tool makes of the link which holds it."""
-        return Striker(name=self.name, frame=self.frame, point=self.head)
+        return Striker(name=self.name, frame=self.own_frame, point=self.head)
+
+    @property
+    def own_frame(self) -> str:
+        """Name of the frame that moves with it."""
+        return self.frame if self.grip is None else f"tool:{self.name}"
+
+    @property
+    def grip_joint(self) -> str:
+        """Name of the joint that a soft grip makes."""
+        return f"{self.name}_grip"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,9 +13,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array
-from impactopt.robots import build, checks
+from impactopt.robots import build, checks, tools
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
-from impactopt.robots.parts import Sole, Source, Striker, Tool, read_only
+from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
 
@@ -238,10 +238,11 @@ class Robot:
     @property
     def gear_limit(self) -> Array:
         """(n,) What the gears bear in a blow, over the torque limit: their momentary peak, or 2 where that is
-        not known.
+        not known; inf where there is no gear.
         """
         known = numbers_of(self.actuators, "momentary_torque") / self.torque_limit
-        return read_only(np.where(np.isnan(known), MOMENTARY_PEAK, known))
+        limit = np.where(np.isnan(known), MOMENTARY_PEAK, known)
+        return read_only(np.where(self.passive, np.inf, limit))
 
     def joint_index(self, name: str) -> int:
         """Index of a joint in arrays of length n."""
@@ -276,12 +277,54 @@ class Robot:
         """A copy of the robot that holds `tool`: its mass on the link, and a striker of its name."""
         if tool.name in self.strikers:
             raise InputError(f"robot {self.name!r} has a striker {tool.name!r} already; rename the tool")
-        model = self.model.copy()
-        build.add_tool(model, tool)
+        model = tools.with_tool(self.model, tool)
         source = self.source and dataclasses.replace(self.source, tools=(*self.source.tools, tool))
         strikers = {**self.strikers, tool.name: tool.striker}
-        tools = (*self.tools, tool)
-        return dataclasses.replace(self, model=model, strikers=strikers, source=source, tools=tools)
+        more: dict[str, Any] = {"strikers": strikers, "source": source, "tools": (*self.tools, tool)}
+        return dataclasses.replace(self, model=model, **more, **self._of_grip(model, tool))
+
+    def with_grip(self, name: str, grip: SoftGrip) -> Robot:
+        """A copy of the robot that holds its tool of that name so softly, and no longer firmly."""
+        tool = build.pick("tool", name, {tool.name: tool for tool in self.tools}, self.name)
+        if tool.grip is not None:
+            raise InputError(f"robot {self.name!r} holds {name!r} softly already; give it one grip")
+        soft = dataclasses.replace(tool, grip=grip)
+        model = tools.with_tool(tools.let_go(self.model, tool), soft)
+        more: dict[str, Any] = {
+            "strikers": {**self.strikers, name: soft.striker},
+            "tools": tuple(soft if t is tool else t for t in self.tools),
+        }
+        if self.source is not None:
+            held = tuple(soft if t is tool else t for t in self.source.tools)
+            more["source"] = dataclasses.replace(self.source, tools=held)
+        return dataclasses.replace(self, model=model, **more, **self._of_grip(model, soft))
+
+    def _of_grip(self, model: Any, tool: Tool) -> dict[str, Any]:
+        """Numbers of all joints, and postures, with a soft grip's joint."""
+        if tool.grip is None:
+            return {}
+        joints = build.joint_names(model)
+        at, (torque, speed) = joints.index(tool.grip_joint), tools.grip_limits(tool.grip)
+        own = {
+            "kp": tool.grip.stiffness,
+            "kd": tool.grip.damping,
+            "torque_limit": torque,
+            "velocity_limit": speed,
+            "lower": -tool.grip.range,
+            "upper": tool.grip.range,
+        }
+        out: dict[str, Any] = {name: np.insert(getattr(self, name), at, x) for name, x in own.items()}
+        out["actuators"] = (*self.actuators[:at], Actuator(), *self.actuators[at:])
+        out["postures"] = {name: tools.mapped(self.model, model, q) for name, q in self.postures.items()}
+        return out
+
+    @property
+    def passive(self) -> Any:
+        """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip: it has no
+        gear.
+        """
+        grips = {tool.grip_joint for tool in self.tools if tool.grip is not None}
+        return np.array([name in grips for name in self.joint_names])
 
     def with_actuators(self, actuators: Mapping[str, Actuator]) -> Robot:
         """A copy of the robot with these motors and gears, of joints by name or pattern.

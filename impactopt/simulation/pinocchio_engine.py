@@ -187,7 +187,7 @@ def simulate_pinocchio(
         world.delay.keep(t, first.asked)
         cuts.look(t, first.wanted, first.cut, step)
         push = first.push
-        saturated += step * bool(np.any(np.abs(first.demand) > robot.torque_limit))
+        saturated += step * bool(np.any(np.abs(first.demand) > world.servo.limit))
         if push is None:
             touches.add(t, 0.0, step)
         else:

@@ -17,6 +17,8 @@ class Servo:
 
     reference : time (k,) [s], q (k, nq), v (k, nv), torque (k, n). An instant that stands twice is a jump.
     kp, kd, limit : factors of the robot's kp, kd and torque limit.
+
+    Joints that nothing drives (`Robot.passive`) have a spring and a damper at rest at the reference's start.
     """
 
     def __init__(
@@ -31,7 +33,12 @@ class Servo:
         self.continuous = np.flatnonzero([joint.nq == 2 for joint in joints])
         angles = np.array([self.angles(q) for q in reference.q])
         angles[:, self.continuous] = np.unwrap(angles[:, self.continuous], axis=0)
-        self.reference = np.hstack([angles, reference.v[:, -robot.n :], reference.torque])
+        rates, torques = np.array(reference.v[:, -robot.n :]), np.array(reference.torque)
+        # a spring does not know of a plan: it bears the tool at rest at first, and gives way from there
+        own = robot.passive
+        angles[:, own], rates[:, own], torques[:, own] = angles[0, own], 0.0, torques[0, own]
+        self.limit[own] = np.inf
+        self.reference = np.hstack([angles, rates, torques])
 
     def angles(self, q: Array) -> Array:
         """Joint angles (n,) of a configuration; those of continuous joints in [-pi, pi]."""

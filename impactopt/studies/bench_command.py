@@ -104,6 +104,16 @@ def _gains(
     """From free joints to one rigid body: the impulse of the same blow with stiffer and stiffer servos."""
 
 
+@_command("machine")
+def _machine(
+    problems: Annotated[
+        list[str] | None,
+        typer.Option("--problem", metavar="NAME", help="This one of problems/; several times for several."),
+    ] = None,
+) -> None:
+    """What gears cost a blow: each problem with gear limits of 3, 2, 1.5 and 1, and without."""
+
+
 @_command("models")
 def _models(
     quick: Annotated[bool, typer.Option("--quick", help="The two arms only.")] = False,
@@ -242,6 +252,7 @@ def _all(
         "fidelity": {"workers": workers, "quick": True},
         "freezes": drawn,
         "gains": {"quick": True},
+        "machine": {"problems": ["arm_planar", "arm7", "chop_arm"]},
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},

@@ -26,6 +26,7 @@ BENCHES = {
     "fidelity": "fidelity",
     "freezes": "freezes",
     "gains": "gains",
+    "machine": "machine",
     "virtual-base": "virtual_base",
     "collision": "collision",
     "scaling": "scaling",

@@ -27,6 +27,7 @@ from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
 from impactopt.transcription.shot import Shot
+from impactopt.transcription.springs import SpringPoint, add_springs
 from impactopt.transcription.structured import StructuredProgram
 
 Program = TypeVar("Program", bound="ContactProgram")
@@ -189,7 +190,8 @@ class ContactProgram(ABC):
 
     # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
-        """Rows that these terms bring, and the objective."""
+        """Rows that these terms bring, those of springs, and the objective."""
+        add_springs(self.builder, self._spring_points())
         for term in terms:
             if type(term).add_rows is not Term.add_rows:  # those of the others are there
                 term.add_rows(self)
@@ -260,6 +262,10 @@ class ContactProgram(ABC):
     @abstractmethod
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         """Places of nodes, torques over limit there, and slots of the block ``node``."""
+
+    def _spring_points(self) -> list[SpringPoint]:
+        """Where springs of joints are held to their law."""
+        return [SpringPoint(place, torque, y, y1, T) for place, torque, (y, y1, _, _, _, T) in self._nodes()]
 
     @abstractmethod
     def _prices(self) -> Prices:

@@ -64,6 +64,7 @@ def sizes(c: StanceCoordinates, target: Target, block: str, *, frozen: bool = Fa
             "invariant": int(bool(target.guards)),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
+        "spring": {"torque": c.ny - base},
         "first": {"base": base, "joints": n, "law": 1, "rotors": n},
         "join": {"travel": 1},
         "link": {"contact": 1, "position": 1, "rate": 1},
@@ -138,6 +139,18 @@ def link() -> BlockExpression:
     return make_block(list(z), [], out)
 
 
+def spring(c: StanceCoordinates) -> BlockExpression:
+    """Torques of springs and dampers at joints outside the held legs, less what they bear at rest.
+
+    z = y, y', T;  p = angles at rest, stiffness and damping over torque limit (one a joint).
+    """
+    m = c.ny - c.base
+    y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
+    rest, stiffness, damping = ca.SX.sym("rest", m), ca.SX.sym("k", m), ca.SX.sym("d", m)
+    torque = -stiffness * (y[c.base :] - rest) - damping * y1[c.base :] / T
+    return make_block([y, y1, T], [rest, stiffness, damping], {"torque": torque})
+
+
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     """What is left after the impact.
 
@@ -200,4 +213,5 @@ def builders(
         **({"impact": lambda: impact(c, striker)} if instant else hit),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
+        **({"spring": lambda: spring(c)} if c.robot.passive.any() else {}),
     }

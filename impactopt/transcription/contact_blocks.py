@@ -129,7 +129,9 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
         tip = striker_kinematics(c, striker)(q, v if frozen.jdot else 0 * v, a)[2]
         slopes = {"legs": r1 - T * leg_part(c, a), "lag": lag1 - T * slower}
         slopes["hand"] = faster - T * ca.dot(normal, tip)
-    ahead = c.configuration(y0 + u0 * t - y, lag)[c.base :]
+    driven = np.ones(ny)
+    driven[c.base :] -= c.robot.passive[c.independent]  # a spring's rest does not move
+    ahead = c.configuration(y0 + driven * u0 * t - y, lag)[c.base :]
     servo = ff + (kp * ahead + kd * c.configuration(u0 - u, slower)[c.base :]) / limit
     out = {
         "closure": c.closure(y, legs),

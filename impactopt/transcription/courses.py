@@ -35,7 +35,7 @@ def torque_courses(
 
     torques : over limit, at the nodes of all of these, one motion after the other.
     """
-    start, first = Affine.constant(_start_torque(b)), len(swing.nodes)
+    start, first = Affine.constant(start_torque(b)), len(swing.nodes)
     nodes = np.append(0.0, swing.nodes)
     out = [TorqueCourse(nodes, [start, *torques[:first]], swing.T[0], swing.place_at)]
     for motion in follows:
@@ -45,7 +45,7 @@ def torque_courses(
     return out
 
 
-def _start_torque(b: Builder) -> Array:
+def start_torque(b: Builder) -> Array:
     """Torque over limit (n,) at rest in the start posture."""
     c, rest = b.coordinates, np.zeros((1, b.ny))
     wrench = static_wrenches(c, b.y0, b.legs0)[None]

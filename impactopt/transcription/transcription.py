@@ -40,6 +40,7 @@ from impactopt.transcription.objective import Prices, motion_prices
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.rows import Index, Place, along, degrees, percent, rates
 from impactopt.transcription.simd import in_lanes
+from impactopt.transcription.springs import SpringPoint, follow_springs, swing_springs
 from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.swing import Swing
 from impactopt.transcription.touch import add_touch_rows
@@ -71,7 +72,8 @@ def block_functions(
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     out: dict[str, Any] = {}
-    keys = {"force": contact, "first": contact[:1], "collision": frozen, "coasting": frozen}
+    springs = tuple(np.flatnonzero(robot.passive).tolist())
+    keys = {"force": contact, "first": contact[:1], "collision": (*frozen, *springs), "coasting": frozen}
     found = {
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()
@@ -198,6 +200,8 @@ class Transcription(ContactProgram):
     def torques_lifted(self) -> bool:
         """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
         p = self.problem
+        if self.robot.passive.any():
+            return True
         return any(term.needs_torques for term in p.terms) or any(o.needs_torques for o in p.objectives)
 
     def _add_torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
@@ -259,6 +263,17 @@ class Transcription(ContactProgram):
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         slots, places = self._slots
         return list(zip(places, self.torques, slots, strict=True))
+
+    def _spring_points(self) -> list[SpringPoint]:
+        if not self.robot.passive.any():
+            return []
+        first = len(self.swing.nodes)
+        out = swing_springs(self.builder, self.swing, self.torques[:first])
+        for follow in self.follows:
+            last = first + len(follow.nodes)
+            out += follow_springs(follow, self.torques[first:last])
+            first = last
+        return out
 
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]

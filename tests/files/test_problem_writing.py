@@ -249,6 +249,12 @@ def changed_arm(**options: Any) -> ImpactProblem:
     return dataclasses.replace(base, robot=impactopt.planar_arm(**options))
 
 
+def _grip() -> impactopt.SoftGrip:
+    return impactopt.SoftGrip(
+        axis=[0.0, 0.6, 0.8], stiffness=30.0, damping=0.4, point=[0.0, 0.1, 0.0], range=0.8
+    )
+
+
 @pytest.mark.parametrize(
     "robot",
     [
@@ -262,6 +268,12 @@ def changed_arm(**options: Any) -> ImpactProblem:
         lambda: dataclasses.replace(impactopt.planar_arm(kp=1500.0), kp=np.array([900.0, 800.0, 200.0])),
         lambda: impactopt.planar_arm().with_striker(Striker(name="elbow", frame="elbow", point=[0, 0, 0.1])),
         lambda: impactopt.planar_arm().with_tool(Tool.hammer(frame="elbow", name="second")),
+        lambda: impactopt.planar_arm().with_grip("hammer", _grip()),
+        lambda: (
+            impactopt.planar_arm()
+            .with_tool(Tool.hammer(frame="elbow", name="second"))
+            .with_grip("second", _grip())
+        ),
     ],
 )
 def test_a_preset_with_changes_comes_back(robot: Any, nailing: ImpactProblem) -> None:

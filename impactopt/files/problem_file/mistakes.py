@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
@@ -122,10 +122,11 @@ def section_at(model: type[BaseModel], place: Place) -> tuple[type[BaseModel], i
         annotation = fields[place[depth]].annotation if place[depth] in fields else None
         inner = [kind for kind in (annotation, *get_args(annotation)) if isinstance(kind, type)]
         inner = [kind for kind in inner if issubclass(kind, BaseModel)]
-        if not inner:
+        by_name = get_origin(annotation) is dict
+        if not inner or (by_name and depth + 1 == len(place)):
             break
         model, depth = inner[0], depth + 1
-        if depth < len(place) and isinstance(place[depth], int):
+        if depth < len(place) and (isinstance(place[depth], int) or by_name):
             depth += 1
     return model, depth
 

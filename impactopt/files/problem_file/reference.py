@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, get_args, get_origin
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, PlainValidator
 from pydantic.fields import FieldInfo
 
@@ -105,6 +106,7 @@ def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel
     section, many = _inner(info)
     if section is None:
         return
+    place = f"{place}.NAME" if get_origin(info.annotation) is dict else place
     yield (f"[[{place}]]" if many else f"[{place}]"), section
     for name, inner in section.model_fields.items():
         yield from _sections(f"{place}.{name}", inner)
@@ -113,7 +115,8 @@ def _sections(place: str, info: FieldInfo) -> Iterator[tuple[str, type[BaseModel
 def _inner(info: FieldInfo) -> tuple[type[BaseModel] | None, bool]:
     """The section that a field holds, if any, and whether it holds a list of them."""
     many = get_origin(info.annotation) is list
-    kind = get_args(info.annotation)[0] if many else info.annotation
+    named = get_origin(info.annotation) is dict
+    kind = get_args(info.annotation)[-1] if many or named else info.annotation
     return (kind, many) if isinstance(kind, type) and issubclass(kind, BaseModel) else (None, many)
 
 
@@ -128,7 +131,7 @@ def _part(header: str, section: type[BaseModel]) -> str:
             default = "**needed**"
         else:
             value = usual.get(name, info.default)
-            default = "" if value is None or value == () else f"`{_show(value)}`"
+            default = "" if value is None or np.size(value) == 0 else f"`{_show(value)}`"
         about = (info.description or "").replace("|", "\\|")
         lines.append(f"| `{info.alias or name}` | {about} | {_allowed(info)} | {default} |")
     return "\n".join([*lines, ""] if keys else lines)

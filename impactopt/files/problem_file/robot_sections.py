@@ -26,6 +26,7 @@ from impactopt.files.problem_file.values import (
 )
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import check_count
+from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
@@ -66,8 +67,19 @@ class StrikerSection(Section):
     point: Vector = required("position in the frame [m]", "point_m")
 
 
+class GripSection(Section):
+    """A hand that holds a tool by a spring and a damper about one axis; left out: it holds it firmly."""
+
+    kind = SoftGrip
+    axis: Vector = required("unit vector in the frame that the tool turns about")
+    stiffness: Positive = required("of the spring [N m/rad]", "stiffness_N_m_rad")
+    damping: Positive = required("of the damper [N m s/rad]", "damping_N_m_s_rad")
+    point: Vector = optional("on the axis, in the frame; left out: its origin [m]", "point_m")
+    range: Positive = optional("how far the tool may turn either way; left out: 1 [rad]", "range_rad")
+
+
 class ToolSection(Section):
-    """A rigid body that a link holds firmly, and the striker that it makes."""
+    """A rigid body that a link holds, and the striker that it makes."""
 
     kind = Tool
     name: str = required("name of the tool and of its striker")
@@ -118,6 +130,7 @@ class RobotSection(Section):
     soles: list[SoleSection] = optional("flat feet; a preset's own ones are replaced")
     strikers: list[StrikerSection] = optional("points that hit")
     tools: list[ToolSection] = optional("what the robot holds")
+    grips: dict[str, GripSection] = optional("tools that are held softly, by name")
     actuators: list[ActuatorSection] = optional("motors and gears; joints that none names keep the preset's")
     postures: dict[str, dict[str, float]] = optional(
         "named postures: joint angles by joint, the others 0 or the SRDF's [rad]", "postures_rad"
@@ -143,6 +156,8 @@ class RobotSection(Section):
             options["position_limit"] = {j: (a, b) for j, (a, b) in options["position_limit"].items()}
         strikers = [striker.build() for striker in self.strikers] if options.pop("strikers", None) else []
         tools = [tool.build() for tool in self.tools] if options.pop("tools", None) else []
+        held = self.grips if options.pop("grips", None) else {}
+        grips = {name: grip.build() for name, grip in held.items()}
         drives = {
             joint: section.build()
             for section in (self.actuators if options.pop("actuators", None) else ())
@@ -158,6 +173,8 @@ class RobotSection(Section):
             robot = robot.with_striker(striker)
         for tool in tools:
             robot = robot.with_tool(tool)
+        for name, grip in grips.items():
+            robot = robot.with_grip(name, grip)
         return robot
 
     def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:

@@ -13,6 +13,7 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.toml import plain_value
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.parts import SoftGrip
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 __all__ = ["robot_data"]
@@ -78,6 +79,9 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
         data["strikers"] = [_striker(striker) for striker in options["strikers"]]
     if source.tools:
         data["tools"] = [_tool(tool) for tool in source.tools]
+    grips = {tool.name: _grip(tool.grip) for tool in robot.tools if tool.grip is not None}
+    if grips:
+        data["grips"] = grips
     postures = options.get("postures", {})
     named = {name: plain_value(angles) for name, angles in postures.items() if isinstance(angles, Mapping)}
     return data | ({"postures_rad": named} if named else {})
@@ -162,4 +166,14 @@ def _tool(tool: Tool) -> dict[str, Any]:
         "center_m": tool.center.tolist(),
         "inertia_kg_m2": tool.inertia.tolist(),
         "head_m": tool.head.tolist(),
+    }
+
+
+def _grip(grip: SoftGrip) -> dict[str, Any]:
+    return {
+        "axis": grip.axis.tolist(),
+        "point_m": grip.point.tolist(),
+        "stiffness_N_m_rad": grip.stiffness,
+        "damping_N_m_s_rad": grip.damping,
+        "range_rad": grip.range,
     }

@@ -49,7 +49,9 @@ class GearLoad(Term):
 
     def most(self, robot: Robot) -> Any:
         """(n,) largest loads over the torque limits; inf: no bound."""
-        return robot.gear_limit if self.limit is None else of_joints(self.limit, robot.joint_names)
+        if self.limit is None:
+            return robot.gear_limit
+        return np.where(robot.passive, np.inf, of_joints(self.limit, robot.joint_names))
 
     def add_rows(self, program: Any) -> None:
         robot, names = program.robot, program.robot.joint_names

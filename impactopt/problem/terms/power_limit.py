@@ -52,7 +52,7 @@ class PowerLimit(Term):
         robot, n = program.robot, program.robot.n
         most = numbers_of(robot.actuators, "power_limit")
         if self.limit is not None:
-            most = of_joints(self.limit, robot.joint_names)
+            most = np.where(robot.passive, np.inf, of_joints(self.limit, robot.joint_names))
         viscous, coulomb = (
             numbers_of(robot.actuators, name) for name in ("viscous_friction", "coulomb_friction")
         )

@@ -40,7 +40,8 @@ class VelocityJump(Term):
     def add_rows(self, program: Any) -> None:
         """Linear in the rates of the independent joints; those of the legs follow from them."""
         c = program.coordinates
-        most = of_joints(self.limit, program.robot.joint_names)
+        robot = program.robot
+        most = np.where(robot.passive, np.inf, of_joints(self.limit, robot.joint_names))
         measure = Measure("rad/s", 1.0, "too much")
         ends = program.contact_ends()
         at = 0

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
@@ -47,7 +48,7 @@ class Meshes:
     def _data(self) -> tuple[Any, Any]:
         model, geometry = self._read
         data, found = model.createData(), geometry.createData()
-        pin.computeCollisions(model, data, geometry, found, self.start, False)
+        pin.computeCollisions(model, data, geometry, found, self._of_urdf(self.start), False)
         for k, pair in enumerate(geometry.collisionPairs):
             a, b = (geometry.geometryObjects[i].parentJoint for i in (pair.first, pair.second))
             together = a == b or model.parents[a] == b or model.parents[b] == a
@@ -55,11 +56,20 @@ class Meshes:
                 found.deactivateCollisionPair(k)
         return data, found
 
+    def _of_urdf(self, q: NDArray[Any]) -> NDArray[Any]:
+        """A configuration without the joints that the URDF does not have, such as a soft grip's."""
+        own, model = self.robot.model, self._read[0]
+        out = pin.neutral(model)
+        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+            at = own.joints[own.getJointId(name)].idx_q
+            out[joint.idx_q : joint.idx_q + joint.nq] = q[at : at + joint.nq]
+        return np.asarray(out)
+
     def touching(self, motion: NDArray[Any]) -> list[tuple[str, str]]:
         """Names of the pairs that are in each other at any of the configurations (k, nq), each once."""
         (model, geometry), (data, found) = self._read, self._data
         pairs: set[tuple[str, str]] = set()
-        for q in motion:
+        for q in map(self._of_urdf, motion):
             if not pin.computeCollisions(model, data, geometry, found, q, True):
                 continue
             pin.computeCollisions(model, data, geometry, found, q, False)

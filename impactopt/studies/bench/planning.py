@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
 from impactopt.studies.report import Say
 
 DEMO = Path("problems/punch.toml")
@@ -31,12 +32,16 @@ def plan_of(file: Path, say: Say) -> Solution:
     return solution
 
 
-def solved(file: Path, say: Say) -> Solution:
-    """The same, whatever the solver made of it."""
+def solved(file: Path, say: Say, change: Callable[[ImpactProblem], ImpactProblem] | None = None) -> Solution:
+    """The same, whatever the solver made of it.
+
+    change : what is done to the file's problem before.
+    """
     read = read_problem_file(file)
     say(f"planning {file}")
     solver = read.solver.name
     options: Mapping[str, Any] | None = read.solver.options.get(solver)
-    solution = solve(read.build(), solver=solver, options=options, time_limit=read.solver.time_limit)
+    problem = read.build() if change is None else change(read.build())
+    solution = solve(problem, solver=solver, options=options, time_limit=read.solver.time_limit)
     say(f"{file}: {solution.status.value}, {solution.impulse:.2f} N s, {solution.solve_seconds:.1f} s")
     return solution

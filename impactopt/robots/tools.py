@@ -1,0 +1,101 @@
+"""What a robot holds: tools that a link holds firmly, or softly by a joint of their own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.robots import build, checks
+from impactopt.robots.parts import SoftGrip, Tool
+
+__all__ = ["grip_limits", "let_go", "mapped", "with_tool", "without"]
+
+Array = NDArray[np.float64]
+GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip; no bound of a blow
+
+
+def with_tool(model: pin.Model, tool: Tool) -> pin.Model:
+    """The model with the tool's mass on the link that holds it, or on a joint of its soft grip, and with its
+    striker's frame.
+    """
+    frame = model.frames[checks.check_frame(model, tool.frame, f"tool {tool.name!r}")]
+    if frame.parentJoint == 0:
+        raise InputError(
+            f"tool {tool.name!r}: no joint moves the frame {tool.frame!r}; give one of a link that moves"
+        )
+    body = pin.Inertia(tool.mass, tool.center, tool.inertia)
+    if tool.grip is None:
+        model = model.copy()
+        model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+    else:
+        model = _hung(model, tool, body)
+    build.add_striker(model, tool.striker)
+    return model
+
+
+def without(whole: Any, part: Any) -> Any:
+    """The pin.Inertia that is left of a link when what it holds is taken away."""
+    mass = whole.mass - part.mass
+    if mass <= 1e-6:
+        return pin.Inertia.Zero()
+    lever = (whole.mass * whole.lever - part.mass * part.lever) / mass
+
+    def about_origin(body: Any) -> Array:
+        c = np.array(body.lever)
+        return np.array(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
+
+    left = about_origin(whole) - about_origin(part)
+    left -= mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+    return pin.Inertia(mass, lever, left)
+
+
+def let_go(model: pin.Model, tool: Tool) -> pin.Model:
+    """The model whose link does not hold a tool that it has held firmly."""
+    model = model.copy()
+    frame = model.frames[model.getFrameId(tool.frame)]
+    body = frame.placement.act(pin.Inertia(tool.mass, tool.center, tool.inertia))
+    model.inertias[frame.parentJoint] = without(model.inertias[frame.parentJoint], body)
+    return model
+
+
+def _hung(model: pin.Model, tool: Tool, body: Any) -> pin.Model:
+    """The model with one more joint, a soft grip's; joints are in depth-first order, as Pinocchio has to have
+    them.
+    """
+    grip: Any = tool.grip
+    if tool.grip_joint in build.joint_names(model):
+        raise InputError(
+            f"tool {tool.name!r}: the robot has a joint {tool.grip_joint!r} already; rename the tool"
+        )
+    held, back = pin.Model(), grip.placement.inverse()
+    bounds = [np.array([x]) for x in (*grip_limits(grip), -grip.range, grip.range)]
+    joint = held.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), tool.grip_joint, *bounds)
+    held.appendBodyToJoint(joint, body, back)
+    held.addFrame(pin.Frame(tool.own_frame, joint, 0, back, pin.FrameType.BODY))
+    held.gravity = model.gravity
+    whole = pin.appendModel(model, held, checks.check_frame(model, tool.frame, "tool"), grip.placement)
+    whole.name = model.name
+    for name, old in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):  # it leaves them behind
+        at = whole.joints[whole.getJointId(name)].idx_v
+        whole.armature[at : at + old.nv] = model.armature[old.idx_v : old.idx_v + old.nv]
+    return whole
+
+
+def grip_limits(grip: SoftGrip) -> tuple[float, float]:
+    """Largest torque [N m] of a soft grip, that of its spring and damper at the ends of their ranges; largest
+    speed [rad/s].
+    """
+    return grip.stiffness * grip.range + grip.damping * GRIP_SPEED, GRIP_SPEED
+
+
+def mapped(old: pin.Model, new: pin.Model, q: Array) -> Array:
+    """A configuration of a model with fewer joints: the others are at zero."""
+    out = pin.neutral(new)
+    for name, joint in zip(list(old.names)[1:], list(old.joints)[1:], strict=True):
+        at = new.joints[new.getJointId(name)].idx_q
+        out[at : at + joint.nq] = q[joint.idx_q : joint.idx_q + joint.nq]
+    return out

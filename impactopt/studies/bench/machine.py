@@ -1,0 +1,111 @@
+"""What gears cost a blow: each problem with less and less that a gear may bear, planned and replayed.
+
+One row a problem and a limit of `GearLoad`, and one without. Planned and replayed (MuJoCo, nothing held) load
+of the worst gear over its torque limit, the joint that it is of, and what moves with the limit: the striking
+point's speed, and what becomes of the target. What fails stays in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from impactopt.errors import InputError, did_you_mean
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import GearLoad
+from impactopt.studies.bench.planning import DEMO, solved
+from impactopt.studies.report import Report, Say, columns_table
+
+__all__ = ["LIMITS", "run"]
+
+LIMITS: tuple[float | None, ...] = (None, 3.0, 2.0, 1.5, 1.0)
+COLUMNS = (
+    ("problem", "problem", 0),
+    ("gear limit", "gear_limit", 1),
+    ("status", "status", 0),
+    ("N s", "impulse_Ns", 2),
+    ("target", "target", 3),
+    ("speed m/s", "speed_m_s", 2),
+    ("gear", "gear_planned", 2),
+    ("replayed", "gear_replayed", 2),
+    ("joint", "joint", 0),
+    ("s", "seconds", 1),
+    ("stands", "stands", 0),
+)
+
+
+def run(
+    say: Say,
+    *,
+    problems: Sequence[str] | None = None,
+    limits: Sequence[float | None] = LIMITS,
+    folder: Path = DEMO.parent,
+) -> Report:
+    """One row a problem and a limit.
+
+    problems : names of files in the folder; none: all whose name does not end in "infeasible".
+    limits : over the torque limit; None: gears bear what they have to.
+
+    Raises
+    ------
+    InputError : no file of that name.
+    """
+    files = {file.stem: file for file in sorted(folder.glob("*.toml"))}
+    for name in problems or ():
+        if name not in files:
+            raise InputError(f"there is no problem {name!r} in {folder}{did_you_mean(name, files)}")
+    chosen = problems or [name for name in files if not name.endswith("infeasible")]
+    rows = [_row(name, files[name], limit, say) for name in chosen for limit in limits]
+
+    def picture() -> Any:
+        from impactopt.report.pictures.machine import machine_picture
+
+        return machine_picture(rows)
+
+    return Report(
+        name="machine",
+        numbers={"rows": rows},
+        tables=(columns_table("what gears may bear, and what a blow brings", COLUMNS, rows),),
+        figures={"machine": picture},
+    )
+
+
+def _limited(limit: float | None, problem: ImpactProblem) -> ImpactProblem:
+    others = tuple(term for term in problem.terms if not isinstance(term, GearLoad))
+    return replace(problem, terms=others if limit is None else (*others, GearLoad(limit=limit)))
+
+
+def _row(name: str, file: Path, limit: float | None, say: Say) -> dict[str, Any]:
+    """An error is its status, and ends what can be said; so does a plan that is none."""
+    out: dict[str, Any] = {"problem": name, "gear_limit": limit}
+    try:
+        solution = solved(file, say, partial(_limited, limit))
+        out |= {"status": solution.status.value, "seconds": solution.solve_seconds}
+        if solution.status.usable:
+            out |= _found(solution)
+    except InputError as error:
+        out |= {"status": out.get("status", "error"), "error": str(error)}
+        say(f"{name}: {error}")
+    return out
+
+
+def _found(solution: Solution) -> dict[str, Any]:
+    replay = solution.validate(engine="mujoco")
+    planned = {} if solution.loads is None else solution.loads.summary()
+    said = solution.summary(replay=replay)["replayed"]
+    outcome = solution.plan.collision.outcome
+    return {
+        "impulse_Ns": solution.impulse,
+        "impulse_error_pct": said["impulse_error_pct"],
+        "target": next(iter(outcome.values()), None),
+        "outcome": outcome,
+        "speed_m_s": solution.plan.hand_speed,
+        "gear_planned": planned.get("gear_ratio"),
+        "gear_replayed": replay.loads.summary()["gear_ratio"],
+        "joint": planned.get("gear_joint"),
+        "stands": said["standing"],
+    }

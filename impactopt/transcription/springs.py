@@ -1,0 +1,93 @@
+"""Rows of joints that a spring and a damper move: the torque that the motion needs is that of the two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from impactopt.transcription.builder import Builder
+from impactopt.transcription.courses import start_torque
+from impactopt.transcription.layout import Affine, add
+from impactopt.transcription.motion_phase import MotionPhase
+from impactopt.transcription.rows import Place, percent
+
+__all__ = ["SpringPoint", "add_springs", "follow_springs", "swing_springs"]
+
+SIMPSON = (1 / 6, 4 / 6, 1 / 6)
+
+
+class SpringPoint(NamedTuple):
+    """Torques over limit (n,), and the motion that they are of: at a place, or means over an interval.
+
+    y, y1 (ny,), T : the coordinates, and their rate y'/T.
+    """
+
+    place: Place
+    torque: Affine
+    y: Affine
+    y1: Affine
+    T: Affine
+
+
+def swing_springs(b: Builder, motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
+    """Of a motion to contact: means over the spline's intervals, and its end.
+
+    Accelerations of a spline are linear in an interval, those of a spring are not. Where their means are
+    right, so are the speeds at the intervals' ends, and with them the blow.
+
+    torques : over limit, at the motion's nodes.
+    """
+    out = []
+    for one, other in pairwise(motion.breaks):
+        three = []
+        for s in (one, (one + other) / 2, other):
+            near = np.flatnonzero(np.isclose(motion.nodes, s))
+            torque = torques[near[0]] if near.size else Affine.constant(start_torque(b))
+            three.append((torque, *motion.at(s)[:2]))
+        torque, y, y1 = (
+            add([part * w for part, w in zip(parts, SIMPSON, strict=True)])
+            for parts in zip(*three, strict=True)
+        )
+        out.append(SpringPoint(motion.place_at((one + other) / 2), torque, y, y1, motion.T[0]))
+    return [*out, *follow_springs(motion, torques)[-1:]]
+
+
+def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[SpringPoint]:
+    """Of a motion to rest: the ends of the spline's intervals. With means it would swing about them."""
+    return [
+        SpringPoint(motion.place_at(s), torque, *motion.at(s)[:2], motion.T[0])
+        for s, torque in zip(motion.nodes, torques, strict=True)
+        if np.isclose(s, motion.breaks).any()
+    ]
+
+
+def add_springs(b: Builder, points: Sequence[SpringPoint]) -> None:
+    """At some points: torque = torque at rest - stiffness x turn - damping x rate.
+
+    In contact the servo's own law is that of the spring.
+    """
+    robot, c = b.robot, b.coordinates
+    passive = np.flatnonzero(robot.passive)
+    if not passive.size:
+        return
+    own = c.independent
+    gains = [(gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd)]
+    slots: list[list[Any]] = [[point.y, point.y1, point.T] for point in points]
+    at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], *gains]))
+    rest, m = start_torque(b)[passive], b.ny - c.base
+    which = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])
+    names = [robot.joint_names[k] for k in passive]
+    for k, point in enumerate(points):
+        b.rows.add(
+            term="spring of a joint",
+            place=point.place,
+            components=names,
+            outputs=at + m * k + which,
+            affine=point.torque[passive] * -1.0,
+            lower=-rest,
+            upper=-rest,
+            measure=percent("of its limit off"),
+        )

@@ -1,0 +1,178 @@
+"""Tools that are held softly: the joint that a grip makes, and the robots that a blow meets at its ends."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impactopt import (
+    SDC,
+    Actuator,
+    FreeMass,
+    InputError,
+    Robot,
+    SoftGrip,
+    SpringDamper,
+    Tool,
+    arm7,
+    effective_mass,
+    planar_arm,
+    striking_velocity,
+    talos,
+)
+from impactopt.collision import Effects
+from impactopt.robots.tools import mapped
+from impactopt.simulation.reference.meshes import Meshes
+from impactopt.simulation.servo import Servo
+
+ONLY_SERVO = Effects(bias=False, jdot=False, saturation=False, feedforward=False)
+NORMAL = np.array([0.6, 0.0, -0.8])
+MASS = 1.0  # [kg] of the target
+
+
+def grip(**changes: Any) -> SoftGrip:
+    numbers = {"axis": [0, 1, 0], "stiffness": 20.0, "damping": 0.5, "point": [0.0, 0.0, 0.08]}
+    return SoftGrip(**numbers | changes)
+
+
+def _inertia(robot: Robot, q: Any) -> Any:
+    return np.array(pin.crba(robot.model, robot.model.createData(), q, pin.Convention.WORLD))
+
+
+def _whole(upper: Any) -> Any:
+    return np.triu(upper) + np.triu(upper, 1).T
+
+
+@pytest.mark.parametrize("frame", ["wrist", "elbow"])
+def test_a_grip_at_rest_makes_the_robot_with_the_firm_tool(frame: str) -> None:
+    """Of a tool at the end, and of one in the middle, whose joint is not the last."""
+    firm = planar_arm().with_tool(Tool.hammer(frame=frame, name="second", face=[0.0, 1.0, 0.0]))
+    axis = np.array([0.6, 0.0, 0.8])
+    soft = firm.with_grip("second", grip(axis=axis))
+    q = pin.randomConfiguration(firm.model, firm.lower, firm.upper)
+    q_soft = mapped(firm.model, soft.model, q)
+    own = soft.joint_index("second_grip")
+    others = np.delete(np.arange(soft.n), own)
+    assert [soft.joint_names[k] for k in others] == list(firm.joint_names)
+    H, expected = _whole(_inertia(soft, q_soft)), _whole(_inertia(firm, q))
+    np.testing.assert_allclose(H[np.ix_(others, others)], expected, atol=1e-12)
+    # about its own axis: the tool's, by the parallel axis theorem; a spring has no rotor
+    tool = firm.tools[-1]
+    arm = tool.center - np.array([0.0, 0.0, 0.08])
+    about = axis @ tool.inertia @ axis + tool.mass * (arm @ arm - (axis @ arm) ** 2)
+    assert H[own, own] == pytest.approx(about)
+    places = []
+    for robot, at in ((firm, q), (soft, q_soft)):
+        data = robot.model.createData()
+        pin.framesForwardKinematics(robot.model, data, at)
+        places.append(np.array(data.oMf[robot.model.getFrameId("striker:second")].homogeneous))
+    np.testing.assert_allclose(*places, atol=1e-12)
+
+
+def test_other_joints_keep_their_numbers() -> None:
+    firm = planar_arm().with_actuators({"wrist": Actuator(momentary_torque=70.0, armature=0.07)})
+    soft = firm.with_tool(Tool.hammer(frame="elbow", name="second")).with_grip("second", grip())
+    others = np.array([soft.joint_index(name) for name in firm.joint_names])
+    for name in ("kp", "kd", "torque_limit", "velocity_limit", "lower", "upper", "armature", "gear_limit"):
+        np.testing.assert_array_equal(getattr(soft, name)[others], getattr(firm, name), name)
+    own = soft.joint_index("second_grip")
+    assert (soft.kp[own], soft.kd[own], soft.armature[own]) == (20.0, 0.5, 0.0)
+    assert soft.gear_limit[own] == np.inf
+    assert list(np.flatnonzero(soft.passive)) == [own]
+    assert not firm.passive.any()
+    np.testing.assert_array_equal(soft.posture("ready")[others], firm.posture("ready"))
+
+
+def _impulse(robot: Robot, factor: float) -> float:
+    """[N s] of a blow in which spring and damper are so much stronger."""
+    q, kp, kd = robot.posture("ready"), robot.kp.copy(), robot.kd.copy()
+    kp[robot.passive] *= factor
+    kd[robot.passive] *= factor
+    v = np.zeros(robot.nv)
+    firm = arm7()
+    v[~robot.passive] = striking_velocity(firm, firm.posture("ready"), "hammer", NORMAL, 1.0)
+    law, target = SpringDamper(stiffness=1e5, damping=100.0), FreeMass(mass=MASS)
+    model = SDC(
+        robot=robot,
+        striker="hammer",
+        normal=NORMAL,
+        law=law,
+        target=target,
+        effects=ONLY_SERVO,
+        kp=kp,
+        kd=kd,
+        accuracy=None,
+    )
+    return float(model.collide(q, v).impulse)
+
+
+def test_a_stiff_grip_hits_as_a_firm_one() -> None:
+    """What it lacks falls with the first power of stiffness and damping."""
+    firm, soft = arm7(), arm7().with_grip("hammer", grip(stiffness=100.0, damping=1.0))
+    whole = _impulse(firm, 1.0)
+    lacks = np.array([whole - _impulse(soft, factor) for factor in (1e3, 1e4, 1e5)])
+    assert lacks[0] > 1e-4 * whole
+    np.testing.assert_allclose(lacks[1:] / lacks[:-1], 0.1, rtol=0.02)
+
+
+def test_without_a_spring_it_hits_as_a_hinge_does() -> None:
+    """The effective mass of an arm whose hammer turns freely, in the closed form of two masses."""
+    soft = arm7().with_grip("hammer", grip())
+    bare = dataclasses.replace(soft, kp=0 * soft.kp, kd=0 * soft.kd)
+    mass = float(effective_mass(soft, striker="hammer", normal=NORMAL)(soft.posture("ready")))
+    assert mass < 0.8 * float(
+        effective_mass(arm7(), striker="hammer", normal=NORMAL)(arm7().posture("ready"))
+    )
+    reduced = 1 / (1 / mass + 1 / MASS)
+    z = 100.0 / (2 * np.sqrt(1e5 * reduced))
+    closed = reduced * (1 + np.exp(-z * np.arccos(z) / np.sqrt(1 - z**2)))
+    assert _impulse(bare, 1.0) == pytest.approx(closed, rel=1e-6)
+
+
+def test_its_servo_is_a_spring_whatever_the_reference_says() -> None:
+    robot = planar_arm().with_grip("hammer", grip())
+    own, rng = robot.passive, np.random.default_rng(1)
+    reference = type("Reference", (), {})()
+    reference.time = np.array([0.0, 0.1, 0.2])
+    reference.q, reference.v = rng.normal(size=(3, robot.nq)), rng.normal(size=(3, robot.nv))
+    reference.torque = rng.normal(size=(3, robot.n))
+    servo = Servo(robot, reference)
+    angles, rates = np.full(robot.n, 30.0), np.full(robot.n, 300.0)
+    demand, torque = servo.torque(0.15, angles, rates)
+    spring = reference.torque[0, own] - 20.0 * (30.0 - reference.q[0, own]) - 0.5 * 300.0
+    np.testing.assert_allclose(demand[own], spring)
+    np.testing.assert_allclose(torque[own], spring, err_msg="nothing saturates")
+    assert (np.abs(torque[~own]) == robot.torque_limit[~own]).all()
+
+
+def test_the_meshes_of_its_urdf_do_not_need_the_grip() -> None:
+    robot = talos().with_tool(Tool.hammer(frame="gripper_right_base_link")).with_grip("hammer", grip())
+    rest = robot.posture("half_sitting")
+    through = rest.copy()
+    for joint in ("arm_left_4_joint", "arm_left_2_joint", "head_2_joint"):  # the last is beyond the grip
+        through[robot.model.joints[robot.model.getJointId(joint)].idx_q] = 0.0
+    meshes = Meshes(robot, rest)
+    assert meshes.touching(rest[None]) == []
+    assert any("arm_left" in one or "arm_left" in two for one, two in meshes.touching(through[None]))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: grip(axis=[0, 2, 0]), "no unit vector; divide it by its length"),
+        (lambda: grip(stiffness=0.0), r"stiffness is 0 N m/rad; give a number > 0"),
+        (lambda: grip(damping=-1.0), r"damping is -1 N m s/rad; give a number > 0"),
+        (lambda: planar_arm().with_grip("hamer", grip()), "has no tool 'hamer'.*did you mean 'hammer'"),
+        (
+            lambda: planar_arm().with_grip("hammer", grip()).with_grip("hammer", grip()),
+            "holds 'hammer' softly already",
+        ),
+    ],
+)
+def test_grips_that_are_none_are_refused(make: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        make()

@@ -38,6 +38,7 @@ from impactopt.files.replay import Planned
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.parts import SoftGrip
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world
@@ -298,10 +299,26 @@ def test_mujoco_plays_the_scene(arm: Solution, tmp_path: Path) -> None:
     assert play(directory, "missing")[0] == 0.0
 
 
+def test_a_soft_grip_is_a_spring_in_the_scene_and_the_tables(tmp_path: Path) -> None:
+    """What nothing drives is not asked to follow the plan; so the scene's blow is the replay's."""
+    firm = load_problem("arm_planar")
+    grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.08])
+    soft = solve(dataclasses.replace(firm, robot=firm.robot.with_grip("hammer", grip)))
+    soft.export("mujoco", tmp_path / "scene")
+    memory = simulate_mujoco(soft.problem.robot, soft.trajectory, scene_of(soft.problem), settle=0.0)
+    assert play(tmp_path / "scene")[0] == pytest.approx(memory.impulse, rel=NEAR)
+    table = np.genfromtxt(soft.export("csv", tmp_path / "csv")[1], delimiter=",", names=True, comments="#")
+    moves = [name for name in table.dtype.names if "hammer_grip" in name and "kp" not in name]
+    assert moves and all(np.ptp(table[name]) == 0.0 for name in moves)
+    joints = json.loads((tmp_path / "csv" / "meta.json").read_text())["joints"]
+    assert [joint["name"] for joint in joints if joint.get("passive")] == ["hammer_grip"]
+
+
 @pytest.mark.parametrize(
     ("law", "target"),
     [
         (SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0)),
+        (SpringDamper(stiffness=1e4, damping=100.0), FreeMass(mass=1.0, initial_velocity=-2.0)),
         (HuntCrossley(stiffness=2e6, dissipation=0.1), RigidWall()),
         (
             HertzDamped(stiffness=2e6, damping=500.0),
@@ -309,7 +326,7 @@ def test_mujoco_plays_the_scene(arm: Solution, tmp_path: Path) -> None:
         ),
         (KelvinVoigt(stiffness=1e4, damping=50.0), Board(mass=0.5, stiffness=2e5, breaking_force=1e6)),
     ],
-    ids=["mass", "wall", "board", "strong board"],
+    ids=["mass", "ball", "wall", "board", "strong board"],
 )
 def test_every_law_and_target_plays(planned: Planned, law: Any, target: Any, tmp_path: Path) -> None:
     """The arm's motion against other things than it was planned for."""

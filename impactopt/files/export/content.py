@@ -17,7 +17,7 @@ from impactopt.contact.fields import abouts
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError, check_number, did_you_mean
-from impactopt.files.export.motion import JUMP, Motion, motion_at
+from impactopt.files.export.motion import JUMP, Motion, motion_at, springs_at_rest
 from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
@@ -58,8 +58,12 @@ class Export:
 
     @property
     def motions(self) -> dict[str, Motion]:
-        """By the names of their files."""
-        return {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
+        """By the names of their files, as a servo is to follow them: a joint that nothing drives, as a soft
+        grip's, stays where its spring is at rest.
+        """
+        springs = self.per_joint(self.robot.passive)
+        of = {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
+        return {name: springs_at_rest(motion, springs) for name, motion in of.items()}
 
     def per_joint(self, values: Array) -> Array:
         """Numbers (n,) of the robot in the order of the export."""
@@ -115,6 +119,7 @@ class Export:
             rows.append(
                 {
                     "name": name,
+                    **({"passive": True} if robot.passive[k] else {}),
                     "kind": "prismatic" if prismatic else "revolute",
                     "kp": robot.kp[k],
                     "kd": robot.kd[k],

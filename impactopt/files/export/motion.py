@@ -15,7 +15,7 @@ from impactopt.kinematics.support import zmp
 from impactopt.robots.robot import Robot
 from impactopt.transcription.plan import Trajectory
 
-__all__ = ["JUMP", "Base", "Motion", "motion_at"]
+__all__ = ["JUMP", "Base", "Motion", "motion_at", "springs_at_rest"]
 
 Array = NDArray[np.float64]
 JUMP = 1e-6  # [s] by which the later one of two rows at a jump is told later
@@ -124,6 +124,18 @@ def motion_at(
         contact_end=edges[1],
         end=reference.end,
     )
+
+
+def springs_at_rest(motion: Motion, springs: NDArray[np.bool_]) -> Motion:
+    """The motion as servos get it, where some joints (n,) are springs: these are asked to stay, and to bear
+    what they bear at the start.
+    """
+    if not springs.any():
+        return motion
+    held = {name: getattr(motion, name).copy() for name in ("position", "velocity", "acceleration", "effort")}
+    for name, value in held.items():
+        value[:, springs] = value[0, springs] if name in ("position", "effort") else 0.0
+    return dataclasses.replace(motion, **held)
 
 
 def _ending(reference: Trajectory) -> Trajectory:

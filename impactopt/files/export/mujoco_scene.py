@@ -248,7 +248,8 @@ def _reference(export: Export) -> dict[str, Any]:
         "contact": np.array([export.motion.contact_start, export.motion.contact_end]),
         "impulse": np.array(float(export.planned.record.summary["impulse_Ns"])),
     }
-    for prefix, motion in (("", export.motion), ("missed_", export.missed)):
+    motions = export.motions
+    for prefix, motion in (("", motions["motion"]), ("missed_", motions.get("missed"))):
         out |= {f"{prefix}{name}": value for name, value in _histories(motion)}
     return out
 

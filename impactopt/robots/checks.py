@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean
+from impactopt.errors import InputError, Mistakes, check_array, did_you_mean
 
 Array = NDArray[np.float64]
 
@@ -42,61 +42,26 @@ def check_joints(joints: Sequence[str], name: str) -> None:
             raise InputError(f"the name of joint {joint!r} has control characters; take them out")
 
 
-def check_inertias(model: pin.Model) -> None:
-    """InputError if a moving body's mass or inertia cannot be those of matter."""
-    for i in range(1, model.njoints):
-        body = model.inertias[i]
-        where = f"the link moved by joint {model.names[i]!r} (with what is fixed to it)"
-        if not 0 < body.mass <= HEAVIEST:
-            raise InputError(
-                f"{where} has mass {body.mass:g} kg; give its <inertial> one > 0 and <= {HEAVIEST:g}"
-            )
-        inertia, placed = np.array(body.inertia), model.jointPlacements[i].translation
-        if not (np.isfinite(inertia).all() and np.isfinite(body.lever).all()):
-            raise InputError(f"{where} has NaN or infinity in its <inertial>; give finite numbers")
-        if not (np.abs(inertia).max() <= HEAVIEST and max(np.abs(body.lever)) <= FARTHEST):
-            raise InputError(
-                f"{where} has more than {HEAVIEST:g} kg m2, or its centre of mass more than {FARTHEST:g} m "
-                "from its joint; correct its <inertial>"
-            )
-        if not max(np.abs(placed)) <= FARTHEST:
-            raise InputError(
-                f"joint {model.names[i]!r} is {max(np.abs(placed)):g} m from the one before, and "
-                f"{FARTHEST:g} is the most; correct its <origin>"
-            )
-        small, middle, large = np.linalg.eigvalsh(inertia)
-        moments = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m2"
-        if small <= 0:
-            raise InputError(
-                f"{where} has principal moments of inertia {moments}: not positive definite; "
-                "correct its <inertia>, which is about the centre of mass"
-            )
-        # moments of matter obey the triangle inequality; 1e-3 is left for rounded decimals
-        if small + middle < large * (1 - 1e-3):
-            raise InputError(
-                f"{where} has principal moments of inertia {moments}: one exceeds the sum of the others, "
-                "which no body has; correct its <inertia>"
-            )
-
-
 def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: Array, upper: Array) -> None:
-    """InputError if a limit is missing (zero or infinite in a URDF), negative or crossed."""
+    """InputError with all limits that are missing (zero or infinite in a URDF), negative or crossed."""
+    found = Mistakes()
     for name, value, unit, option in (
         *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
         *((j, x, "rad/s", "velocity_limit") for j, x in zip(joints, velocity, strict=True)),
     ):
         # Pinocchio writes a missing limit as infinity or the largest double
         if not 0 < value <= STRONGEST:
-            raise InputError(
+            found.found.append(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
                 f"set it in the URDF's <limit>, or give {option}={{{name!r}: ...}}"
             )
     for name, low, high in zip(joints, lower, upper, strict=True):
         if not low < high:
-            raise InputError(
+            found.found.append(
                 f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
                 f"set them in the URDF's <limit>, or give position_limit={{{name!r}: (lower, upper)}}"
             )
+    found.raise_if_any("the robot")
 
 
 def check_actuators(joints: Sequence[str], actuators: Sequence[Any]) -> None:

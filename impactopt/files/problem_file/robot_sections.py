@@ -1,9 +1,9 @@
-"""The section [robot]: a preset with changes, or a URDF with what it lacks."""
+"""The section [robot]: a preset with changes, or a URDF or MJCF with what it lacks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -93,17 +93,23 @@ class ActuatorSection(_OfActuator):
 
 
 class RobotSection(Section):
-    """A preset with changes, or a URDF; files are relative to the problem file.
+    """A preset with changes, or a URDF or MJCF; files are relative to the problem file.
 
     A preset keeps its own strikers beside the section's.
     """
 
     preset: Preset = optional("name of a preset: see `impactopt robots`")
     urdf: str = optional("the robot's URDF, in place of a preset")
+    mjcf: str = optional(
+        "the robot's MJCF, in place of a preset: with its armature, friction, actuators, keyframes, sites"
+    )
     srdf: str = optional("file with the URDF's named postures and rotors")
     name: str = optional("what reports call it")
     floating: bool = optional("true: the base is free; false: the root link is fixed to the ground")
     locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
+    inertias: Literal["given", "repaired"] = optional(
+        '"repaired": those that no body can have are changed to ones that it can; `check` lists them'
+    )
     armature: PerJoint = optional(
         "reflected rotor inertia, of all joints or by joint [kg m2]", "armature_kg_m2"
     )
@@ -125,8 +131,11 @@ class RobotSection(Section):
 
     @model_validator(mode="after")
     def _one_source(self) -> RobotSection:
-        if ("preset" in self.model_fields_set) == ("urdf" in self.model_fields_set):
-            raise ValueError("give either preset or urdf")
+        if len(self.model_fields_set & {"preset", "urdf", "mjcf"}) != 1:
+            raise ValueError("give one of preset, urdf and mjcf")
+        for key, of in (("srdf", {"urdf"}), ("inertias", {"urdf", "mjcf"})):
+            if key in self.model_fields_set and not self.model_fields_set & of:
+                raise ValueError(f"{key} belongs to {' or '.join(sorted(of))}: leave it out")
         return self
 
     def make(self, folder: Path) -> Robot:
@@ -134,7 +143,7 @@ class RobotSection(Section):
         for key in ("soles", "strikers", "tools"):
             check_count(key.removesuffix("s"), getattr(self, key) or ())
         options = self.given()
-        for file in ("urdf", "srdf"):
+        for file in ("urdf", "mjcf", "srdf"):
             if file in options:
                 options[file] = folder / options[file]
         if "soles" in options:
@@ -148,9 +157,10 @@ class RobotSection(Section):
             for section in (self.actuators if options.pop("actuators", None) else ())
             for joint in section.joints
         }
-        if "urdf" in options:
-            options |= {"actuators": drives} if drives else {}
-            robot = Robot.from_urdf(options.pop("urdf"), **options)
+        kind = next((key for key in ("urdf", "mjcf") if key in options), None)
+        if kind is not None:
+            read = Robot.from_urdf if kind == "urdf" else Robot.from_mjcf
+            robot = read(options.pop(kind), **options, **({"actuators": drives} if drives else {}))
         else:
             robot = load_robot(options.pop("preset"), **options)
             robot = robot.with_actuators(drives) if drives else robot
@@ -176,7 +186,7 @@ class RobotSection(Section):
         return found or [((), error)]
 
 
-_BARE = {"preset", "urdf", "srdf", "floating", "locked"}  # what the other keys are about
+_BARE = {"preset", "urdf", "mjcf", "srdf", "floating", "locked", "inertias"}  # what the other keys are about
 
 
 def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:

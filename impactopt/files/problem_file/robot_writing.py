@@ -13,6 +13,7 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.toml import plain_value
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.inertias import GIVEN
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
 __all__ = ["robot_data"]
@@ -59,12 +60,16 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     data: dict[str, Any] = {} if source.preset is None else {"preset": source.preset}
     if source.urdf is not None:
         data["urdf"] = _relative(source.urdf, folder)
+    if source.mjcf is not None:
+        data["mjcf"] = _relative(source.mjcf, folder)
+    if options.get("inertias", GIVEN) != GIVEN:
+        data["inertias"] = options["inertias"]
     if "srdf" in options:
         data["srdf"] = _relative(options["srdf"], folder)
     if "name" in options:
         data["name"] = options["name"]
-    if "floating" in options and not options["floating"]:
-        data["floating"] = False
+    if "floating" in options and (source.mjcf is not None or not options["floating"]):
+        data["floating"] = options["floating"]
     locked = options.get("locked", ())
     angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
     if angles or (locked != () and source.preset is not None):

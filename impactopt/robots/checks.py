@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 # time. Light wrists without armature reach 1e5.
 MAX_SERVO_RATE = 3e4
 HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool, a rotor: a ship
+LEG = 6  # joints of a leg whose sole is held: as many as the sole has directions
 STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
 
 
@@ -144,6 +145,27 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
         return int(model.getFrameId(frame))
     except (ValueError, RuntimeError):  # a link and a joint of the same name
         return int(model.getFrameId(frame, pin.FrameType.BODY))
+
+
+def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
+    """InputError with all held soles, (name, frame) each, that are not on a leg of their own of six joints."""
+    found, legs = Mistakes(), []
+    for name, frame in soles:
+        parent = model.frames[check_frame(model, frame, f"sole {name!r}")].parentJoint
+        joints = [str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1]
+        legs.append(set(joints))
+        if len(joints) != LEG:
+            told = f": {', '.join(joints)}" if joints else ""
+            found.found.append(
+                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}; a "
+                f"held sole needs exactly {LEG} (lock the others with `locked=`)"
+            )
+    shared = sorted(set.union(set(), *(a & b for k, a in enumerate(legs) for b in legs[:k])))
+    if shared and not found.found:
+        found.found.append(
+            f"the held soles' legs share joints, {', '.join(shared)}: their motion is not independent"
+        )
+    found.raise_if_any("the stance")
 
 
 def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:

@@ -393,6 +393,8 @@ class ImpactProblem:
             if self.freezes:
                 more["sdc"] = f", {self.freezes} freezes"
             out["collision"] = self.collision + more.get(self.collision, "")
+        if self.robot.source is not None and self.robot.source.repairs:
+            out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
         if self.scenarios:
             out["scenarios"] = [str(s) for s in self.scenarios]
         if self.objectives != DEFAULT_OBJECTIVES:

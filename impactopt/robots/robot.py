@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, Mistakes, check_array
 from impactopt.robots import build, checks
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
@@ -83,8 +83,10 @@ class Robot:
             object.__setattr__(self, name, read_only(value))
         object.__setattr__(self, "soles", tuple(self.soles))
         object.__setattr__(self, "strikers", dict(self.strikers))
-        check_inertias(self.model)
-        checks.check_limits(self.joint_names, self.torque_limit, self.velocity_limit, self.lower, self.upper)
+        found, limits = Mistakes(), (self.torque_limit, self.velocity_limit, self.lower, self.upper)
+        found.attempt(lambda: check_inertias(self.model))
+        found.attempt(lambda: checks.check_limits(self.joint_names, *limits))
+        found.raise_if_any(f"robot {self.name!r}")
         object.__setattr__(self, "actuators", tuple(self.actuators) or (Actuator(),) * self.n)
         checks.check_actuators(self.joint_names, self.actuators)
         for sole in self.soles:
@@ -122,19 +124,19 @@ class Robot:
         name : the URDF's own name when left out.
         floating : with a free-flyer at the root; else the root link is fixed to the world.
         locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
-        inertias : "given", or "repaired" where no body can have them: `repairs` says what was changed.
+        inertias : "given", or "repaired" where no body can have them: `source.repairs` lists what was changed.
         options : as of `from_model`.
         """
         check_choice(inertias)
         model = build.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         model = build.lock_joints(model, locked)
-        if inertias == REPAIRED:
-            repair_inertias(model)
+        repairs = tuple(repair_inertias(model)) if inertias == REPAIRED else ()
         robot = cls.from_model(model, name=name or model.name, **{"urdf": path, **options})
         pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
         robot = dataclasses.replace(robot, disable_collisions=pairs)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
-        return dataclasses.replace(robot, source=Source(urdf=fspath(path), options=given | options))
+        source = Source(urdf=fspath(path), options=given | options, repairs=repairs)
+        return dataclasses.replace(robot, source=source)
 
     @classmethod
     def from_mjcf(
@@ -165,11 +167,11 @@ class Robot:
         check_choice(inertias)
         read = _mjcf.read_mjcf(path, floating=floating)
         model = build.lock_joints(read.model, locked)
-        if inertias == REPAIRED:
-            repair_inertias(model)
+        repairs = tuple(repair_inertias(model)) if inertias == REPAIRED else ()
         robot = cls.from_model(model, name=name or model.name, mjcf=path, **read.options(model, options))
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
-        return dataclasses.replace(robot, source=Source(mjcf=fspath(path), options=given | options))
+        source = Source(mjcf=fspath(path), options=given | options, repairs=repairs)
+        return dataclasses.replace(robot, source=source)
 
     @classmethod
     def from_model(

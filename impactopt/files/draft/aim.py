@@ -21,9 +21,10 @@ Array = NDArray[np.float64]
 WAYS = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0))
 # of the arm's length, from the shoulder: where its end waits (ahead, below), and where it may hit (ahead)
 WAITS = ((0.4, 0.3), (0.45, 0.0), (0.35, 0.5), (0.5, -0.3))
+BENCH = 0.6  # [m] a shoulder as low as that belongs to an arm on the ground, whose end waits level with it
 HITS = (0.75, 0.65, 0.85, 0.55)
 LOWEST = 0.25  # [m] above the ground
-NEAR = 0.01  # [m] off its place
+NEAR = 0.03  # [m] off its place, as bent postures are preferred
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +50,8 @@ def ready(robot: Robot, arms: Sequence[Arm], q: Array, *, ways: Sequence[Sequenc
         length = arm_length(robot, arm.limb, arm.name)
         root = shoulder(robot, arm.limb, q)
         best, off = q, np.inf
-        for to, (ahead, below) in product(ways if k == 0 else [way], WAITS):
+        waits = WAITS if root[2] > BENCH else WAITS[1:]
+        for to, (ahead, below) in product(ways if k == 0 else [way], waits):
             place = root + length * (ahead * np.array(to) - [0.0, 0.0, below])
             place[2] = max(place[2], LOWEST)
             tried, gap = bend_arm(robot, arm.limb, arm.name, arm.axis, q, place, np.array(to))

@@ -19,7 +19,8 @@ Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
 STARTS = 10
 INSIDE = 0.1  # of a joint's range that is left to its limits
-REST = 0.03  # weight of the middle of a joint's range, over that of a metre
+REST = 0.02  # [m] that the whole range of a joint is worth: postures in the middle of their ranges
+EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
 
 
 def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array) -> Array:
@@ -69,8 +70,8 @@ def bend_arm(robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, targe
     model, data = robot.model, robot.model.createData()
     fid, own = model.getFrameId(f"striker:{striker}"), _rows(robot, arm.own)
     low, high = _limits(robot, own)
-    middle = np.where(np.isfinite(low + high), np.clip(0.0, low, high), 0.0)
-    span = np.minimum(high - low, 2 * np.pi)
+    span = high - low
+    middle = np.where(np.minimum(high, -low) > EDGE * span, 0.0, (low + high) / 2)
     rng = np.random.default_rng(0)
     tries = []
 
@@ -80,7 +81,7 @@ def bend_arm(robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, targe
         pin.updateFramePlacement(model, data, fid)
         gap = target - data.oMf[fid].translation
         points = data.oMi[arm.tip].rotation @ axis
-        return np.concatenate([gap, 0.02 * (points - way), REST * 0.1 * (angles - middle) / span])
+        return np.concatenate([gap, 0.02 * (points - way), REST * (angles - middle) / span])
 
     for k in range(STARTS):
         start = np.clip(middle + (0.25 * span * rng.standard_normal(len(own)) if k else 0.05), low, high)

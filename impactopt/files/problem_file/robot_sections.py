@@ -25,7 +25,9 @@ from impactopt.files.problem_file.values import (
     Vector,
 )
 from impactopt.robots.actuators import Actuator
-from impactopt.robots.build import check_count
+from impactopt.robots.build import add_frame, check_count, lock_joints, read_urdf
+from impactopt.robots.checks import check_legs
+from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
@@ -169,6 +171,33 @@ class RobotSection(Section):
         for tool in tools:
             robot = robot.with_tool(tool)
         return robot
+
+    def leg_mistake(self, folder: Path, held: str) -> InputError | None:
+        """What is wrong with the legs of the held soles, "both" or one by its name, whatever else is."""
+        try:
+            model = self._model(folder)
+            chosen = [s for s in self.soles or () if held in ("both", s.name)]
+            built = [section.build() for section in chosen]
+            for sole in built:
+                if sole.parent is not None:
+                    add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
+        except (InputError, AttributeError):
+            return None  # it has no soles, or something else is wrong, which others tell
+        try:
+            check_legs(model, [(sole.name, sole.frame) for sole in built])
+        except InputError as error:
+            return error
+        return None
+
+    def _model(self, folder: Path) -> Any:
+        """The pin.Model alone; InputError for a preset, which is sound."""
+        locked = self.locked or {}
+        if "urdf" in self.model_fields_set:
+            floating = self.floating if "floating" in self.model_fields_set else True
+            return lock_joints(read_urdf(folder / self.urdf, None, floating=floating, repaired=True), locked)
+        if "mjcf" in self.model_fields_set:
+            return lock_joints(read_mjcf(folder / self.mjcf, floating=self.floating).model, locked)
+        raise InputError("a preset")
 
     def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
         """All that keeps `make` from making a robot, `error` being the first of it, and of which key it is.

@@ -59,9 +59,9 @@ def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
 def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
     """The pieces of a robot, and in words where they are from.
 
-    They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no others.
-    A robot without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools are rods to their
-    heads.
+    They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no
+    others. A robot without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools
+    are rods to their heads.
     """
     if robot.mjcf is not None:
         found, source = list(_from_mjcf(robot, robot.mjcf)), "collision shapes of its MJCF"

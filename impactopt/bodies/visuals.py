@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes in its URDF or MJCF, or, where there is none, boxes of its links' inertia."""
+"""What a robot looks like: the shapes in its URDF or MJCF, or boxes of its links' inertia."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def new(
     ] = None,
     urdf: Annotated[
         str | None,
-        typer.Option(metavar="FILE", help="Draft it for the robot of this URDF, or example-robot-data's name."),
+        typer.Option(metavar="FILE", help="Draft it for this URDF, or a robot of example-robot-data."),
     ] = None,
     mjcf: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draft it for the robot of this MJCF.")

@@ -1,4 +1,4 @@
-"""Postures that reach a point at rest: soles in place, joints inside their limits, and the weight over the soles."""
+"""Postures that reach a point at rest: soles in place, joints inside limits, the weight over the soles."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ FARAWAY = 50.0  # [rad], [m] bound of what has none
 
 
 class Reach(NamedTuple):
-    """The posture (nq,) found; how far [m] its striking point is off, soles and all; how far [m] its centre of
-    mass is outside the support polygon, < 0 inside."""
+    """The posture (nq,) found; how far [m] its striking point is off, soles and all; how far [m] its centre
+    of mass is outside the support polygon, < 0 inside."""
 
     q: Array
     off: float
@@ -41,8 +41,8 @@ def reach(
 ) -> Reach:
     """The best posture near some guesses (nq,) with the striking point at `point` (3,) [m].
 
-    held : soles, each a frame and its pin.SE3 in the world.  polygon : (k, 2) that the centre of mass is to be
-    above, (0, 2): none is asked for.  joint_margin [rad] : inside the limits.
+    held : soles, each a frame and its pin.SE3 in the world.  polygon : (k, 2) that the centre of mass is to
+    be above, (0, 2): none is asked for.  joint_margin [rad] : inside the limits.
     """
     model, data = robot.model, robot.model.createData()
     fid = model.getFrameId(f"striker:{striker}")

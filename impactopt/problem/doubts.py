@@ -25,7 +25,7 @@ DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, the first to mend first: the start beyond the target, a point out of balance."""
+    """What no solve can mend, first what to mend first: a start beyond the target, a point out of balance."""
     found = [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
 
@@ -66,10 +66,10 @@ def _out_of_balance(problem: ImpactProblem) -> str:
     if found.off <= OFF and found.outside <= LEANS:
         return ""
     return (
-        f"the point {np.round(problem.point, 3).tolist()} m is out of balance's reach: the best posture found "
-        f"is {1e3 * found.off:.0f} mm off it with the centre of mass {1e3 * max(found.outside, 0):.0f} mm "
-        f"outside the support polygon of {', '.join(sole.name for sole in c.soles)}; move the point nearer to "
-        "the feet"
+        f"the point {np.round(problem.point, 3).tolist()} m is out of balance's reach: the best posture "
+        f"found is {1e3 * found.off:.0f} mm off it with the centre of mass "
+        f"{1e3 * max(found.outside, 0):.0f} mm outside the support polygon of {', '.join(sole.name for sole in c.soles)}; move the "
+        "point nearer to the feet"
     )
 
 

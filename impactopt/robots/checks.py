@@ -148,7 +148,7 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
 
 
 def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
-    """InputError with all held soles, (name, frame) each, that are not on a leg of their own of six joints."""
+    """InputError with all held soles, (name, frame) each, that are on no leg of their own of six joints."""
     found, legs = Mistakes(), []
     for name, frame in soles:
         parent = model.frames[check_frame(model, frame, f"sole {name!r}")].parentJoint

@@ -7,7 +7,6 @@ has another one (`tests/robots/test_mjcf.py` compares them).
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
@@ -224,8 +223,8 @@ class _Reader:
             one, other = int(mj.eq_obj1id[e]), int(mj.eq_obj2id[e])
             if int(mj.eq_type[e]) in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
                 raise InputError(
-                    f"{self.what} closes a loop by the equality {self.name('equality', e)!r}; robots here are "
-                    "trees: take it out, with the rods that it holds"
+                    f"{self.what} closes a loop by the equality {self.name('equality', e)!r}; robots here "
+                    "are trees: take it out, with the rods that it holds"
                 )
             if mj.eq_type[e] == kinds.mjEQ_JOINT and one in self.joint and other in self.joint:
                 self.out.coupled.append((self.name("joint", one), self.name("joint", other)))
@@ -233,7 +232,7 @@ class _Reader:
     def _actuators(self) -> None:
         mj, kinds = self.mj, self.mujoco.mjtTrn
         inside = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
-        most: Counter[str] = Counter()
+        most: dict[str, float] = {}
         for a in range(mj.nu):
             j = int(mj.actuator_trnid[a, 0])
             if int(mj.actuator_trntype[a]) not in inside or j not in self.joint:
@@ -241,7 +240,7 @@ class _Reader:
             name, gear = self.name("joint", j), abs(float(mj.actuator_gear[a, 0]))
             affine = mj.actuator_biastype[a] == self.mujoco.mjtBias.mjBIAS_AFFINE
             kp, kd = (-float(mj.actuator_biasprm[a, k]) * gear**2 if affine else 0.0 for k in (1, 2))
-            most[name] += _largest(mj, a, affine) * gear
+            most[name] = most.get(name, 0.0) + _largest(mj, a, affine) * gear
             if kp > 0 or kd > 0:
                 self.out.kp[name] = self.out.kp.get(name, 0.0) + kp
                 self.out.kd[name] = self.out.kd.get(name, 0.0) + kd

@@ -124,7 +124,7 @@ class Robot:
         name : the URDF's own name when left out.
         floating : with a free-flyer at the root; else the root link is fixed to the world.
         locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
-        inertias : "given", or "repaired" where no body can have them: `source.repairs` lists what was changed.
+        inertias : "given", or "repaired" where no body can have them: `source.repairs` lists these.
         options : as of `from_model`.
         """
         check_choice(inertias)
@@ -161,8 +161,7 @@ class Robot:
 
         Raises
         ------
-        InputError : no MuJoCo; no robot in the file; loops, ball joints, joints that follow others (lock
-            one of them).
+        InputError : no MuJoCo; no robot in the file; loops, ball joints, joints that follow others.
         """
         check_choice(inertias)
         read = _mjcf.read_mjcf(path, floating=floating)

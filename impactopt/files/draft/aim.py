@@ -36,7 +36,9 @@ class Arm:
     axis: Array
 
 
-def ready(robot: Robot, arms: Sequence[Arm], q: Array, *, ways: Sequence[Sequence[float]]) -> tuple[Array, Array]:
+def ready(
+    robot: Robot, arms: Sequence[Arm], q: Array, *, ways: Sequence[Sequence[float]]
+) -> tuple[Array, Array]:
     """The configuration (nq,) with all arms bent, and the way (3,) in which the first one strikes.
 
     arms : the first one strikes, and has to find a place.  ways : that may be struck in, the best first.
@@ -64,8 +66,8 @@ def ready(robot: Robot, arms: Sequence[Arm], q: Array, *, ways: Sequence[Sequenc
         q = best
     if nearest > 5 * NEAR:
         raise InputError(
-            f"no posture is found with {arms[0].name!r} in front: the best one is {1e3 * nearest:.0f} mm off; write "
-            "the problem file by hand (docs/howto/robot.md)"
+            f"no posture is found with {arms[0].name!r} in front: the best one is {1e3 * nearest:.0f} mm "
+            "off; write the problem file by hand (docs/howto/robot.md)"
         )
     return q, way
 

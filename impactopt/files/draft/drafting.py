@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.draft.aim import WAYS, Arm, aims, ready
 from impactopt.files.draft.guesses import DOUBT, ROTOR
+from impactopt.files.draft.postures import half_sitting
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, find_striker, sides
-from impactopt.files.draft.postures import half_sitting
 from impactopt.files.problem_file.describing import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import sole_data, striker_data
@@ -161,18 +161,18 @@ def _aimed(
             return aimed
         first = first or wrong[0]
     raise InputError(
-        f"no target is found that {arm.name!r} can hit from the drafted posture; write the problem file by hand "
-        f"(docs/howto/robot.md){f': {first}' if first else ''}"
+        f"no target is found that {arm.name!r} can hit from the drafted posture; write the problem file by "
+        f"hand (docs/howto/robot.md){f': {first}' if first else ''}"
     )
 
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
     guessed = {
-        "armature_kg_m2": f"{DOUBT}: {1e3 * ROTOR:g} g m2 for each N m of torque; ask for rotor inertia x gear^2",
+        "armature_kg_m2": f"{DOUBT}: {1e3 * ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
         "torque_limit_N_m": f"{DOUBT}: three times what gravity can ask; the file has none",
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
-        "strikers": "found in the shapes of the last links: the end along the link; move it to what is to hit",
+        "strikers": "found in the shapes of the last links, where these end; move them to what is to hit",
         "locked_rad": "; ".join(_reasons(drafted.locked)),
     }
 
@@ -188,14 +188,14 @@ def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
 
     head = [
         f"# A first strike of {robot.name}, drafted by `impactopt new`.",
-        f"# What is {DOUBT} is marked so: put the maker's numbers there. `impactopt check FILE` says what is wrong.",
+        f"# What is {DOUBT} is marked so: put the maker's numbers there. `impactopt check FILE` says more.",
     ]
     for text in drafted.drives.said:
         head.append(f"# {text}.")
     if drafted.wrong:
         head += [
-            f"# {len(drafted.wrong)} inertias are none of matter. Correct the {robot_kind(drafted)}, or take the # away "
-            'before `inertias = "repaired"`:',
+            f"# {len(drafted.wrong)} inertias are none of matter. Correct the {robot_kind(drafted)}, or take "
+            'the # away before `inertias = "repaired"`:',
             *(f"#   {text.partition('; correct')[0]}" for text in drafted.wrong),
         ]
     text = write_toml(data, comment, hidden).rstrip("\n")
@@ -218,11 +218,8 @@ def _frames(robot: Robot) -> Iterator[str]:
     yield "# Frames for other strikers and soles, by the joint that moves them:"
     model = robot.model
     for joint in range(1, model.njoints):
-        names = [
-            str(f.name)
-            for f in model.frames
-            if f.parentJoint == joint and f.type != pin.FrameType.JOINT and not str(f.name).startswith("striker:")
-        ]
+        of = [f for f in model.frames if f.parentJoint == joint and f.type != pin.FrameType.JOINT]
+        names = [str(f.name) for f in of if not str(f.name).startswith("striker:")]
         if names:
             yield f"#   {model.names[joint]}: {', '.join(names)}"
 
@@ -239,12 +236,13 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
         ("velocity_limit_rad_s", "velocity limits"),
     ):
         if key in data["robot"]:
-            yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {len(data['robot'][key])} joints"
+            count = len(data["robot"][key])
+            yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {count} joints"
     yield from drafted.drives.said[:3]
     if len(drafted.drives.said) > 3:
         yield f"... and {len(drafted.drives.said) - 3} more such limits: see the file's head"
     if drafted.wrong:
         yield (
-            f"{len(drafted.wrong)} inertias are none of matter, listed at the file's head: correct them, or say "
-            '`inertias = "repaired"` there'
+            f"{len(drafted.wrong)} inertias are none of matter, listed at the file's head: correct them, or "
+            'say `inertias = "repaired"` there'
         )

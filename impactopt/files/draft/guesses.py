@@ -12,7 +12,7 @@ from impactopt.robots.build import effort_limit, is_floating, joint_names, veloc
 
 __all__ = ["Drives", "guess_drives"]
 
-# Robots with public rotors are at 0.0002 s2 (G1: gears of 14 to 22) to 0.003 s2 (arms of 160) of their torque limit
+# Robots with public rotors have 0.0002 s2 (G1: gears of 14 to 22) to 0.003 s2 (arms: 160) x torque limit
 ROTOR = 1e-3  # [s2] armature over torque limit
 LEAST = {True: 1e-3, False: 0.05}  # armature: [kg m2] of a hinge, [kg] of a slide
 SPEED = {True: 3.0, False: 0.3}  # [rad/s], [m/s]

@@ -68,9 +68,7 @@ def to_lock(model: pin.Model) -> dict[str, str]:
         )
         if not low < high:
             out[name] = "no range"
-        elif joint.nq == 2 and (_WHEELS.search(name) or (model.parents[j] <= first - 1 and not children[j])):
-            out[name] = "a wheel"
-        elif _WHEELS.search(name):
+        elif _WHEELS.search(name) or (joint.nq == 2 and model.parents[j] < first and not children[j]):
             out[name] = "a wheel"
         elif _FINGERS.search(name):
             out[name] = "a finger"
@@ -93,7 +91,7 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
 
     def heights(joint: int) -> Array:
         found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
-        return np.concatenate([[0.0], *found] if not found else found) + data.oMi[joint].translation[2]
+        return np.concatenate(found or [np.zeros(1)]) + data.oMi[joint].translation[2]
 
     everywhere = np.concatenate([heights(j) for j in range(1, model.njoints)])
     lowest, tall = float(everywhere.min()), float(np.ptp(everywhere))

@@ -61,9 +61,11 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     return robot.place(q, soles)
 
 
-def bend_arm(robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, target: Array, way: Array) -> tuple[Array, float]:
-    """The configuration with one arm's end near a place (3,) [m], pointing along `way` (3,), and how far it is
-    off [m].
+def bend_arm(
+    robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, target: Array, way: Array
+) -> tuple[Array, float]:
+    """The configuration with one arm's end near a place (3,) [m], pointing along `way` (3,), and how far off
+    [m] it is.
 
     axis (3,) : in which the last link points.  Its other joints stay as in q (nq,).
     """
@@ -87,7 +89,7 @@ def bend_arm(robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, targe
         start = np.clip(middle + (0.25 * span * rng.standard_normal(len(own)) if k else 0.05), low, high)
         found = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), max_nfev=60)
         tries.append((float(found.cost), found.x))
-    cost, angles = min(tries, key=lambda one: one[0])
+    _, angles = min(tries, key=lambda one: one[0])
     return _set(robot, q, own, angles), float(np.linalg.norm(errors(angles)[:3]))
 
 
@@ -121,7 +123,9 @@ def _leg(
 
     for k in range(2 * STARTS):
         start = np.clip(now + (0.6 * rng.standard_normal(len(own)) if k else 0.0), low, high)
-        found = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        found = least_squares(
+            errors, start, bounds=(low - 1e-9, high + 1e-9), xtol=1e-14, ftol=1e-14, gtol=1e-14
+        )
         off = float(np.abs(errors(found.x)).max())
         nearest = min(nearest, off)
         if off > 1e-7:
@@ -130,9 +134,10 @@ def _leg(
         if best is None or knee > best[0] + 1e-4:
             best = knee, found.x
     if best is None:
+        names = [model.names[j] for j in leg.path]
         raise InputError(
-            f"no posture with level soles is found for the leg {', '.join(str(model.names[j]) for j in leg.path)}: the "
-            f"best one is {nearest:.2g} off; give postures by hand (docs/howto/robot.md)"
+            f"no posture with level soles is found for the leg {', '.join(map(str, names))}: the best one is"
+            f" {nearest:.2g} off; give postures by hand (docs/howto/robot.md)"
         )
     return _set(robot, q, own, best[1])
 

@@ -144,14 +144,14 @@ def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
     of = " or ".join(str(count) for count in counts)
     if len(legs) != 2 or counts[0] < LEG:
         raise InputError(
-            f"{robot.name!r} has {len(legs)} legs of {of} joints each ({told}), and impactopt plans for robots on "
-            f"two legs of {LEG} joints, which hold a sole in all its {LEG} directions, or on a fixed base; `--fixed` "
-            "bolts its root link to the ground, and its limbs may strike"
+            f"{robot.name!r} has {len(legs)} legs of {of} joints each ({told}), and impactopt plans for "
+            f"robots on two legs of {LEG} joints, which hold a sole in all its {LEG} directions, or on a "
+            "fixed base; `--fixed` bolts its root link to the ground, and its limbs may strike"
         )
     shared = set(legs[0].path) & set(legs[1].path)
     if shared:
         raise InputError(
-            f"the legs of {robot.name!r} share {', '.join(str(model.names[j]) for j in sorted(shared))}: each needs "
-            f"{LEG} joints of its own from the root link on"
+            f"the legs of {robot.name!r} share {', '.join(str(model.names[j]) for j in sorted(shared))}: "
+            f"each needs {LEG} joints of its own from the root link on"
         )
     return {str(model.names[j]): "beyond the sixth of a leg" for leg in legs for j in leg.path[LEG:]}

@@ -43,8 +43,8 @@ def find_soles(
         found = pieces.get(leg.tip, ())
         if not found:
             raise InputError(
-                f"the foot at joint {str(model.names[leg.tip])!r} has no shapes, so its sole is not known: put its "
-                "meshes where the file says, or write the problem file by hand (docs/howto/robot.md)"
+                f"the foot at joint {str(model.names[leg.tip])!r} has no shapes, so its sole is not known: "
+                "put its meshes where the file says, or write the problem file by hand (docs/howto/robot.md)"
             )
         points, turn = np.concatenate([p.vertices for p in found]), data.oMi[leg.tip].rotation
         up = -_face(points, turn)
@@ -66,8 +66,8 @@ def find_soles(
         polygon = _polygon(corners)
         if polygon is None:
             raise InputError(
-                f"the foot at joint {str(model.names[leg.tip])!r} has no flat face of {1e4 * SMALLEST:g} cm2 to stand "
-                "on: point feet and round ones cannot be held as soles"
+                f"the foot at joint {str(model.names[leg.tip])!r} has no flat face of {1e4 * SMALLEST:g} cm2 "
+                "to stand on: point feet and round ones cannot be held as soles"
             )
         parent, above = _body_of(model, leg.tip)
         soles.append(
@@ -146,7 +146,7 @@ def _face(points: Array, turn: Array) -> Array:
 
 
 def _polygon(corners: Array) -> Array | None:
-    """A convex polygon (k, 2) inside the hull of points, counter-clockwise, of few corners; None: too small."""
+    """A convex polygon (k, 2) inside the hull of points, counter-clockwise, few corners; None: too small."""
     try:
         points = corners[ConvexHull(corners).vertices]
     except (ValueError, RuntimeError):
@@ -173,7 +173,9 @@ def _body_of(model: pin.Model, joint: int) -> tuple[str, Any]:
 
 def _neat(place: Any) -> Any:
     """Without digits that mean nothing."""
-    turn = np.where(np.abs(place.rotation - np.round(place.rotation)) < 1e-6, np.round(place.rotation), place.rotation)
+    turn = np.where(
+        np.abs(place.rotation - np.round(place.rotation)) < 1e-6, np.round(place.rotation), place.rotation
+    )
     return pin.SE3(turn + 0.0, np.round(place.translation, 4) + 0.0)
 
 

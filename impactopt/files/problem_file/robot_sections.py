@@ -162,7 +162,8 @@ class RobotSection(Section):
         kind = next((key for key in ("urdf", "mjcf") if key in options), None)
         if kind is not None:
             read = Robot.from_urdf if kind == "urdf" else Robot.from_mjcf
-            robot = read(options.pop(kind), **options, **({"actuators": drives} if drives else {}))
+            options |= {"actuators": drives} if drives else {}
+            robot = read(options.pop(kind), **options)
         else:
             robot = load_robot(options.pop("preset"), **options)
             robot = robot.with_actuators(drives) if drives else robot

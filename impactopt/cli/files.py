@@ -102,9 +102,6 @@ def new(
     mjcf: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draft it for the robot of this MJCF.")
     ] = None,
-    fixed: Annotated[
-        bool, typer.Option("--fixed", help="Its root link is bolted to the ground, legs or not.")
-    ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write it there, and do not print it.")
     ] = None,
@@ -122,14 +119,12 @@ def new(
     with plain_errors("interrupted"):
         if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
-        if fixed and urdf is None and mjcf is None:
-            raise typer.BadParameter("it is about a robot: give --urdf or --mjcf", param_hint="--fixed")
         if reference:
             from impactopt.files.problem_file.reference import reference as page
 
             _give(page(), out)
         elif urdf is not None or mjcf is not None:
-            _draft(str(mjcf if urdf is None else urdf), urdf is None, fixed, out)
+            _draft(str(mjcf if urdf is None else urdf), urdf is None, out)
         elif name is not None:
             from impactopt.files.problem_file.template import problem_template
 
@@ -140,14 +135,14 @@ def new(
             problems(as_json)
 
 
-def _draft(given: str, mjcf: bool, fixed: bool, out: Path | None) -> None:
+def _draft(given: str, mjcf: bool, out: Path | None) -> None:
     from impactopt.errors import printable
     from impactopt.files.draft.description import find_description
     from impactopt.files.draft.drafting import draft_problem
 
     path = Path(given) if mjcf else find_description(given)
     folder = Path() if out is None else out.parent
-    draft = draft_problem(path, folder=folder, mjcf=mjcf, fixed=fixed)
+    draft = draft_problem(path, folder=folder, mjcf=mjcf)
     _give(draft.text, out)
     for line in draft.said:
         typer.echo(printable(line), err=True)

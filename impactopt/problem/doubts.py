@@ -63,13 +63,14 @@ def _out_of_balance(problem: ImpactProblem) -> str:
     if not len(polygon):
         return ""
     found = _nearest(problem, polygon)
-    if found.off <= OFF and found.outside <= LEANS:
+    if found.off <= OFF:
         return ""
+    names = ", ".join(sole.name for sole in c.soles)
     return (
         f"the point {np.round(problem.point, 3).tolist()} m is out of balance's reach: the best posture "
         f"found is {1e3 * found.off:.0f} mm off it with the centre of mass "
-        f"{1e3 * max(found.outside, 0):.0f} mm outside the support polygon of {', '.join(sole.name for sole in c.soles)}; move the "
-        "point nearer to the feet"
+        f"{1e3 * max(found.outside, 0):.0f} mm outside the support polygon of {names}; move the point nearer "
+        "to the feet"
     )
 
 
@@ -83,10 +84,9 @@ def _nearest(problem: ImpactProblem, polygon: Array) -> Reach:
         guesses.append(pin.integrate(robot.model, problem.start_posture, step))
     best = None
     for guess in guesses:
-        found = reach(robot, held, polygon, problem.striker, problem.point, [guess])
-        if best is None or found.off + max(found.outside, 0) < best.off + max(best.outside, 0):
-            best = found
-        if best.off <= OFF and best.outside <= LEANS:
+        found = reach(robot, held, polygon, problem.striker, problem.point, guess, lean=LEANS)
+        best = found if best is None or found.off < best.off else best
+        if best.off <= OFF:
             break
     assert best is not None
     return best

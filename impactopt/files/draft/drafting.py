@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.draft.aim import WAYS, Arm, aims, ready
 from impactopt.files.draft.guesses import DOUBT, ROTOR
-from impactopt.files.draft.postures import half_sitting
+from impactopt.files.draft.postures import half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, find_striker, sides
 from impactopt.files.problem_file.describing import comment_at
@@ -42,24 +42,24 @@ class Draft:
     said: tuple[str, ...]
 
 
-def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, fixed: bool = False) -> Draft:
+def draft_problem(path: Path, *, folder: Path, mjcf: bool = False) -> Draft:
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
-    folder : that the file is to be in.  fixed : its root link is bolted to the ground, legs or not.
+    folder : that the file is to be in.
 
     Raises
     ------
     InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
         posture or no target is found.
     """
-    drafted = draft_robot(path, mjcf=mjcf, fixed=fixed)
+    drafted = draft_robot(path, mjcf=mjcf)
     model, forward = drafted.robot.model, np.array(WAYS[0])
     soles: list[Sole] = []
     if drafted.legs:
         soles, forward = find_soles(model, drafted.legs, drafted.pieces)
     arms, strikers = _arms(drafted)
     robot = drafted.made(soles=soles, strikers=strikers)
-    q = half_sitting(robot, drafted.legs, soles, forward) if soles else _neutral(robot)
+    q = half_sitting(robot, drafted.legs, soles, forward) if soles else rested(robot)
     q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
     data = _data(drafted, robot, soles, strikers, q, folder)
     data = _aimed(data, robot, arms[0], q, way, folder)
@@ -79,15 +79,6 @@ def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
         strikers.append(striker)
     arms.sort(key=lambda arm: (not arm.name.startswith("right"), -len(arm.limb.own)))
     return arms, strikers
-
-
-def _neutral(robot: Robot) -> Array:
-    """Zero, or as near to it as the limits allow."""
-    q = pin.neutral(robot.model)
-    angles = np.clip(robot.joint_positions(q), robot.lower, robot.upper)
-    for joint, angle in zip(list(robot.model.joints)[-robot.n :], angles, strict=True):
-        q[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
-    return np.asarray(q)
 
 
 def _data(

@@ -13,13 +13,14 @@ from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.robots.robot import Robot, Sole
 
-__all__ = ["arm_length", "bend_arm", "half_sitting", "shoulder"]
+__all__ = ["arm_length", "bend_arm", "half_sitting", "rested", "shoulder"]
 
 Array = NDArray[np.float64]
 BENT = 0.06  # of the legs' length: how much lower than straight it sits
 STARTS = 10
 INSIDE = 0.1  # of a joint's range that is left to its limits
 REST = 0.02  # [m] that the whole range of a joint is worth: postures in the middle of their ranges
+LONG = 0.2  # of an arm's length: an upper arm at least
 EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
 
 
@@ -33,7 +34,7 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     InputError : none is found.
     """
     model, data = robot.model, robot.model.createData()
-    neutral = _inside(robot, pin.neutral(model))
+    neutral = rested(robot)
     pin.framesForwardKinematics(model, data, neutral)
     turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
     straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
@@ -94,16 +95,23 @@ def bend_arm(
 
 
 def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
-    """Where an arm begins (3,) [m]: at the first of its own joints from which on it bends."""
+    """Where an arm begins (3,) [m]: at the joint that its upper arm is on."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q)
-    return np.array(data.oMi[arm.own[min(1, len(arm.own) - 1)]].translation)
+    return np.array(data.oMi[arm.own[_upper(robot, arm)]].translation)
 
 
 def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
     """From the shoulder to the striking point, stretched out [m]."""
     frame = robot.model.frames[robot.model.getFrameId(f"striker:{striker}")]
-    return _path(robot, arm, arm.own[2:]) + float(np.linalg.norm(frame.placement.translation))
+    beyond = _path(robot, arm, arm.own[_upper(robot, arm) + 1 :])
+    return beyond + float(np.linalg.norm(frame.placement.translation))
+
+
+def _upper(robot: Robot, arm: Limb) -> int:
+    """Which of an arm's own joints is the last before its first long link."""
+    steps = [float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in arm.own[1:]]
+    return next((k for k, step in enumerate(steps) if step > LONG * sum(steps)), 0)
 
 
 def _leg(
@@ -155,8 +163,9 @@ def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
     return low + inside, high - inside
 
 
-def _inside(robot: Robot, q: Array) -> Array:
-    every = np.arange(robot.n)
+def rested(robot: Robot) -> Array:
+    """The configuration (nq,) nearest to zero that is well inside the limits."""
+    q, every = pin.neutral(robot.model), np.arange(robot.n)
     low, high = _limits(robot, every)
     return _set(robot, q, every, np.clip(robot.joint_positions(q), low, high))
 

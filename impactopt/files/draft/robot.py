@@ -55,8 +55,8 @@ class Drafted:
         return make(self.path, inertias=REPAIRED, **{**self.options, **more})
 
 
-def draft_robot(path: Path, *, mjcf: bool = False, fixed: bool = False) -> Drafted:
-    """The robot of a file, on two legs if it has them, else bolted to the ground; or that if `fixed`.
+def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
+    """The robot of a file, on two legs if it has them, else bolted to the ground.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def draft_robot(path: Path, *, mjcf: bool = False, fixed: bool = False) -> Draft
     """
     first = _read(path, mjcf, None if mjcf else True)
     locked = _locked(first)
-    floats = is_floating(first.model) and not fixed
+    floats = is_floating(first.model)
     found = _made(path, mjcf, floats, locked)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
     if legs:
@@ -146,7 +146,7 @@ def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
         raise InputError(
             f"{robot.name!r} has {len(legs)} legs of {of} joints each ({told}), and impactopt plans for "
             f"robots on two legs of {LEG} joints, which hold a sole in all its {LEG} directions, or on a "
-            "fixed base; `--fixed` bolts its root link to the ground, and its limbs may strike"
+            "fixed base"
         )
     shared = set(legs[0].path) & set(legs[1].path)
     if shared:

@@ -37,7 +37,7 @@ class Mjcf:
     model : with its armature, limits, and its keyframes as reference configurations; a frame of type BODY for
     each body, and an OP_FRAME for each site, by their names.  kp, kd, torque : by joint, what its actuators
     say.  drives : friction and damping of joints.  sites : names of those on links that move.  coupled :
-    pairs of joints of which one follows the other.
+    pairs of joints of which one follows the other.  shared : joints that move the body of another one too.
     """
 
     model: pin.Model
@@ -47,15 +47,21 @@ class Mjcf:
     drives: dict[str, Actuator] = field(default_factory=dict)
     sites: list[str] = field(default_factory=list)
     coupled: list[tuple[str, str]] = field(default_factory=list)
+    shared: list[str] = field(default_factory=list)
 
     def options(self, model: pin.Model, given: Mapping[str, Any]) -> dict[str, Any]:
         """Options of `Robot.from_model` for a model with some of these joints, under those that are given.
 
         Raises
         ------
-        InputError : two joints are left of which one follows the other.
+        InputError : two joints are left that move the same body, or of which one follows the other.
         """
         joints = joint_names(model)
+        for joint in (joint for joint in self.shared if joint in joints):
+            raise InputError(
+                f"MJCF: joint {joint!r} and another one move the same body, with no mass between them; "
+                "put a body with mass between the two, or lock one of them (`locked`)"
+            )
         for one, other in self.coupled:
             if one in joints and other in joints:
                 raise InputError(
@@ -159,6 +165,8 @@ class _Reader:
             name = self.name("joint", first) if free else "root_joint"
             joint, place = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), name), _none()
             above = model.addJointFrame(joint, 0)
+        if not free:
+            self.out.shared += [self.name("joint", j) for j in range(first, first + count - 1)]
         for j in () if free else range(first, first + count):
             at = pin.SE3(np.eye(3), np.array(mj.jnt_pos[j]))
             joint, above = self._add_joint(j, joint, place * at, above)

@@ -200,12 +200,17 @@ def test_own_numbers_win_over_the_files(tree: Path) -> None:
             '<freejoint/><geom size=".1"/><body><joint/><geom size=".1"/></body>',
             "has several robots, 'trunk', 'ball'",
         ),
+        (
+            '<joint name="turn"',
+            '<joint name="sway" axis="1 0 0" range="-10 10"/><joint name="turn"',
+            "'sway' and another one move the same body.*lock one",
+        ),
         ("<mujoco model", "<mujoco nonsense='1' model", "MJCF .*tree.xml: .*nonsense"),
     ],
 )
 def test_what_is_no_robot_here_is_refused(tree: Path, old: str, new: str, said: str) -> None:
     text = TREE.replace(old, new)
-    if "body><joint/>" in new:
+    if "<joint/>" in new or "sway" in new:  # more numbers than its keyframes have
         text = text.partition("<keyframe>")[0] + "</mujoco>"
     tree.write_text(text)
     with pytest.raises(InputError, match=said):

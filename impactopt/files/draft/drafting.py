@@ -160,7 +160,7 @@ def _aimed(
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
     guessed = {
         "armature_kg_m2": f"{DOUBT}: {1e3 * ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
-        "torque_limit_N_m": f"{DOUBT}: three times what gravity can ask; the file has none",
+        "torque_limit_N_m": f"{DOUBT}: from what gravity can ask; the file has none",
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
         "strikers": "found in the shapes of the last links, where these end; move them to what is to hit",
@@ -219,6 +219,9 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
     """What a user should know before the first plan."""
     stands = "on two legs" if drafted.legs else "on a fixed base"
     yield f"{robot.name}: {robot.n} joints, {stands}; {data['problem']['striker']!r} strikes"
+    across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
+    if across:
+        yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
     for key, what in (
@@ -237,3 +240,9 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
             f"{len(drafted.wrong)} inertias are none of matter, listed at the file's head: correct them, or "
             'say `inertias = "repaired"` there'
         )
+
+
+def _wide(polygon: list[list[float]]) -> bool:
+    """Whether a sole is longer across than ahead, as no foot is."""
+    length, width = np.ptp(np.array(polygon), axis=0)
+    return bool(width > length)

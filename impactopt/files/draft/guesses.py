@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,7 @@ ROTOR = 1e-3  # [s2] armature over torque limit
 LEAST = {True: 1e-3, False: 0.05}  # armature: [kg m2] of a hinge, [kg] of a slide
 SPEED = {True: 3.0, False: 0.3}  # [rad/s], [m/s]
 WEIGHT = 3.0  # torque limit over the largest that gravity asks for
+THIGH = 0.3  # [m] times the robot's weight: what a leg's joint can bear at least
 WEAKEST = {True: 2.0, False: 50.0}  # [N m], [N]
 BELIEVED = {True: 500.0, False: 1e4}  # more than that [N m], [N] is told
 FAST = 60.0  # [rad/s], [m/s]: likewise
@@ -35,17 +36,21 @@ class Drives:
     said: list[str] = field(default_factory=list)
 
 
-def guess_drives(model: pin.Model, known: Mapping[str, float]) -> Drives:
-    """For each joint what is missing; known : torque limits that the model itself has not got."""
+def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collection[str] = ()) -> Drives:
+    """For each joint what is missing.
+
+    known : torque limits that the model itself has not got.  carrying : joints of legs, with the robot above.
+    """
     out, joints = Drives(), joint_names(model)
     base, first = model.nv - len(joints), 2 if is_floating(model) else 1
     torque, speed = effort_limit(model)[base:], velocity_limit(model)[base:]
     lifting = _gravity(model)
+    weight = THIGH * 9.81 * sum(float(body.mass) for body in model.inertias)
     for k, joint in enumerate(joints):
         turns = "JointModelP" not in model.joints[first + k].shortname()
         limit = known.get(joint, float(torque[k]))
         if not 0 < limit < 1e15:
-            limit = _rounded(max(WEIGHT * lifting[k], WEAKEST[turns]))
+            limit = _rounded(max(WEIGHT * lifting[k], WEAKEST[turns], weight * (joint in carrying)))
             out.torque[joint] = limit
         elif limit > BELIEVED[turns]:
             unit = "N m" if turns else "N"

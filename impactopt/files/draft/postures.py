@@ -21,6 +21,7 @@ STARTS = 10
 INSIDE = 0.1  # of a joint's range that is left to its limits
 REST = 0.02  # [m] that the whole range of a joint is worth: postures in the middle of their ranges
 LONG = 0.2  # of an arm's length: an upper arm at least
+ACROSS = 0.7  # largest cosine between a shoulder's axis and the arm, for its place along the axis to be free
 EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
 
 
@@ -39,15 +40,13 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
     straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
     hips = [np.array(data.oMi[leg.own[0]].translation) for leg in legs]
+    aside = [float(spot @ turn[:, 1]) for spot in straight]
     length = float(np.mean([_path(robot, leg, leg.own[1:]) for leg in legs]))
-    across = np.array([hip @ turn[:, 1] for hip in hips])
-    aside = np.array([spot @ turn[:, 1] for spot in straight])
-    side = (np.sign(across) * np.mean(np.abs(aside))) if np.ptp(across) > 0.02 else aside
     height = min(float(spot[2]) for spot in straight) + BENT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
     rng, q = np.random.default_rng(0), neutral
     for _ in range(4):  # feet go where the weight is
-        for leg, sole, out in zip(legs, soles, side, strict=True):
+        for leg, sole, out in zip(legs, soles, aside, strict=True):
             spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
             q = _leg(robot, leg, sole, pin.SE3(turn, spot), q, forward, rng)
         centre = np.array(pin.centerOfMass(model, data, q))
@@ -95,10 +94,18 @@ def bend_arm(
 
 
 def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
-    """Where an arm begins (3,) [m]: at the joint that its upper arm is on."""
-    data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, q)
-    return np.array(data.oMi[arm.own[_upper(robot, arm)]].translation)
+    """Where an arm begins (3,) [m]: on the axis of the joint that its upper arm is on, abreast of the arm."""
+    model, data = robot.model, robot.model.createData()
+    first = arm.own[_upper(robot, arm)]
+    pin.computeJointJacobians(model, data, q)
+    pin.centerOfMass(model, data, q)
+    joint, column = data.oMi[first], model.joints[first].idx_v
+    axis = np.array(pin.getJointJacobian(model, data, first, pin.LOCAL_WORLD_ALIGNED))[3:, column]
+    middle = joint.act(np.array(data.com[first])) - joint.translation
+    along = float(axis @ middle)
+    if abs(along) > ACROSS * np.linalg.norm(middle):
+        return np.array(joint.translation)  # the axis goes along the arm
+    return np.asarray(joint.translation + along * axis)
 
 
 def arm_length(robot: Robot, arm: Limb, striker: str) -> float:

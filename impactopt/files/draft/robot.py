@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,10 @@ def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
     if legs:
         extra = _check_legs(found.robot, legs)
         if extra:
-            found = _made(path, mjcf, True, {**locked, **extra})
+            locked = {**locked, **extra}
+        carrying = {str(found.robot.model.names[j]) for leg in legs for j in leg.path} - extra.keys()
+        if extra or carrying & found.drives.torque.keys():
+            found = _made(path, mjcf, True, locked, carrying)
             legs = legs_of(found.robot.model, found.pieces)
     elif floats:
         found = _made(path, mjcf, False, locked)
@@ -91,11 +94,13 @@ def _locked(read: Mjcf) -> dict[str, str]:
     return out | {one: f"follows {other}" for one, other in read.coupled if not {one, other} & out.keys()}
 
 
-def _made(path: Path, mjcf: bool, floating: bool, locked: Mapping[str, str]) -> Drafted:
+def _made(
+    path: Path, mjcf: bool, floating: bool, locked: Mapping[str, str], carrying: Collection[str] = ()
+) -> Drafted:
     read = _read(path, mjcf, floating)
     angles = {joint: _rest(read.model, joint) for joint in locked}
     model = lock_joints(read.model, angles)
-    drives = guess_drives(model, read.torque)
+    drives = guess_drives(model, read.torque, carrying)
     wrong: tuple[str, ...] = ()
     try:
         check_inertias(model)

@@ -23,6 +23,7 @@ STEEP = np.cos(np.radians(40))  # least cosine between a sole and the ground in 
 CORNERS = 8  # of a polygon at most
 SMALLEST = 2e-3  # [m2] of a sole
 AHEAD = 0.01  # [m] of a foot's middle ahead of its ankle that says which way is forward
+KNEE, BENDS = 3, 0.2  # of a leg's six joints; [rad] of its range more to one side than to the other, twice
 STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
 
 
@@ -53,10 +54,7 @@ def find_soles(
         flats.append((up, low, flat))
         middle = turn @ ((flat.max(axis=0) + flat.min(axis=0)) / 2)
         ahead += middle * [1.0, 1.0, 0.0]
-    forward = np.array([1.0, 0.0, 0.0])
-    if np.abs(ahead).max() > AHEAD * len(legs):
-        k = int(np.argmax(np.abs(ahead)))
-        forward = np.eye(3)[k] * np.sign(ahead[k])
+    forward = _forward(model, data, legs, ahead)
     soles = []
     for name, leg, (up, low, flat) in zip(names, legs, flats, strict=True):
         x = data.oMi[leg.tip].rotation.T @ forward
@@ -80,6 +78,26 @@ def find_soles(
             )
         )
     return soles, forward
+
+
+def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
+    """The way forward (3,): knees bend the feet back; else where the feet's middles are, feet (3,) [m]."""
+    back = np.zeros(3)
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    for leg in legs:
+        knee = model.joints[leg.path[KNEE]]
+        low, high = model.lowerPositionLimit[knee.idx_q], model.upperPositionLimit[knee.idx_q]
+        axis = np.array(pin.getJointJacobian(model, data, leg.path[KNEE], pin.LOCAL_WORLD_ALIGNED))[
+            3:, knee.idx_v
+        ]
+        shin = data.oMi[leg.tip].translation - data.oMi[leg.path[KNEE]].translation
+        if knee.nq == 1 and abs(low + high) > BENDS:
+            back += np.sign(low + high) * np.cross(axis, shin) * [1.0, 1.0, 0.0]
+    for way in (-back, feet):
+        if np.abs(way).max() > AHEAD * len(legs):
+            k = int(np.argmax(np.abs(way)))
+            return np.asarray(np.eye(3)[k] * np.sign(way[k]))
+    return np.array([1.0, 0.0, 0.0])
 
 
 def find_striker(

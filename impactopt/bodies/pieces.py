@@ -16,6 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from impactopt.bodies.mjcf import geoms_of
 from impactopt.bodies.solids import Solid, cylinder, rounded_box
 from impactopt.bodies.urdf import lost_meshes, shapes_of, urdf_root
 from impactopt.codegen.directory import kept
@@ -59,11 +60,14 @@ def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
 def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
     """The pieces of a robot, and in words where they are from.
 
-    They are hulls of its URDF's collision shapes, or of the visual ones of a link that has no others. A robot
-    without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools are rods to their
-    heads.
+    They are hulls of its URDF's or MJCF's collision shapes, or of the visual ones of a link that has no
+    others. A robot without any, and what has lost its meshes, is rounded boxes of the links' inertia. Tools
+    are rods to their heads.
     """
-    found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
+    if robot.mjcf is not None:
+        found, source = list(_from_mjcf(robot, robot.mjcf)), "collision shapes of its MJCF"
+    else:
+        found, source = list(_from_urdf(robot)), "collision shapes of its URDF"
     if not found:
         found, source = list(_from_inertia(robot)), "boxes of its links' inertia"
     else:
@@ -93,6 +97,16 @@ def _from_urdf(robot: Robot) -> Iterator[Piece]:
         piece = _hull(shape.link, shape.joint, shape.solid)
         if piece is not None:
             yield piece
+
+
+def _from_mjcf(robot: Robot, mjcf: str) -> Iterator[Piece]:
+    geoms = geoms_of(robot.model, mjcf)
+    bodied = {geom.link for geom in geoms if geom.collides}
+    for geom in geoms:
+        if geom.collides or geom.link not in bodied:
+            piece = _hull(geom.link, geom.joint, geom.solid)
+            if piece is not None:
+                yield piece
 
 
 def _from_inertia(robot: Robot) -> Iterator[Piece]:

@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes in its URDF, or, where there is none, boxes of its links' inertia."""
+"""What a robot looks like: the shapes in its URDF or MJCF, or boxes of its links' inertia."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.mjcf import geoms_of
 from impactopt.bodies.pieces import ROD, bare_joints, inertia_box
 from impactopt.bodies.solids import Solid, cylinder, sphere
 from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
@@ -40,6 +41,8 @@ def visuals_of(robot: Robot) -> list[Visual]:
     robot without shapes.
     """
     found = [] if robot.urdf is None else _from_urdf(robot, Path(robot.urdf))
+    if robot.mjcf is not None:
+        found = _from_mjcf(robot, robot.mjcf)
     if not found:
         return _from_inertia(robot)
     bare = bare_joints(robot, {visual.joint for visual in found})
@@ -59,6 +62,17 @@ def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
         colour = None if material is None else _colour(material) or colours.get(material.get("name", ""))
         found.append(Visual(joint=shape.joint, solid=shape.solid, colour=colour or GREY))
     return found
+
+
+def _from_mjcf(robot: Robot, mjcf: str) -> list[Visual]:
+    """What is there to be seen of a link; where that is nothing, what collides."""
+    geoms = geoms_of(robot.model, mjcf)
+    seen = {geom.link for geom in geoms if not geom.collides}
+    return [
+        Visual(joint=geom.joint, solid=geom.solid, colour=geom.colour)
+        for geom in geoms
+        if not geom.collides or geom.link not in seen
+    ]
 
 
 def _colour(material: ElementTree.Element) -> tuple[float, float, float] | None:

@@ -22,32 +22,39 @@ def check(
 ) -> None:
     """Say whether a problem file is sound and its target within reach; else every mistake, and its mend.
 
-    With --json {"sound", "file", "hash", "problem"}, or {"sound", "file", "mistakes"}. Exit code: 0 sound, 2
-    not.
+    What to mend first stands first. With --json {"sound", "file", "hash", "problem", "doubts"}, or {"sound",
+    "file", "mistakes"}. Exit code: 0 sound, 2 not.
     """
     with plain_errors("interrupted", verbose=verbose):
-        from impactopt.errors import InputError, printable
+        from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.problem.doubts import doubts, hopeless
 
         try:
             problem = read_problem_file(file, parse_settings(settings or ())).build()
+            found = Mistakes()
+            found.found += hopeless(problem)
+            found.raise_if_any(str(file))
         except InputError as error:
             if not as_json:
                 raise
             first, *rest = str(error).splitlines()
-            found = {"sound": False, "file": str(file), "mistakes": [m.strip() for m in rest] or [first]}
-            typer.echo(json.dumps(found, indent=2))
+            told = {"sound": False, "file": str(file), "mistakes": [m.strip() for m in rest] or [first]}
+            typer.echo(json.dumps(told, indent=2))
             raise typer.Exit(BAD_INPUT) from None
         if as_json:
-            found = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
-            typer.echo(json.dumps(found, indent=2))
+            told = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
+            typer.echo(json.dumps(told | {"doubts": doubts(problem.robot)}, indent=2))
             return
         typer.echo(printable(f"{file} is sound:"))
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
         for name, value in (problem.describe() | plain).items():
-            typer.echo(printable(f"  {name:<10} {_in_words(value)}"))
+            for text in value if name == "inertias" else [_in_words(value)]:
+                typer.echo(printable(f"  {name:<10} {text}"))
         if lost := _lost_meshes(problem.robot):
             typer.echo(printable(f"  {'meshes':<10} {lost}"))
+        for doubt in doubts(problem.robot):
+            typer.echo(printable(f"  {'doubt':<10} {doubt}"))
 
 
 def _lost_meshes(robot: Robot) -> str:
@@ -88,6 +95,16 @@ def new(
             metavar="[NAME]", help="Name of the problem to start from.", autocompletion=complete_problem
         ),
     ] = None,
+    urdf: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Draft it for this URDF, or a robot of example-robot-data."),
+    ] = None,
+    mjcf: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draft it for the robot of this MJCF.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write it there, and do not print it.")
+    ] = None,
     reference: Annotated[
         bool, typer.Option("--reference", help="Print all sections and keys instead, as Markdown.")
     ] = False,
@@ -95,20 +112,58 @@ def new(
 ) -> None:
     """Print a problem file to start from, with a comment to each key; without a name, list the problems.
 
-    Keys that the problem leaves out stand there as comments with their defaults. --json is for the list.
+    Keys that the problem leaves out stand there as comments with their defaults. --json is for the list. With
+    --urdf or --mjcf the file is drafted for that robot: soles, strikers, a posture, a target, and guesses of
+    what its description lacks.
     """
-    if reference:
-        with plain_errors("interrupted"):
+    with plain_errors("interrupted"):
+        if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
+            raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
+        if reference:
             from impactopt.files.problem_file.reference import reference as page
 
-            typer.echo(page(), nl=False)
-    elif name is None:
-        problems(as_json)
-    else:
-        with plain_errors("interrupted"):
+            _give(page(), out)
+        elif urdf is not None or mjcf is not None:
+            _draft(str(mjcf if urdf is None else urdf), urdf is None, out)
+        elif name is not None:
             from impactopt.files.problem_file.template import problem_template
 
-            typer.echo(problem_template(name), nl=False)
+            _give(problem_template(name), out)
+        elif out is not None:
+            raise typer.BadParameter("name what to write: NAME, --urdf or --mjcf", param_hint="--out")
+        else:
+            problems(as_json)
+
+
+def _draft(given: str, mjcf: bool, out: Path | None) -> None:
+    from impactopt.errors import printable
+    from impactopt.files.draft.description import find_description
+    from impactopt.files.draft.drafting import draft_problem
+
+    path = Path(given) if mjcf else find_description(given)
+    folder = Path() if out is None else out.parent
+    draft = draft_problem(path, folder=folder, mjcf=mjcf)
+    _give(draft.text, out)
+    for line in draft.said:
+        typer.echo(printable(line), err=True)
+    if out is not None:
+        typer.echo(f"next: impactopt check {out}; then impactopt solve {out}", err=True)
+
+
+def _give(text: str, out: Path | None) -> None:
+    """Print a file's text, or write it where there is none yet."""
+    from impactopt.codegen.files import write_atomically
+    from impactopt.errors import InputError
+
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    if out.exists():
+        raise InputError(f"there is a file {out} already; give another --out, or delete it")
+    try:
+        write_atomically(out, lambda file: file.write(text.encode()))
+    except OSError as error:
+        raise InputError(f"cannot write {out}: {error.strerror}") from error
 
 
 def problems(as_json: AsJson = False) -> None:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
+from impactopt.robots.checks import check_legs
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole
 
@@ -58,21 +59,15 @@ class StanceCoordinates:
                 f"{robot.name} has a free-flyer: a stance needs at least one sole (or build it with "
                 "floating=False)"
             )
+        check_legs(self.model, [(sole.name, sole.frame) for sole in soles])
         pin.framesForwardKinematics(self.model, self.data, posture)
         self.legs: list[Leg] = []
         for sole in soles:
             joints = np.array(robot.limb(sole.frame), dtype=np.intp)
-            if len(joints) != 6:
-                raise InputError(
-                    f"the leg of sole '{sole.name}' has {len(joints)} joints between the base and "
-                    f"'{sole.frame}'; a held sole needs exactly 6 (lock the others with `locked=`)"
-                )
             placement = self.data.oMf[self.model.getFrameId(sole.frame)].copy()
             order = elimination_order(self._leg_samples(sole.frame, joints, posture))
             self.legs.append(Leg(sole, joints, order, placement))
         held = {int(j) for leg in self.legs for j in leg.joints}
-        if len(held) != 6 * len(self.legs):
-            raise InputError("the held soles' legs share joints: their motion is not independent")
         self.dependent = np.array([j for leg in self.legs for j in leg.joints], dtype=np.intp)
         self.independent = np.array([j for j in range(robot.n) if j not in held], dtype=np.intp)
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)

@@ -389,12 +389,12 @@ class ImpactProblem:
             "hash": self.hash,
         }
         if self.collision != "full":
-            more = {"rigid": f", restitution {self.coefficient_of_restitution:g}"}
-            if self.freezes:
-                more["sdc"] = f", {self.freezes} freezes"
+            frozen = f", {self.freezes} freezes" if self.freezes else ""
+            more = {"rigid": f", restitution {self.coefficient_of_restitution:g}", "sdc": frozen}
             out["collision"] = self.collision + more.get(self.collision, "")
-        if self.scenarios:
-            out["scenarios"] = [str(s) for s in self.scenarios]
+        if self.robot.source and self.robot.source.repairs:
+            out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
+        out |= {"scenarios": [str(s) for s in self.scenarios]} if self.scenarios else {}
         if self.objectives != DEFAULT_OBJECTIVES:
             out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in self.objectives]
         return out

@@ -17,7 +17,15 @@ from impactopt.kinematics.support import margin
 from impactopt.report.histories import at_contact, ground_wrenches, planned_torque
 from impactopt.report.page import html_page
 from impactopt.report.report import Report
-from impactopt.report.result_rows import Cell, Row, blow_rows, number_row, phase_rows, word_row
+from impactopt.report.result_rows import (
+    Cell,
+    Row,
+    blow_rows,
+    number_row,
+    phase_rows,
+    standing,
+    word_row,
+)
 from impactopt.report.thinning import thinned
 from impactopt.simulation.result import centre_of_pressure
 
@@ -119,7 +127,7 @@ def _rows(summaries: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     yield number_row("least distance of bodies [mm]", [s.get("clearance_mm") for s in summaries], 1)
     yield number_row("replayed impulse [N s]", [r.get("impulse_Ns") for r in replays], 2)
     yield number_row("replayed, largest slip of a sole [mm]", [r.get("sole_slip_mm") for r in replays], 2)
-    yield word_row("replayed, stands at the end", [r.get("standing") for r in replays], no_is_bad=True)
+    yield word_row("replayed, stands at the end", [standing(r) for r in replays], no_is_bad=True)
     yield number_row("iterations", [s.get("iterations") for s in summaries], 0)
     yield number_row("solved in [s]", [s.get("solve_seconds") for s in summaries], 1)
 

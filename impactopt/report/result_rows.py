@@ -20,6 +20,7 @@ __all__ = [
     "replay_columns",
     "result_columns",
     "result_rows",
+    "standing",
     "target_rows",
     "word_row",
     "worst_rows",
@@ -89,8 +90,13 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
     ):
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
     yield from _model_rows(sources)
-    stands = [None, *(source.get("standing") for source in sources[1:])]
+    stands = [None, *(standing(source) for source in sources[1:])]
     yield _of_replays(word_row("stands at the end", stands, no_is_bad=True))
+
+
+def standing(replay: Mapping[str, Any]) -> bool | None:
+    """Whether a replay stands at the end; None where there are no soles: what is bolted cannot fall."""
+    return None if replay.get("min_normal_force_N") is None else replay.get("standing")
 
 
 def blow_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:

@@ -16,7 +16,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import is_plain_file
-from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
+from impactopt.errors import InputError, Mistakes, check_array, did_you_mean, raw_array, shortened
 from impactopt.robots.checks import HEAVIEST, check_frame
 from impactopt.robots.parts import Striker
 
@@ -26,17 +26,22 @@ MANY = 100  # soles, strikers or tools
 _ROUNDED = 1e-6
 
 
-def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool) -> pin.Model:
-    """The model of a URDF, with an SRDF's reference configurations and rotors (as armature)."""
-    urdf = _existing(path, "URDF")
+def read_urdf(
+    path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool, repaired: bool = False
+) -> pin.Model:
+    """The model of a URDF, with an SRDF's reference configurations and rotors (as armature).
+
+    repaired : moments of inertia that no link can have are let through, as they are to be repaired.
+    """
+    urdf = existing(path, "URDF")
     root = (pin.JointModelFreeFlyer(),) if floating else ()
     try:
         model = pin.buildModelFromUrdf(urdf, *root)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
-    _check_links(urdf)
+    _check_links(urdf, moments=not repaired)
     if srdf is not None:
-        file = _existing(srdf, "SRDF")
+        file = existing(srdf, "SRDF")
         try:
             pin.loadReferenceConfigurations(model, file, False)
             pin.loadRotorParameters(model, file, False)
@@ -45,8 +50,8 @@ def read_urdf(path: str | PathLike[str], srdf: str | PathLike[str] | None, *, fl
     return model
 
 
-def _check_links(urdf: str) -> None:
-    """InputError for a link that no matter is made of: what is fixed to another hides it in their sum.
+def _check_links(urdf: str, *, moments: bool) -> None:
+    """InputError with all links that no matter is made of: what is fixed to another hides it in their sum.
 
     Links without mass or inertia, as frames are, are none's trouble.
     """
@@ -55,6 +60,7 @@ def _check_links(urdf: str) -> None:
         root = expatbuilder.parse(urdf, namespaces=False).documentElement
     except ExpatError as error:
         raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+    found = Mistakes()
     for link in _children(root, "link"):
         given = _children(link, "inertial")
         masses = [mass for part in given for mass in _children(part, "mass")]
@@ -67,16 +73,18 @@ def _check_links(urdf: str) -> None:
         where = f"URDF {urdf}: the <inertial> of link {link.getAttribute('name')!r}"
         numbers = np.array([m, *entries])
         if not np.isfinite(numbers).all() or m < 0 or np.abs(numbers).max() > HEAVIEST:
-            raise InputError(
+            found.found.append(
                 f"{where} has mass {m:g} kg and moments {xx:g}, {yy:g}, {zz:g} kg m2; give numbers from 0 to "
                 f"{HEAVIEST:g}"
             )
+            continue
         least = float(np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))[0])
-        if least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
-            raise InputError(
+        if moments and least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
+            found.found.append(
                 f"{where} has a principal moment of inertia of {least:.3g} kg m2; correct its <inertia>, "
-                "which is about the centre of mass"
+                'which is about the centre of mass, or take inertias="repaired"'
             )
+    found.raise_if_any(f"URDF {urdf}")
 
 
 def _children(element: Any, tag: str) -> list[Any]:
@@ -324,7 +332,8 @@ def _joints(model: pin.Model) -> list[Any]:
     return list(model.joints)[2 if is_floating(model) else 1 :]
 
 
-def _existing(path: str | PathLike[str], kind: str) -> str:
+def existing(path: str | PathLike[str], kind: str) -> str:
+    """The path of a file; InputError if there is none."""
     file = Path(fspath(path))
     with contextlib.suppress(RuntimeError):  # of a user that there is not
         file = file.expanduser()

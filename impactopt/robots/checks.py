@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import FARTHEST, InputError, check_array, did_you_mean
+from impactopt.errors import InputError, Mistakes, check_array, did_you_mean
 
 Array = NDArray[np.float64]
 
@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 # time. Light wrists without armature reach 1e5.
 MAX_SERVO_RATE = 3e4
 HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool, a rotor: a ship
+LEG = 6  # joints of a leg whose sole is held: as many as the sole has directions
 STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
 
 
@@ -42,61 +43,26 @@ def check_joints(joints: Sequence[str], name: str) -> None:
             raise InputError(f"the name of joint {joint!r} has control characters; take them out")
 
 
-def check_inertias(model: pin.Model) -> None:
-    """InputError if a moving body's mass or inertia cannot be those of matter."""
-    for i in range(1, model.njoints):
-        body = model.inertias[i]
-        where = f"the link moved by joint {model.names[i]!r} (with what is fixed to it)"
-        if not 0 < body.mass <= HEAVIEST:
-            raise InputError(
-                f"{where} has mass {body.mass:g} kg; give its <inertial> one > 0 and <= {HEAVIEST:g}"
-            )
-        inertia, placed = np.array(body.inertia), model.jointPlacements[i].translation
-        if not (np.isfinite(inertia).all() and np.isfinite(body.lever).all()):
-            raise InputError(f"{where} has NaN or infinity in its <inertial>; give finite numbers")
-        if not (np.abs(inertia).max() <= HEAVIEST and max(np.abs(body.lever)) <= FARTHEST):
-            raise InputError(
-                f"{where} has more than {HEAVIEST:g} kg m2, or its centre of mass more than {FARTHEST:g} m "
-                "from its joint; correct its <inertial>"
-            )
-        if not max(np.abs(placed)) <= FARTHEST:
-            raise InputError(
-                f"joint {model.names[i]!r} is {max(np.abs(placed)):g} m from the one before, and "
-                f"{FARTHEST:g} is the most; correct its <origin>"
-            )
-        small, middle, large = np.linalg.eigvalsh(inertia)
-        moments = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m2"
-        if small <= 0:
-            raise InputError(
-                f"{where} has principal moments of inertia {moments}: not positive definite; "
-                "correct its <inertia>, which is about the centre of mass"
-            )
-        # moments of matter obey the triangle inequality; 1e-3 is left for rounded decimals
-        if small + middle < large * (1 - 1e-3):
-            raise InputError(
-                f"{where} has principal moments of inertia {moments}: one exceeds the sum of the others, "
-                "which no body has; correct its <inertia>"
-            )
-
-
 def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: Array, upper: Array) -> None:
-    """InputError if a limit is missing (zero or infinite in a URDF), negative or crossed."""
+    """InputError with all limits that are missing (zero or infinite in a URDF), negative or crossed."""
+    found = Mistakes()
     for name, value, unit, option in (
         *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
         *((j, x, "rad/s", "velocity_limit") for j, x in zip(joints, velocity, strict=True)),
     ):
         # Pinocchio writes a missing limit as infinity or the largest double
         if not 0 < value <= STRONGEST:
-            raise InputError(
+            found.found.append(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
                 f"set it in the URDF's <limit>, or give {option}={{{name!r}: ...}}"
             )
     for name, low, high in zip(joints, lower, upper, strict=True):
         if not low < high:
-            raise InputError(
+            found.found.append(
                 f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
                 f"set them in the URDF's <limit>, or give position_limit={{{name!r}: (lower, upper)}}"
             )
+    found.raise_if_any("the robot")
 
 
 def check_actuators(joints: Sequence[str], actuators: Sequence[Any]) -> None:
@@ -179,6 +145,27 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
         return int(model.getFrameId(frame))
     except (ValueError, RuntimeError):  # a link and a joint of the same name
         return int(model.getFrameId(frame, pin.FrameType.BODY))
+
+
+def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
+    """InputError with all held soles, (name, frame) each, that are on no leg of their own of six joints."""
+    found, legs = Mistakes(), []
+    for name, frame in soles:
+        parent = model.frames[check_frame(model, frame, f"sole {name!r}")].parentJoint
+        joints = [str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1]
+        legs.append(set(joints))
+        if len(joints) != LEG:
+            told = f": {', '.join(joints)}" if joints else ""
+            found.found.append(
+                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}; a "
+                f"held sole needs exactly {LEG} (lock the others with `locked=`)"
+            )
+    shared = sorted(set.union(set(), *(a & b for k, a in enumerate(legs) for b in legs[:k])))
+    if shared and not found.found:
+        found.found.append(
+            f"the held soles' legs share joints, {', '.join(shared)}: their motion is not independent"
+        )
+    found.raise_if_any("the stance")
 
 
 def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:

@@ -243,15 +243,18 @@ class Source:
     Attributes
     ----------
     preset : name of one, or None.
-    urdf : path of a URDF, or None.
-    options : what else was given: to the preset, or to `Robot.from_urdf`.
+    urdf, mjcf : path of a URDF or an MJCF, or None.
+    options : what else was given: to the preset, or to `Robot.from_urdf` or `Robot.from_mjcf`.
     tools : what the robot was given to hold after that.
+    repairs : inertias that were changed, in words.
     """
 
     preset: str | None = None
     urdf: str | None = None
+    mjcf: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     tools: tuple[Tool, ...] = ()
+    repairs: tuple[str, ...] = ()
 
 
 def read_only(array: ArrayLike) -> Array:

@@ -12,9 +12,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, check_array
+from impactopt.errors import InputError, Mistakes, check_array
 from impactopt.robots import build, checks, tools
+from impactopt.robots import mjcf as _mjcf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
+from impactopt.robots.inertias import GIVEN, REPAIRED, check_choice, check_inertias, repair_inertias
 from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
@@ -46,7 +48,7 @@ class Robot:
     disable_collisions : pairs of links that may pass through each other: an SRDF's, and one's own.
     tools : what it holds.
     source : what it was made from, None where that was a model in Python.
-    urdf : file whose visual shapes a picture shows, None for simple ones.
+    urdf, mjcf : file whose shapes are its bodies and a picture shows, None for simple ones.
 
     Raises
     ------
@@ -70,6 +72,7 @@ class Robot:
     tools: tuple[Tool, ...] = ()
     source: Source | None = None
     urdf: str | None = None
+    mjcf: str | None = None
     actuators: tuple[Actuator, ...] = ()
 
     def __post_init__(self) -> None:
@@ -80,8 +83,10 @@ class Robot:
             object.__setattr__(self, name, read_only(value))
         object.__setattr__(self, "soles", tuple(self.soles))
         object.__setattr__(self, "strikers", dict(self.strikers))
-        checks.check_inertias(self.model)
-        checks.check_limits(self.joint_names, self.torque_limit, self.velocity_limit, self.lower, self.upper)
+        found, limits = Mistakes(), (self.torque_limit, self.velocity_limit, self.lower, self.upper)
+        found.attempt(lambda: check_inertias(self.model))
+        found.attempt(lambda: checks.check_limits(self.joint_names, *limits))
+        found.raise_if_any(f"robot {self.name!r}")
         object.__setattr__(self, "actuators", tuple(self.actuators) or (Actuator(),) * self.n)
         checks.check_actuators(self.joint_names, self.actuators)
         for sole in self.soles:
@@ -108,6 +113,7 @@ class Robot:
         name: str | None = None,
         floating: bool = True,
         locked: Iterable[str] | Mapping[str, float] = (),
+        inertias: str = GIVEN,
         **options: Any,
     ) -> Robot:
         """A robot from its URDF, and its SRDF's named postures and rotors when there is one.
@@ -118,15 +124,53 @@ class Robot:
         name : the URDF's own name when left out.
         floating : with a free-flyer at the root; else the root link is fixed to the world.
         locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
+        inertias : "given", or "repaired" where no body can have them: `source.repairs` lists these.
         options : as of `from_model`.
         """
-        model = build.read_urdf(path, srdf, floating=floating)
+        check_choice(inertias)
+        model = build.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         model = build.lock_joints(model, locked)
+        repairs = tuple(repair_inertias(model)) if inertias == REPAIRED else ()
         robot = cls.from_model(model, name=name or model.name, **{"urdf": path, **options})
         pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
         robot = dataclasses.replace(robot, disable_collisions=pairs)
-        given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, **options}
-        return dataclasses.replace(robot, source=Source(urdf=fspath(path), options=given))
+        given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
+        source = Source(urdf=fspath(path), options=given | options, repairs=repairs)
+        return dataclasses.replace(robot, source=source)
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        path: str | PathLike[str],
+        *,
+        name: str | None = None,
+        floating: bool | None = None,
+        locked: Iterable[str] | Mapping[str, float] = (),
+        inertias: str = GIVEN,
+        **options: Any,
+    ) -> Robot:
+        """A robot from MuJoCo's MJCF: its armature, friction, actuators' limits and gains, keyframes, sites.
+
+        Parameters
+        ----------
+        path : the file, which MuJoCo compiles.
+        floating : with a free-flyer at the root, or fixed to the world; None: as the file has it.
+        name, locked, inertias : as of `from_urdf`.
+        options : as of `from_model`. MJCF has no velocity limits. Each site on a link that moves is a
+            striker; postures are the keyframes inside the limits.
+
+        Raises
+        ------
+        InputError : no MuJoCo; no robot in the file; loops, ball joints, joints that follow others.
+        """
+        check_choice(inertias)
+        read = _mjcf.read_mjcf(path, floating=floating)
+        model = build.lock_joints(read.model, locked)
+        repairs = tuple(repair_inertias(model)) if inertias == REPAIRED else ()
+        robot = cls.from_model(model, name=name or model.name, mjcf=path, **read.options(model, options))
+        given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
+        source = Source(mjcf=fspath(path), options=given | options, repairs=repairs)
+        return dataclasses.replace(robot, source=source)
 
     @classmethod
     def from_model(
@@ -146,6 +190,7 @@ class Robot:
         postures: Mapping[str, Mapping[str, float] | ArrayLike] | None = None,
         disable_collisions: Sequence[tuple[str, str]] = (),
         urdf: str | PathLike[str] | None = None,
+        mjcf: str | PathLike[str] | None = None,
         actuators: Mapping[str, Actuator] | None = None,
     ) -> Robot:
         """A robot from a pin.Model (which is copied): a free-flyer, if any, first, and then one-DOF joints.
@@ -166,7 +211,7 @@ class Robot:
         postures : by name: (nq,) configurations, or joint angles [rad] by name on top of the model's posture
             of that name (an SRDF's), or else of zero. The model's other postures are kept.
         disable_collisions : pairs of links that may pass through each other.
-        urdf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
+        urdf, mjcf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
         actuators : motors and gears, as of `with_actuators`.
         """
         build.check_count("sole", soles)
@@ -199,6 +244,7 @@ class Robot:
             strikers=build.by_name("striker", strikers),
             disable_collisions=build.link_pairs(model, disable_collisions),
             urdf=None if urdf is None else str(urdf),
+            mjcf=None if mjcf is None else str(mjcf),
             actuators=drives,
         )
         build.by_name("sole", soles)

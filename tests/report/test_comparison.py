@@ -22,6 +22,7 @@ from impactopt.errors import InputError
 from impactopt.files.output import Record, record_of, save_record
 from impactopt.report.comparison import compare, histories_of
 from impactopt.report.pictures.compare import comparison_picture
+from impactopt.report.result_rows import result_rows, standing
 
 runner = CliRunner()
 
@@ -168,3 +169,13 @@ def test_the_page_works_in_a_browser(records: dict[str, Record], tmp_path: Path)
     assert [visit.console for visit in seen] == [[], []]
     fits, lines, keys = seen[0].values
     assert fits and seen[1].values == [True] and keys == 2 and lines >= 6
+
+
+def test_what_is_bolted_does_not_stand() -> None:
+    replay = {"impulse_Ns": 1.0, "standing": True}
+    columns: dict[str, dict[str, Any]] = {"planned": {"impulse_Ns": 1.0}, "free soles": replay}
+    assert [row for row in result_rows(columns) if row.label == "stands at the end"] == []
+    assert standing(replay) is None
+    columns["free soles"] = {**replay, "min_normal_force_N": 120.0}
+    (row,) = (row for row in result_rows(columns) if row.label == "stands at the end")
+    assert [cell.text for cell in row.cells] == ["", "yes"]

@@ -39,12 +39,14 @@ _SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 class Mistake:
     """A mistake at a place in the file.
 
-    place : path of keys and indices; the first `sections` of them name the table.
+    place : path of keys and indices; the first `sections` of them name the table.  first : it is to be mended
+    before the others.
     """
 
     place: Place
     sections: int
     text: str
+    first: bool = False
 
     def __str__(self) -> str:
         table = ".".join(str(part) for part in self.place[: self.sections] if isinstance(part, str))
@@ -66,8 +68,8 @@ def report_mistakes(where: str, lines: Mapping[Place, int], mistakes: Iterable[M
         # what is missing has no line of its own, and neither has a key inside a value
         line = next((lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines), None)
         at = "" if line is None else f"line {line}, " if line else "as set, "
-        found.append((line is None, line or 0, f"{at}{mistake}"))
-    rows = list(dict.fromkeys(shortened(row, _LONGEST) for _, _, row in sorted(found)))
+        found.append((not mistake.first, line is None, line or 0, f"{at}{mistake}"))
+    rows = list(dict.fromkeys(shortened(row, _LONGEST) for *_, row in sorted(found)))
     if len(rows) == 1:
         return f"{where}, {rows[0]}" if rows[0].startswith(("line", "as set")) else f"{where}: {rows[0]}"
     told = rows[:_MOST] + ([f"... and {len(rows) - _MOST} more"] if len(rows) > _MOST else [])

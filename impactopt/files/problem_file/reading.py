@@ -31,6 +31,7 @@ from impactopt.files.problem_file.toml import (
 )
 from impactopt.problem.checks import MANY, check_names
 from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.checks import check_legs
 
 __all__ = [
     "ProblemFile",
@@ -96,6 +97,9 @@ class ProblemFile:
         try:
             robot = content.make_robot(self.path.parent)
         except InputError as error:
+            legs = content.leg_mistake(self.path.parent)
+            if legs is not None:
+                mistakes.add(("robot", "soles"), legs, first=True)
             for place, wrong in content.robot_mistakes(self.path.parent, error):
                 mistakes.add(place, wrong)
             raise InputError(mistakes.report(self.path)) from error
@@ -103,6 +107,11 @@ class ProblemFile:
         mistakes.attempt(("problem", "start"), lambda: content.make_start(robot))
         stance = mistakes.attempt(("stance", "soles"), lambda: content.make_stance(robot))
         given = content.arguments()
+        if stance is not None:
+            try:
+                check_legs(robot.model, [(sole.name, sole.frame) for sole in stance.soles(robot)])
+            except InputError as error:
+                mistakes.add(("robot", "soles"), error, first=True)
         if mistakes or stance is None:
             # the rest of the problem cannot be put together, but what its terms name can be looked at
             for name, term in content.given_terms():
@@ -209,9 +218,11 @@ class _Collector:
     def __bool__(self) -> bool:
         return bool(self._mistakes)
 
-    def add(self, place: tuple[str, ...], error: InputError) -> None:
+    def add(self, place: tuple[str, ...], error: InputError, *, first: bool = False) -> None:
         sections = max(1, len(place) - 1) if place[:1] != ("terms",) else len(place)
-        self._mistakes += [Mistake(place=place, sections=sections, text=text) for text in error.mistakes]
+        self._mistakes += [
+            Mistake(place=place, sections=sections, text=text, first=first) for text in error.mistakes
+        ]
 
     def attempt(self, place: tuple[str, ...], make: Callable[[], _T]) -> _T | None:
         """What `make` gives; None, and a mistake at `place`, if it raises an InputError."""

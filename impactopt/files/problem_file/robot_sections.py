@@ -1,9 +1,9 @@
-"""The section [robot]: a preset with changes, or a URDF with what it lacks."""
+"""The section [robot]: a preset with changes, or a URDF or MJCF with what it lacks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -25,7 +25,9 @@ from impactopt.files.problem_file.values import (
     Vector,
 )
 from impactopt.robots.actuators import Actuator
-from impactopt.robots.build import check_count
+from impactopt.robots.build import add_frame, check_count, lock_joints, read_urdf
+from impactopt.robots.checks import check_legs
+from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
@@ -105,17 +107,23 @@ class ActuatorSection(_OfActuator):
 
 
 class RobotSection(Section):
-    """A preset with changes, or a URDF; files are relative to the problem file.
+    """A preset with changes, or a URDF or MJCF; files are relative to the problem file.
 
     A preset keeps its own strikers beside the section's.
     """
 
     preset: Preset = optional("name of a preset: see `impactopt robots`")
     urdf: str = optional("the robot's URDF, in place of a preset")
+    mjcf: str = optional(
+        "the robot's MJCF, in place of a preset: with its armature, friction, actuators, keyframes, sites"
+    )
     srdf: str = optional("file with the URDF's named postures and rotors")
     name: str = optional("what reports call it")
     floating: bool = optional("true: the base is free; false: the root link is fixed to the ground")
     locked: dict[str, float] = optional("joints to remove, and their angles [rad]", "locked_rad")
+    inertias: Literal["given", "repaired"] = optional(
+        '"repaired": those that no body can have are changed to ones that it can; `check` lists them'
+    )
     armature: PerJoint = optional(
         "reflected rotor inertia, of all joints or by joint [kg m2]", "armature_kg_m2"
     )
@@ -138,8 +146,11 @@ class RobotSection(Section):
 
     @model_validator(mode="after")
     def _one_source(self) -> RobotSection:
-        if ("preset" in self.model_fields_set) == ("urdf" in self.model_fields_set):
-            raise ValueError("give either preset or urdf")
+        if len(self.model_fields_set & {"preset", "urdf", "mjcf"}) != 1:
+            raise ValueError("give one of preset, urdf and mjcf")
+        for key, of in (("srdf", {"urdf"}), ("inertias", {"urdf", "mjcf"})):
+            if key in self.model_fields_set and not self.model_fields_set & of:
+                raise ValueError(f"{key} belongs to {' or '.join(sorted(of))}: leave it out")
         return self
 
     def make(self, folder: Path) -> Robot:
@@ -147,7 +158,7 @@ class RobotSection(Section):
         for key in ("soles", "strikers", "tools"):
             check_count(key.removesuffix("s"), getattr(self, key) or ())
         options = self.given()
-        for file in ("urdf", "srdf"):
+        for file in ("urdf", "mjcf", "srdf"):
             if file in options:
                 options[file] = folder / options[file]
         if "soles" in options:
@@ -163,9 +174,11 @@ class RobotSection(Section):
             for section in (self.actuators if options.pop("actuators", None) else ())
             for joint in section.joints
         }
-        if "urdf" in options:
+        kind = next((key for key in ("urdf", "mjcf") if key in options), None)
+        if kind is not None:
+            read = Robot.from_urdf if kind == "urdf" else Robot.from_mjcf
             options |= {"actuators": drives} if drives else {}
-            robot = Robot.from_urdf(options.pop("urdf"), **options)
+            robot = read(options.pop(kind), **options)
         else:
             robot = load_robot(options.pop("preset"), **options)
             robot = robot.with_actuators(drives) if drives else robot
@@ -176,6 +189,33 @@ class RobotSection(Section):
         for name, grip in grips.items():
             robot = robot.with_grip(name, grip)
         return robot
+
+    def leg_mistake(self, folder: Path, held: str) -> InputError | None:
+        """What is wrong with the legs of the held soles, "both" or one by its name, whatever else is."""
+        try:
+            model = self._model(folder)
+            chosen = [s for s in self.soles or () if held in ("both", s.name)]
+            built = [section.build() for section in chosen]
+            for sole in built:
+                if sole.parent is not None:
+                    add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
+        except (InputError, AttributeError):
+            return None  # it has no soles, or something else is wrong, which others tell
+        try:
+            check_legs(model, [(sole.name, sole.frame) for sole in built])
+        except InputError as error:
+            return error
+        return None
+
+    def _model(self, folder: Path) -> Any:
+        """The pin.Model alone; InputError for a preset, which is sound."""
+        locked = self.locked or {}
+        if "urdf" in self.model_fields_set:
+            floating = self.floating if "floating" in self.model_fields_set else True
+            return lock_joints(read_urdf(folder / self.urdf, None, floating=floating, repaired=True), locked)
+        if "mjcf" in self.model_fields_set:
+            return lock_joints(read_mjcf(folder / self.mjcf, floating=self.floating).model, locked)
+        raise InputError("a preset")
 
     def mistakes(self, folder: Path, error: InputError) -> list[tuple[tuple[str, ...], InputError]]:
         """All that keeps `make` from making a robot, `error` being the first of it, and of which key it is.
@@ -193,7 +233,7 @@ class RobotSection(Section):
         return found or [((), error)]
 
 
-_BARE = {"preset", "urdf", "srdf", "floating", "locked"}  # what the other keys are about
+_BARE = {"preset", "urdf", "mjcf", "srdf", "floating", "locked", "inertias"}  # what the other keys are about
 
 
 def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:

@@ -13,10 +13,11 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file.robot_sections import RobotSection
 from impactopt.files.problem_file.toml import plain_value
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.inertias import GIVEN
 from impactopt.robots.parts import SoftGrip
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
 
-__all__ = ["robot_data"]
+__all__ = ["robot_data", "sole_data", "striker_data"]
 
 BY_JOINT = {
     "armature": "armature_kg_m2",
@@ -60,12 +61,16 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
     data: dict[str, Any] = {} if source.preset is None else {"preset": source.preset}
     if source.urdf is not None:
         data["urdf"] = _relative(source.urdf, folder)
+    if source.mjcf is not None:
+        data["mjcf"] = _relative(source.mjcf, folder)
+    if options.get("inertias", GIVEN) != GIVEN:
+        data["inertias"] = options["inertias"]
     if "srdf" in options:
         data["srdf"] = _relative(options["srdf"], folder)
     if "name" in options:
         data["name"] = options["name"]
-    if "floating" in options and not options["floating"]:
-        data["floating"] = False
+    if "floating" in options and (source.mjcf is not None or not options["floating"]):
+        data["floating"] = options["floating"]
     locked = options.get("locked", ())
     angles = locked if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
     if angles or (locked != () and source.preset is not None):
@@ -74,9 +79,9 @@ def _source(robot: Robot, folder: Path) -> dict[str, Any]:
         if isinstance(options.get(name), (int, float, Mapping)):
             data[key] = plain_value(options[name])
     if "soles" in options:
-        data["soles"] = [_sole(sole) for sole in options["soles"]]
+        data["soles"] = [sole_data(sole) for sole in options["soles"]]
     if options.get("strikers") and source.preset is None:
-        data["strikers"] = [_striker(striker) for striker in options["strikers"]]
+        data["strikers"] = [striker_data(striker) for striker in options["strikers"]]
     if source.tools:
         data["tools"] = [_tool(tool) for tool in source.tools]
     grips = {tool.name: _grip(tool.grip) for tool in robot.tools if tool.grip is not None}
@@ -107,16 +112,16 @@ def _differences(built: Robot, robot: Robot) -> dict[str, Any]:
         out["position_limit_rad"] = moved
     if built.actuators != robot.actuators:
         out["actuators"] = _actuators(robot)
-    if [_sole(sole) for sole in built.soles] != [_sole(sole) for sole in robot.soles]:
-        out["soles"] = [_sole(sole) for sole in robot.soles]
+    if [sole_data(sole) for sole in built.soles] != [sole_data(sole) for sole in robot.soles]:
+        out["soles"] = [sole_data(sole) for sole in robot.soles]
     apart = [list(pair) for pair in robot.disable_collisions if pair not in built.disable_collisions]
     if apart:
         out["disable_collisions"] = apart
     made = {tool.name for tool in (robot.source.tools if robot.source else ())}
     strikers = [
-        _striker(striker)
+        striker_data(striker)
         for name, striker in robot.strikers.items()
-        if name not in built.strikers or _striker(built.strikers[name]) != _striker(striker)
+        if name not in built.strikers or striker_data(built.strikers[name]) != striker_data(striker)
         if name not in made
     ]
     return out | ({"strikers": strikers} if strikers else {})
@@ -145,7 +150,7 @@ def _relative(path: Any, folder: Path) -> str:
     return str(whole.relative_to(base) if whole.is_relative_to(base) else whole)
 
 
-def _sole(sole: Sole) -> dict[str, Any]:
+def sole_data(sole: Sole) -> dict[str, Any]:
     data: dict[str, Any] = {"name": sole.name, "frame": sole.frame, "polygon_m": sole.polygon.tolist()}
     if sole.parent is not None:
         data |= {"parent": sole.parent, "position_m": sole.placement.translation.tolist()}
@@ -154,7 +159,7 @@ def _sole(sole: Sole) -> dict[str, Any]:
     return data
 
 
-def _striker(striker: Striker) -> dict[str, Any]:
+def striker_data(striker: Striker) -> dict[str, Any]:
     return {"name": striker.name, "frame": striker.frame, "point_m": striker.point.tolist()}
 
 

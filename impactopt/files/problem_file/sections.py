@@ -171,6 +171,12 @@ class File(Section):
             return [(("problem", "robot"), error)]
         return [(("robot", *place), wrong) for place, wrong in self.robot.mistakes(folder, error)]
 
+    def leg_mistake(self, folder: Path) -> InputError | None:
+        """What is wrong with the legs of a robot that cannot be made, as far as its model can be."""
+        if "robot" not in self.model_fields_set:
+            return None
+        return self.robot.leg_mistake(folder, self.stance.soles if self.stance else "both")
+
     def given_terms(self) -> Iterator[tuple[str, Any]]:
         """The terms that the file has, by their sections' names."""
         for name in TermSections.model_fields if self.terms is not None else ():

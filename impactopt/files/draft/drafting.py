@@ -1,0 +1,248 @@
+"""A whole problem file for a robot that nobody has prepared."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.files.draft.aim import WAYS, Arm, aims, ready
+from impactopt.files.draft.guesses import DOUBT, ROTOR
+from impactopt.files.draft.postures import half_sitting, rested
+from impactopt.files.draft.robot import Drafted, draft_robot
+from impactopt.files.draft.soles import find_soles, find_striker, sides
+from impactopt.files.problem_file.describing import comment_at
+from impactopt.files.problem_file.reading import problem_file_from_data
+from impactopt.files.problem_file.robot_writing import sole_data, striker_data
+from impactopt.files.problem_file.toml import Place, plain_value, write_toml
+from impactopt.problem.doubts import hopeless
+from impactopt.robots.inertias import REPAIRED
+from impactopt.robots.parts import Sole, Striker
+from impactopt.robots.robot import Robot
+
+__all__ = ["Draft", "draft_problem"]
+
+Array = NDArray[np.float64]
+TRIED = 8  # targets
+START = "ready"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """A drafted problem file: its text, and what is to be said of it."""
+
+    text: str
+    said: tuple[str, ...]
+
+
+def draft_problem(path: Path, *, folder: Path, mjcf: bool = False) -> Draft:
+    """The text of a problem file for the robot of a URDF, or an MJCF.
+
+    folder : that the file is to be in.
+
+    Raises
+    ------
+    InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
+        posture or no target is found.
+    """
+    drafted = draft_robot(path, mjcf=mjcf)
+    model, forward = drafted.robot.model, np.array(WAYS[0])
+    soles: list[Sole] = []
+    if drafted.legs:
+        soles, forward = find_soles(model, drafted.legs, drafted.pieces)
+    arms, strikers = _arms(drafted)
+    robot = drafted.made(soles=soles, strikers=strikers)
+    q = half_sitting(robot, drafted.legs, soles, forward) if soles else rested(robot)
+    q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
+    data = _data(drafted, robot, soles, strikers, q, folder)
+    data = _aimed(data, robot, arms[0], q, way, folder)
+    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
+
+
+def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
+    """What may strike, right or longest first; and all strikers."""
+    model, limbs = drafted.robot.model, drafted.arms
+    names = sides(model, [limb.tip for limb in limbs])
+    names = [f"{name}_hand" if name in ("left", "right") else name for name in names]
+    names = ["hand"] if len(names) == 1 else names
+    arms, strikers = [], []
+    for limb, name in zip(limbs, names, strict=True):
+        striker, axis = find_striker(model, limb, name, drafted.pieces)
+        arms.append(Arm(limb=limb, name=name, axis=axis))
+        strikers.append(striker)
+    arms.sort(key=lambda arm: (not arm.name.startswith("right"), -len(arm.limb.own)))
+    return arms, strikers
+
+
+def _data(
+    drafted: Drafted, robot: Robot, soles: list[Sole], strikers: list[Striker], q: Array, folder: Path
+) -> dict[str, Any]:
+    whole, base = drafted.path.resolve(), folder.resolve()
+    kind = "mjcf" if drafted.mjcf else "urdf"
+    options, keys = drafted.options, dict[str, Any]()
+    keys[kind] = os.path.relpath(whole, base) if whole.is_relative_to(base) else str(whole)
+    keys["name"] = robot.name
+    if "floating" in options:
+        keys["floating"] = options["floating"]
+    for option, key in (
+        ("locked", "locked_rad"),
+        ("armature", "armature_kg_m2"),
+        ("torque_limit", "torque_limit_N_m"),
+        ("velocity_limit", "velocity_limit_rad_s"),
+    ):
+        if options.get(option):
+            keys[key] = dict(options[option])
+    if soles:
+        keys["soles"] = [sole_data(sole) for sole in soles]
+    keys["strikers"] = [striker_data(striker) for striker in strikers]
+    angles = zip(robot.joint_names, robot.joint_positions(q), strict=True)
+    keys["postures_rad"] = {START: {joint: round(float(angle), 5) for joint, angle in angles}}
+    mass = sum(float(body.mass) for body in robot.model.inertias)
+    data: dict[str, Any] = {
+        "problem": {"name": f"first strike of {robot.name}", "start": START},
+        "robot": keys,
+        "target": {"mass_kg": float(f"{np.clip(0.06 * mass, 0.5, 5.0):.1g}")},
+        "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 300.0},
+        "swing": {"duration_s": [0.5, 1.2], "intervals": 16 if soles else 12},
+        "follow": {"duration_s": [0.6, 1.5], "intervals": 14 if soles else 10},
+    }
+    if soles:
+        part = mass / 90.0  # bounds that fit TALOS, which has 90 kg on soles 12 cm wide
+        width = min(float(np.ptp(sole.polygon[:, 1])) for sole in soles)
+        margin = round(float(np.clip(0.15 * width, 0.005, 0.02)), 3)
+        data["terms"] = {
+            "contact_wrench_cone": {
+                "margin_m": margin,
+                "collision_margin_m": margin,
+                "minimum_force_N": float(f"{50 * part:.2g}"),
+            },
+            "balance": {"angular_momentum_N_m_s": float(f"{min(10.0, 10 * part):.2g}")},
+        }
+    return plain_value(data)
+
+
+def _aimed(
+    data: dict[str, Any], robot: Robot, arm: Arm, q: Array, way: Array, folder: Path
+) -> dict[str, Any]:
+    """The data with a target that check finds no fault with.
+
+    Raises
+    ------
+    InputError : there is none; with what was wrong with the first.
+    """
+    first = ""
+    for k, point in enumerate(aims(robot, arm, q, way)):
+        if k == TRIED:
+            break
+        problem = {"striker": arm.name, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
+        aimed = {**data, "problem": {"name": data["problem"]["name"], **problem, "start": START}}
+        tried = {**aimed, "robot": {**aimed["robot"], "inertias": REPAIRED}}
+        try:
+            wrong = hopeless(problem_file_from_data(tried, where=folder / "draft.toml").build())
+        except InputError as error:
+            wrong = [str(error)]
+        if not wrong:
+            return aimed
+        first = first or wrong[0]
+    raise InputError(
+        f"no target is found that {arm.name!r} can hit from the drafted posture; write the problem file by "
+        f"hand (docs/howto/robot.md){f': {first}' if first else ''}"
+    )
+
+
+def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
+    guessed = {
+        "armature_kg_m2": f"{DOUBT}: {1e3 * ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
+        "torque_limit_N_m": f"{DOUBT}: from what gravity can ask; the file has none",
+        "velocity_limit_rad_s": f"{DOUBT}; the file has none",
+        "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
+        "strikers": "found in the shapes of the last links, where these end; move them to what is to hit",
+        "locked_rad": "; ".join(_reasons(drafted.locked)),
+    }
+
+    def comment(place: Place) -> str:
+        if len(place) == 2 and place[0] == "robot" and str(place[1]) in guessed:
+            return guessed[str(place[1])]
+        if place == ("robot", "postures_rad", START):
+            return "soles level, knees ahead, arms bent" if data["robot"].get("soles") else "bent"
+        return comment_at(data, place)
+
+    def hidden(place: Place) -> Mapping[str, Any]:
+        return {"inertias": REPAIRED} if place == ("robot",) and drafted.wrong else {}
+
+    head = [
+        f"# A first strike of {robot.name}, drafted by `impactopt new`.",
+        f"# What is {DOUBT} is marked so: put the maker's numbers there. `impactopt check FILE` says more.",
+    ]
+    for text in drafted.drives.said:
+        head.append(f"# {text}.")
+    if drafted.wrong:
+        head += [
+            f"# {len(drafted.wrong)} inertias are none of matter. Correct the {robot_kind(drafted)}, or take "
+            'the # away before `inertias = "repaired"`:',
+            *(f"#   {text.partition('; correct')[0]}" for text in drafted.wrong),
+        ]
+    text = write_toml(data, comment, hidden).rstrip("\n")
+    return "\n".join([*head, "", text, "", *_frames(robot), ""])
+
+
+def robot_kind(drafted: Drafted) -> str:
+    """What the file is."""
+    return "MJCF" if drafted.mjcf else "URDF"
+
+
+def _reasons(locked: Mapping[str, str]) -> Iterator[str]:
+    for reason in dict.fromkeys(locked.values()):
+        count = sum(other == reason for other in locked.values())
+        yield f"{reason}" if count == 1 else f"{count} x {reason}"
+
+
+def _frames(robot: Robot) -> Iterator[str]:
+    """Frames that soles and strikers can be on, as comments."""
+    yield "# Frames for other strikers and soles, by the joint that moves them:"
+    model = robot.model
+    for joint in range(1, model.njoints):
+        of = [f for f in model.frames if f.parentJoint == joint and f.type != pin.FrameType.JOINT]
+        names = [str(f.name) for f in of if not str(f.name).startswith("striker:")]
+        if names:
+            yield f"#   {model.names[joint]}: {', '.join(names)}"
+
+
+def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
+    """What a user should know before the first plan."""
+    stands = "on two legs" if drafted.legs else "on a fixed base"
+    yield f"{robot.name}: {robot.n} joints, {stands}; {data['problem']['striker']!r} strikes"
+    across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
+    if across:
+        yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"
+    if drafted.locked:
+        yield f"locked: {'; '.join(_reasons(drafted.locked))}"
+    for key, what in (
+        ("armature_kg_m2", "rotor inertias"),
+        ("torque_limit_N_m", "torque limits"),
+        ("velocity_limit_rad_s", "velocity limits"),
+    ):
+        if key in data["robot"]:
+            count = len(data["robot"][key])
+            yield f"guessed, as the {robot_kind(drafted)} has none: {what} of {count} joints"
+    yield from drafted.drives.said[:3]
+    if len(drafted.drives.said) > 3:
+        yield f"... and {len(drafted.drives.said) - 3} more such limits: see the file's head"
+    if drafted.wrong:
+        yield (
+            f"{len(drafted.wrong)} inertias are none of matter, listed at the file's head: correct them, or "
+            'say `inertias = "repaired"` there'
+        )
+
+
+def _wide(polygon: list[list[float]]) -> bool:
+    """Whether a sole is longer across than ahead, as no foot is."""
+    length, width = np.ptp(np.array(polygon), axis=0)
+    return bool(width > length)

@@ -1,0 +1,139 @@
+"""Which joints of a robot are legs, arms, fingers and wheels, by its tree, its shapes and their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.pieces import Piece
+from impactopt.robots.build import is_floating
+
+__all__ = ["Limb", "arms_of", "legs_of", "limbs_of", "to_lock"]
+
+Array = NDArray[np.float64]
+_FINGERS = re.compile(r"finger|thumb|gripper|jaw|claw|knuckle|(?<![a-z])eyes?(?![a-z])", re.IGNORECASE)
+_WHEELS = re.compile(r"wheel|caster|roller", re.IGNORECASE)
+_HEADS = re.compile(r"head|neck|eye|camera|face", re.IGNORECASE)
+LIGHT, SHORT = 0.03, 0.25  # of the robot's mass, and [m]: a finger's and all beyond it at most
+FLAT = 0.05  # of the robot's height: how far apart the lowest points of its feet may be
+ABOVE = 0.1  # of that height: how much higher than the feet the root link ends
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limb:
+    """A chain of joints to a tip: `path` (indices in the model, from the root on), of which the last `own`
+    are its own, and no other limb's.
+    """
+
+    path: tuple[int, ...]
+    own: tuple[int, ...]
+
+    @property
+    def tip(self) -> int:
+        """The last joint."""
+        return self.path[-1]
+
+
+def limbs_of(model: pin.Model) -> tuple[Limb, ...]:
+    """All limbs, by their tips' order."""
+    children = _children(model)
+    first = 2 if is_floating(model) else 1
+    out = []
+    for tip in range(first, model.njoints):
+        if children[tip]:
+            continue
+        path = tuple(int(j) for j in model.supports[tip] if j >= first)
+        fork = max((k + 1 for k, j in enumerate(path) if len(children[j]) > 1), default=0)
+        out.append(Limb(path=path, own=path[fork:]))
+    return tuple(out)
+
+
+def to_lock(model: pin.Model) -> dict[str, str]:
+    """Joints that no plan should move, and why: fingers, wheels, joints without range or without mass."""
+    children, out = _children(model), dict[str, str]()
+    first = 2 if is_floating(model) else 1
+    mass, total = _beyond(model, children), sum(float(body.mass) for body in model.inertias)
+    reach = _reach(model, children)
+    for j in range(model.njoints - 1, first - 1, -1):
+        joint, name = model.joints[j], str(model.names[j])
+        low, high = (
+            (-np.inf, np.inf)
+            if joint.nq != 1
+            else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
+        )
+        if not low < high:
+            out[name] = "no range"
+        elif _WHEELS.search(name) or (joint.nq == 2 and model.parents[j] < first and not children[j]):
+            out[name] = "a wheel"
+        elif _FINGERS.search(name):
+            out[name] = "a finger"
+        elif mass[j] <= 0:
+            out[name] = "no mass"
+    for j in range(first, model.njoints):  # a hand: several short and light chains beside each other
+        small = [c for c in children[j] if mass[c] < LIGHT * total and reach[c] < SHORT]
+        if len(small) > 1 and len(small) == len(children[j]):
+            out |= {str(model.names[i]): "a finger" for c in small for i in _below(c, children)}
+    return out
+
+
+def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[Limb, ...]:
+    """Limbs on which it stands in its zero posture: those that end lowest, well below the root link.
+
+    pieces : by the joint that moves them.
+    """
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+
+    def heights(joint: int) -> Array:
+        found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
+        return np.concatenate(found or [np.zeros(1)]) + data.oMi[joint].translation[2]
+
+    everywhere = np.concatenate([heights(j) for j in range(1, model.njoints)])
+    lowest, tall = float(everywhere.min()), float(np.ptp(everywhere))
+    root = float(heights(1).min())
+    if root < lowest + ABOVE * tall:
+        return ()
+    feet = (limb for limb in limbs_of(model) if len(limb.own) > 1 and not _is_head(model, limb))
+    found = tuple(limb for limb in feet if heights(limb.tip).min() < lowest + FLAT * tall)
+    return found if len(found) > 1 else ()  # an arm that hangs is no leg
+
+
+def arms_of(model: pin.Model, legs: tuple[Limb, ...]) -> tuple[Limb, ...]:
+    """Limbs that may strike: no legs, and no heads."""
+    feet = {leg.tip for leg in legs}
+    long = [limb for limb in limbs_of(model) if limb.tip not in feet and not _is_head(model, limb)]
+    return tuple(limb for limb in long if len(limb.own) > 1) or tuple(long)
+
+
+def _is_head(model: pin.Model, limb: Limb) -> bool:
+    return any(_HEADS.search(str(model.names[j])) for j in limb.own)
+
+
+def _children(model: pin.Model) -> dict[int, list[int]]:
+    out: dict[int, list[int]] = {j: [] for j in range(model.njoints)}
+    for j in range(1, model.njoints):
+        out[int(model.parents[j])].append(j)
+    return out
+
+
+def _below(joint: int, children: Mapping[int, list[int]]) -> list[int]:
+    return [joint, *(i for c in children[joint] for i in _below(c, children))]
+
+
+def _beyond(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
+    """Mass [kg] that each joint moves."""
+    return {j: sum(float(model.inertias[i].mass) for i in _below(j, children)) for j in range(model.njoints)}
+
+
+def _reach(model: pin.Model, children: Mapping[int, list[int]]) -> dict[int, float]:
+    """Length [m] of the longest chain beyond each joint, to the centre of mass of its last link."""
+    out: dict[int, float] = {}
+    for j in range(model.njoints - 1, -1, -1):
+        ways = [float(np.linalg.norm(model.jointPlacements[c].translation)) + out[c] for c in children[j]]
+        out[j] = max([float(np.linalg.norm(model.inertias[j].lever)), *ways])
+    return out

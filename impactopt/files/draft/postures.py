@@ -1,0 +1,189 @@
+"""Postures to start from: half sitting on flat soles, arms bent with their ends in front."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from impactopt.errors import InputError
+from impactopt.files.draft.limbs import Limb
+from impactopt.robots.robot import Robot, Sole
+
+__all__ = ["arm_length", "bend_arm", "half_sitting", "rested", "shoulder"]
+
+Array = NDArray[np.float64]
+BENT = 0.06  # of the legs' length: how much lower than straight it sits
+STARTS = 10
+INSIDE = 0.1  # of a joint's range that is left to its limits
+REST = 0.02  # [m] that the whole range of a joint is worth: postures in the middle of their ranges
+LONG = 0.2  # of an arm's length: an upper arm at least
+ACROSS = 0.7  # largest cosine between a shoulder's axis and the arm, for its place along the axis to be free
+EDGE = 0.2  # of a range: zero is a joint's rest unless it is as near to a limit as that
+
+
+def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forward: Array) -> Array:
+    """A configuration (nq,) with the soles level and beside each other, knees ahead, the weight above them.
+
+    robot : with the soles.  forward (3,) : in the root's frame.
+
+    Raises
+    ------
+    InputError : none is found.
+    """
+    model, data = robot.model, robot.model.createData()
+    neutral = rested(robot)
+    pin.framesForwardKinematics(model, data, neutral)
+    turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
+    straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
+    hips = [np.array(data.oMi[leg.own[0]].translation) for leg in legs]
+    aside = [float(spot @ turn[:, 1]) for spot in straight]
+    length = float(np.mean([_path(robot, leg, leg.own[1:]) for leg in legs]))
+    height = min(float(spot[2]) for spot in straight) + BENT * length
+    ahead = float(np.mean([hip @ forward for hip in hips]))
+    rng, q = np.random.default_rng(0), neutral
+    for _ in range(4):  # feet go where the weight is
+        for leg, sole, out in zip(legs, soles, aside, strict=True):
+            spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
+            q = _leg(robot, leg, sole, pin.SE3(turn, spot), q, forward, rng)
+        centre = np.array(pin.centerOfMass(model, data, q))
+        pin.framesForwardKinematics(model, data, q)
+        middles = [
+            data.oMf[model.getFrameId(s.frame)].act(np.append(s.polygon.mean(axis=0), 0.0)) for s in soles
+        ]
+        off = float((centre - np.mean(middles, axis=0)) @ forward)
+        if abs(off) < 2e-3:
+            break
+        ahead += off
+    return robot.place(q, soles)
+
+
+def bend_arm(
+    robot: Robot, arm: Limb, striker: str, axis: Array, q: Array, target: Array, way: Array
+) -> tuple[Array, float]:
+    """The configuration with one arm's end near a place (3,) [m], pointing along `way` (3,), and how far off
+    [m] it is.
+
+    axis (3,) : in which the last link points.  Its other joints stay as in q (nq,).
+    """
+    model, data = robot.model, robot.model.createData()
+    fid, own = model.getFrameId(f"striker:{striker}"), _rows(robot, arm.own)
+    low, high = _limits(robot, own)
+    span = high - low
+    middle = np.where(np.minimum(high, -low) > EDGE * span, 0.0, (low + high) / 2)
+    rng = np.random.default_rng(0)
+    tries = []
+
+    def errors(angles: Array) -> Array:
+        now = _set(robot, q, own, angles)
+        pin.forwardKinematics(model, data, now)
+        pin.updateFramePlacement(model, data, fid)
+        gap = target - data.oMf[fid].translation
+        points = data.oMi[arm.tip].rotation @ axis
+        return np.concatenate([gap, 0.02 * (points - way), REST * (angles - middle) / span])
+
+    for k in range(STARTS):
+        start = np.clip(middle + (0.25 * span * rng.standard_normal(len(own)) if k else 0.05), low, high)
+        found = least_squares(errors, start, bounds=(low - 1e-9, high + 1e-9), max_nfev=60)
+        tries.append((float(found.cost), found.x))
+    _, angles = min(tries, key=lambda one: one[0])
+    return _set(robot, q, own, angles), float(np.linalg.norm(errors(angles)[:3]))
+
+
+def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
+    """Where an arm begins (3,) [m]: on the axis of the joint that its upper arm is on, abreast of the arm."""
+    model, data = robot.model, robot.model.createData()
+    first = arm.own[_upper(robot, arm)]
+    pin.computeJointJacobians(model, data, q)
+    pin.centerOfMass(model, data, q)
+    joint, column = data.oMi[first], model.joints[first].idx_v
+    axis = np.array(pin.getJointJacobian(model, data, first, pin.LOCAL_WORLD_ALIGNED))[3:, column]
+    middle = joint.act(np.array(data.com[first])) - joint.translation
+    along = float(axis @ middle)
+    if abs(along) > ACROSS * np.linalg.norm(middle):
+        return np.array(joint.translation)  # the axis goes along the arm
+    return np.asarray(joint.translation + along * axis)
+
+
+def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
+    """From the shoulder to the striking point, stretched out [m]."""
+    frame = robot.model.frames[robot.model.getFrameId(f"striker:{striker}")]
+    beyond = _path(robot, arm, arm.own[_upper(robot, arm) + 1 :])
+    return beyond + float(np.linalg.norm(frame.placement.translation))
+
+
+def _upper(robot: Robot, arm: Limb) -> int:
+    """Which of an arm's own joints is the last before its first long link."""
+    steps = [float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in arm.own[1:]]
+    return next((k for k, step in enumerate(steps) if step > LONG * sum(steps)), 0)
+
+
+def _leg(
+    robot: Robot, leg: Limb, sole: Sole, goal: object, q: Array, forward: Array, rng: np.random.Generator
+) -> Array:
+    """The configuration with a leg's sole at its goal, a pin.SE3, and its knee as far ahead as may be."""
+    model, data = robot.model, robot.model.createData()
+    fid, own = model.getFrameId(sole.frame), _rows(robot, leg.path)
+    low, high = _limits(robot, own)
+    now = robot.joint_positions(q)[own]
+    best, nearest = None, np.inf
+
+    def errors(angles: Array) -> Array:
+        pin.forwardKinematics(model, data, _set(robot, q, own, angles))
+        pin.updateFramePlacement(model, data, fid)
+        return np.asarray(pin.log6(data.oMf[fid].actInv(goal)).vector)
+
+    for k in range(2 * STARTS):
+        start = np.clip(now + (0.6 * rng.standard_normal(len(own)) if k else 0.0), low, high)
+        found = least_squares(
+            errors, start, bounds=(low - 1e-9, high + 1e-9), xtol=1e-14, ftol=1e-14, gtol=1e-14
+        )
+        off = float(np.abs(errors(found.x)).max())
+        nearest = min(nearest, off)
+        if off > 1e-7:
+            continue
+        knee = max(float(data.oMi[j].translation @ forward) for j in leg.own)
+        if best is None or knee > best[0] + 1e-4:
+            best = knee, found.x
+    if best is None:
+        names = [model.names[j] for j in leg.path]
+        raise InputError(
+            f"no posture with level soles is found for the leg {', '.join(map(str, names))}: the best one is"
+            f" {nearest:.2g} off; give postures by hand (docs/howto/robot.md)"
+        )
+    return _set(robot, q, own, best[1])
+
+
+def _rows(robot: Robot, joints: Sequence[int]) -> NDArray[np.intp]:
+    """Indices into arrays of length n of joints of the model."""
+    base = robot.nv - robot.n
+    return np.array([robot.model.joints[j].idx_v - base for j in joints], dtype=np.intp)
+
+
+def _limits(robot: Robot, own: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Of joints, inside their limits; a turn to both sides where there are none."""
+    low, high = np.maximum(robot.lower[own], -np.pi), np.minimum(robot.upper[own], np.pi)
+    inside = np.minimum(INSIDE * (high - low) / 2, 0.15)
+    return low + inside, high - inside
+
+
+def rested(robot: Robot) -> Array:
+    """The configuration (nq,) nearest to zero that is well inside the limits."""
+    q, every = pin.neutral(robot.model), np.arange(robot.n)
+    low, high = _limits(robot, every)
+    return _set(robot, q, every, np.clip(robot.joint_positions(q), low, high))
+
+
+def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
+    out, first = q.copy(), robot.model.njoints - robot.n
+    for row, angle in zip(own, angles, strict=True):
+        joint = robot.model.joints[first + int(row)]
+        out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+    return out
+
+
+def _path(robot: Robot, limb: Limb, joints: Sequence[int]) -> float:
+    return sum(float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in joints)

@@ -1,0 +1,162 @@
+"""From a description to a robot that can be tried: what is locked, guessed, repaired; its legs and arms."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.pieces import Piece, pieces_of
+from impactopt.errors import InputError
+from impactopt.files.draft.guesses import Drives, guess_drives
+from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock
+from impactopt.robots.build import is_floating, lock_joints, read_urdf
+from impactopt.robots.checks import LEG
+from impactopt.robots.inertias import REPAIRED, check_inertias
+from impactopt.robots.mjcf import Mjcf, read_mjcf
+from impactopt.robots.robot import Robot
+
+__all__ = ["Drafted", "draft_robot"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drafted:
+    """A robot on its way to a problem file, without soles, strikers and postures as yet.
+
+    options : of `Robot.from_urdf` or `Robot.from_mjcf`.  locked : joints that are, and why.  wrong :
+    inertias that no body can have, which are repaired here.
+    """
+
+    robot: Robot
+    path: Path
+    options: Mapping[str, Any]
+    locked: Mapping[str, str]
+    drives: Drives
+    wrong: tuple[str, ...]
+    legs: tuple[Limb, ...]
+    arms: tuple[Limb, ...]
+    pieces: Mapping[int, tuple[Piece, ...]] = field(repr=False)
+
+    @property
+    def mjcf(self) -> bool:
+        """Whether it is of an MJCF."""
+        return self.robot.mjcf is not None
+
+    def made(self, **more: Any) -> Robot:
+        """The robot anew, with more options."""
+        make = Robot.from_mjcf if self.mjcf else Robot.from_urdf
+        return make(self.path, inertias=REPAIRED, **{**self.options, **more})
+
+
+def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
+    """The robot of a file, on two legs if it has them, else bolted to the ground.
+
+    Raises
+    ------
+    InputError : it cannot be read; it has legs that no plan can hold, with the reason; nothing can strike.
+    """
+    first = _read(path, mjcf, None if mjcf else True)
+    locked = _locked(first)
+    floats = is_floating(first.model)
+    found = _made(path, mjcf, floats, locked)
+    legs = legs_of(found.robot.model, found.pieces) if floats else ()
+    if legs:
+        extra = _check_legs(found.robot, legs)
+        if extra:
+            locked = {**locked, **extra}
+        carrying = {str(found.robot.model.names[j]) for leg in legs for j in leg.path} - extra.keys()
+        if extra or carrying & found.drives.torque.keys():
+            found = _made(path, mjcf, True, locked, carrying)
+            legs = legs_of(found.robot.model, found.pieces)
+    elif floats:
+        found = _made(path, mjcf, False, locked)
+    arms = arms_of(found.robot.model, legs)
+    if not arms:
+        raise InputError(f"{path}: there is no limb beside the legs, so nothing to strike with")
+    return replace(found, legs=legs, arms=arms)
+
+
+def _read(path: Path, mjcf: bool, floating: bool | None) -> Mjcf:
+    if mjcf:
+        return read_mjcf(path, floating=floating)
+    return Mjcf(model=read_urdf(path, None, floating=bool(floating), repaired=True))
+
+
+def _locked(read: Mjcf) -> dict[str, str]:
+    out = to_lock(read.model)
+    return out | {one: f"follows {other}" for one, other in read.coupled if not {one, other} & out.keys()}
+
+
+def _made(
+    path: Path, mjcf: bool, floating: bool, locked: Mapping[str, str], carrying: Collection[str] = ()
+) -> Drafted:
+    read = _read(path, mjcf, floating)
+    angles = {joint: _rest(read.model, joint) for joint in locked}
+    model = lock_joints(read.model, angles)
+    drives = guess_drives(model, read.torque, carrying)
+    wrong: tuple[str, ...] = ()
+    try:
+        check_inertias(model)
+    except InputError as error:
+        wrong = error.mistakes
+    options: dict[str, Any] = {"locked": angles} | ({} if floating and not mjcf else {"floating": floating})
+    for key, values in (
+        ("armature", drives.armature),
+        ("torque_limit", drives.torque),
+        ("velocity_limit", drives.velocity),
+    ):
+        options |= {key: values} if values else {}
+    out = Drafted(
+        robot=Robot.from_mjcf(path, inertias=REPAIRED, **options)
+        if mjcf
+        else Robot.from_urdf(path, inertias=REPAIRED, **options),
+        path=path,
+        options=options,
+        locked=locked,
+        drives=drives,
+        wrong=wrong,
+        legs=(),
+        arms=(),
+        pieces={},
+    )
+    pieces: dict[int, list[Piece]] = {}
+    for piece in pieces_of(out.robot)[0]:
+        pieces.setdefault(piece.joint, []).append(piece)
+    return replace(out, pieces={joint: tuple(several) for joint, several in pieces.items()})
+
+
+def _rest(model: pin.Model, name: str) -> float:
+    """The angle nearest to zero that a joint can have."""
+    joint = model.joints[model.getJointId(name)]
+    if joint.nq != 1:
+        return 0.0
+    low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+    return float(np.clip(0.0, low, high)) if low <= high else 0.0
+
+
+def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
+    """Joints beyond the sixth of a leg, to lock; InputError for legs that no plan can hold."""
+    model = robot.model
+    told = "; ".join(", ".join(str(model.names[j]) for j in leg.path) for leg in legs)
+    counts = sorted({len(leg.path) for leg in legs})
+    of = " or ".join(str(count) for count in counts)
+    if len(legs) != 2 or counts[0] < LEG:
+        raise InputError(
+            f"{robot.name!r} has {len(legs)} legs of {of} joints each ({told}), and impactopt plans for "
+            f"robots on two legs of {LEG} joints, which hold a sole in all its {LEG} directions, or on a "
+            "fixed base"
+        )
+    shared = set(legs[0].path) & set(legs[1].path)
+    if shared:
+        raise InputError(
+            f"the legs of {robot.name!r} share {', '.join(str(model.names[j]) for j in sorted(shared))}: "
+            f"each needs {LEG} joints of its own from the root link on"
+        )
+    return {str(model.names[j]): "beyond the sixth of a leg" for leg in legs for j in leg.path[LEG:]}

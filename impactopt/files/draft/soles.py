@@ -1,0 +1,201 @@
+"""Soles and striking points, found in the shapes of the links that end a limb."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from impactopt.bodies.pieces import Piece
+from impactopt.errors import InputError
+from impactopt.files.draft.limbs import Limb
+from impactopt.robots.parts import Sole, Striker
+
+__all__ = ["find_soles", "find_striker", "sides"]
+
+Array = NDArray[np.float64]
+SLICE = 0.005  # [m] of a foot above its lowest point, that stands on the ground
+STEEP = np.cos(np.radians(40))  # least cosine between a sole and the ground in the zero posture
+CORNERS = 8  # of a polygon at most
+SMALLEST = 2e-3  # [m2] of a sole
+AHEAD = 0.01  # [m] of a foot's middle ahead of its ankle that says which way is forward
+KNEE, BENDS = 3, 0.2  # of a leg's six joints; [rad] of its range more to one side than to the other, twice
+STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
+
+
+def find_soles(
+    model: pin.Model, legs: Sequence[Limb], pieces: Mapping[int, tuple[Piece, ...]]
+) -> tuple[list[Sole], Array]:
+    """A sole for each leg, on a new frame below the ankle, and the way forward (3,) in the root's frame.
+
+    Raises
+    ------
+    InputError : a foot without a flat face.
+    """
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    names = sides(model, [leg.tip for leg in legs])
+    flats, ahead = [], np.zeros(3)
+    for leg in legs:
+        found = pieces.get(leg.tip, ())
+        if not found:
+            raise InputError(
+                f"the foot at joint {str(model.names[leg.tip])!r} has no shapes, so its sole is not known: "
+                "put its meshes where the file says, or write the problem file by hand (docs/howto/robot.md)"
+            )
+        points, turn = np.concatenate([p.vertices for p in found]), data.oMi[leg.tip].rotation
+        up = -_face(points, turn)
+        low = float((points @ up).min())
+        flat = points[points @ up < low + SLICE]
+        flats.append((up, low, flat))
+        middle = turn @ ((flat.max(axis=0) + flat.min(axis=0)) / 2)
+        ahead += middle * [1.0, 1.0, 0.0]
+    forward = _forward(model, data, legs, ahead)
+    soles = []
+    for name, leg, (up, low, flat) in zip(names, legs, flats, strict=True):
+        x = data.oMi[leg.tip].rotation.T @ forward
+        x = _unit(x - up * (up @ x))
+        place = pin.SE3(np.column_stack([x, np.cross(up, x), up]), low * up)
+        corners = (flat - place.translation) @ place.rotation[:, :2]
+        polygon = _polygon(corners)
+        if polygon is None:
+            raise InputError(
+                f"the foot at joint {str(model.names[leg.tip])!r} has no flat face of {1e4 * SMALLEST:g} cm2 "
+                "to stand on: point feet and round ones cannot be held as soles"
+            )
+        parent, above = _body_of(model, leg.tip)
+        soles.append(
+            Sole(
+                name=name,
+                frame=f"{name}_sole" if not model.existFrame(f"{name}_sole") else f"{name}_drafted_sole",
+                polygon=polygon,
+                parent=parent,
+                placement=_neat(above.inverse() * place),
+            )
+        )
+    return soles, forward
+
+
+def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> Array:
+    """The way forward (3,): knees bend the feet back; else where the feet's middles are, feet (3,) [m]."""
+    back = np.zeros(3)
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    for leg in legs:
+        knee = model.joints[leg.path[KNEE]]
+        low, high = model.lowerPositionLimit[knee.idx_q], model.upperPositionLimit[knee.idx_q]
+        axis = np.array(pin.getJointJacobian(model, data, leg.path[KNEE], pin.LOCAL_WORLD_ALIGNED))[
+            3:, knee.idx_v
+        ]
+        shin = data.oMi[leg.tip].translation - data.oMi[leg.path[KNEE]].translation
+        if knee.nq == 1 and abs(low + high) > BENDS:
+            back += np.sign(low + high) * np.cross(axis, shin) * [1.0, 1.0, 0.0]
+    for way in (-back, feet):
+        if np.abs(way).max() > AHEAD * len(legs):
+            k = int(np.argmax(np.abs(way)))
+            return np.asarray(np.eye(3)[k] * np.sign(way[k]))
+    return np.array([1.0, 0.0, 0.0])
+
+
+def find_striker(
+    model: pin.Model, limb: Limb, name: str, pieces: Mapping[int, tuple[Piece, ...]]
+) -> tuple[Striker, Array]:
+    """The end of a limb, on its axis, and the way (3,) in which the limb's last link points there."""
+    parent, above = _body_of(model, limb.tip)
+    points = [p.vertices for p in pieces.get(limb.tip, ())]
+    frames = [f.placement.translation for f in model.frames if f.parentJoint == limb.tip]
+    middle = np.mean([(p.max(axis=0) + p.min(axis=0)) / 2 for p in points], axis=0) if points else np.zeros(3)
+    axis = middle if np.linalg.norm(middle) > AHEAD else np.array(max(frames, key=np.linalg.norm))
+    if np.linalg.norm(axis) < 1e-6:  # nothing sticks out: on as the link before does
+        axis = model.jointPlacements[limb.tip].actInv(np.zeros(3)) * -1.0
+    if np.linalg.norm(axis) < 1e-6:
+        axis = np.array([0.0, 0.0, 1.0])
+    axis = _unit(axis)
+    k = int(np.argmax(np.abs(axis)))
+    if abs(axis[k]) > STRAIGHT:
+        axis = np.eye(3)[k] * np.sign(axis[k])
+    everything = np.concatenate([*points, np.array(frames).reshape(-1, 3)])
+    point = axis * max(float((everything @ axis).max()), 0.0)
+    local = np.round(above.actInv(point), 4) + 0.0
+    return Striker(name=name, frame=parent, point=local), axis
+
+
+def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
+    """Names for limbs: "left" and "right" where two are on both sides of the middle, else their links'."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    links = [_body_of(model, tip)[0] for tip in tips]
+    if len(tips) != 2:
+        return links
+    words = [_side(link) for link in links]
+    if set(words) == {"left", "right"}:
+        return words
+    y = [float(data.oMi[tip].translation[1]) for tip in tips]
+    if min(y) < 0 < max(y):
+        return ["left" if y[0] > y[1] else "right", "left" if y[1] > y[0] else "right"]
+    return links
+
+
+def _side(name: str) -> str:
+    """What a link's name says of its side."""
+    low = name.lower()
+    if "left" in low or low.startswith(("l_", "l-")) or (name[:1] == "L" and name[1:2].isupper()):
+        return "left"
+    if "right" in low or low.startswith(("r_", "r-")) or (name[:1] == "R" and name[1:2].isupper()):
+        return "right"
+    return name
+
+
+def _face(points: Array, turn: Array) -> Array:
+    """The way (3,) out of a foot's largest flat face that looks down; turn (3, 3) : of its joint."""
+    hull = ConvexHull(points)
+    corners = points[hull.simplices]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    normals, down = hull.equations[:, :3], -turn[2]
+    best, size = down, 0.0
+    for normal in [down, *normals[(normals @ down > STEEP) & (area > 0.05 * area.max())]]:
+        alike = normals @ normal > np.cos(np.radians(3))
+        if area[alike].sum() > size * (1 + 1e-9):
+            best, size = _unit((area[alike, None] * normals[alike]).sum(axis=0)), float(area[alike].sum())
+    return down if best @ down > np.cos(np.radians(1)) else np.asarray(best)
+
+
+def _polygon(corners: Array) -> Array | None:
+    """A convex polygon (k, 2) inside the hull of points, counter-clockwise, few corners; None: too small."""
+    try:
+        points = corners[ConvexHull(corners).vertices]
+    except (ValueError, RuntimeError):
+        return None
+    while True:
+        before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
+        (ax, ay), (bx, by) = (points - before).T, (after - points).T
+        lost = (ax * by - ay * bx) / 2
+        if len(points) <= 3 or (len(points) <= CORNERS and lost.min() > 2e-5):
+            break
+        points = np.delete(points, int(np.argmin(lost)), axis=0)
+    x, y = points.T
+    area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
+    return np.round(points, 4) + 0.0 if area > SMALLEST else None
+
+
+def _body_of(model: pin.Model, joint: int) -> tuple[str, Any]:
+    """The first link that a joint moves, and its placement."""
+    for frame in model.frames:
+        if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
+            return str(frame.name), frame.placement
+    return str(model.names[joint]), pin.SE3.Identity()
+
+
+def _neat(place: Any) -> Any:
+    """Without digits that mean nothing."""
+    turn = np.where(
+        np.abs(place.rotation - np.round(place.rotation)) < 1e-6, np.round(place.rotation), place.rotation
+    )
+    return pin.SE3(turn + 0.0, np.round(place.translation, 4) + 0.0)
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))

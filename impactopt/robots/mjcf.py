@@ -1,0 +1,329 @@
+"""From an MJCF to a `pin.Model` and what else it says of a robot, by MuJoCo's own compiler.
+
+The compiler knows all of the language: defaults, includes, angles, inertias of geoms and meshes. What it has
+compiled is taken over number by number, so both engines have the same robot. Pinocchio's own reader (4.1)
+gives the same for plain files, but leaves out the mass of geoms that do not collide, refuses keyframes of
+scenes, and says nothing of actuators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError, missing_package
+from impactopt.robots.actuators import Actuator
+from impactopt.robots.build import existing, joint_names
+from impactopt.robots.parts import Striker
+
+__all__ = ["Mjcf", "compile_mjcf", "read_mjcf"]
+
+Array = NDArray[np.float64]
+_HINGES = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
+_TURNS = (pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ)  # without limits
+_SLIDES = (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ)
+
+
+@dataclass(kw_only=True)
+class Mjcf:
+    """A robot in an MJCF.
+
+    model : with its armature, limits, and its keyframes as reference configurations; a frame of type BODY for
+    each body, and an OP_FRAME for each site, by their names.  kp, kd, torque : by joint, what its actuators
+    say.  drives : friction and damping of joints.  sites : names of those on links that move.  coupled :
+    pairs of joints of which one follows the other.  shared : joints that move the body of another one too.
+    """
+
+    model: pin.Model
+    kp: dict[str, float] = field(default_factory=dict)
+    kd: dict[str, float] = field(default_factory=dict)
+    torque: dict[str, float] = field(default_factory=dict)
+    drives: dict[str, Actuator] = field(default_factory=dict)
+    sites: list[str] = field(default_factory=list)
+    coupled: list[tuple[str, str]] = field(default_factory=list)
+    shared: list[str] = field(default_factory=list)
+
+    def options(self, model: pin.Model, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Options of `Robot.from_model` for a model with some of these joints, under those that are given.
+
+        Raises
+        ------
+        InputError : two joints are left that move the same body, or of which one follows the other.
+        """
+        joints = joint_names(model)
+        for joint in (joint for joint in self.shared if joint in joints):
+            raise InputError(
+                f"MJCF: joint {joint!r} and another one move the same body, with no mass between them; "
+                "put a body with mass between the two, or lock one of them (`locked`)"
+            )
+        for one, other in self.coupled:
+            if one in joints and other in joints:
+                raise InputError(
+                    f"MJCF: joint {one!r} follows {other!r} by an equality, and here all joints have motors; "
+                    "lock one of them (`locked`)"
+                )
+        out = dict(given)
+        for key, found in (("kp", self.kp), ("kd", self.kd), ("torque_limit", self.torque)):
+            own = {joint: value for joint, value in found.items() if joint in joints}
+            if isinstance(given.get(key, {}), Mapping):
+                out[key] = {**own, **given.get(key, {})}
+        drives = {joint: drive for joint, drive in self.drives.items() if joint in joints}
+        out["actuators"] = {**drives, **(given.get("actuators") or {})}
+        named = {striker.name for striker in given.get("strikers", ())}
+        sites = [Striker(name=s, frame=s, point=np.zeros(3)) for s in self.sites if s not in named]
+        return {**out, "strikers": [*sites, *given.get("strikers", ())]}
+
+
+def compile_mjcf(path: str | PathLike[str]) -> Any:
+    """The mujoco.MjModel of a file; InputError if there is none, with the compiler's message."""
+    file = existing(path, "MJCF")
+    try:
+        import mujoco
+    except ImportError as error:
+        raise missing_package("a robot from an MJCF", "mujoco", "validate") from error
+    try:
+        return mujoco.MjModel.from_xml_path(file)
+    except ValueError as error:
+        raise InputError(f"MJCF {file}: {error}") from error
+
+
+def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Mjcf:
+    """The robot of an MJCF: the body with a free joint, and joints below it; else all that have joints.
+
+    floating : whether its root has a free joint; None: as the file says.
+
+    Raises
+    ------
+    InputError : no robot, or several; ball joints; loops (equality constraints that connect or weld).
+    """
+    mj = compile_mjcf(path)
+    return _Reader(mj, f"MJCF {path}", floating).read()
+
+
+class _Reader:
+    def __init__(self, mj: Any, what: str, floating: bool | None) -> None:
+        import mujoco
+
+        self.mj, self.what, self.mujoco = mj, what, mujoco
+        roots = [b for b in range(1, mj.nbody) if mj.body_parentid[b] == 0 and self._driven(b)]
+        free = [b for b in roots if self._free(b)]
+        if not roots:
+            raise InputError(f"{what} has no hinges or slides: there is nothing to plan")
+        if len(free) > 1:
+            names = ", ".join(repr(self.name("body", b)) for b in free)
+            raise InputError(f"{what} has several robots, {names}; take all but one out")
+        self.roots = free or roots
+        if len(self.roots) > 1 and floating:
+            raise InputError(f"{what} has several bodies with joints on the ground: it cannot float")
+        self.floating = bool(free) if floating is None else floating
+        self.model = pin.Model()
+        self.model.name = mj.names[: mj.names.index(b"\0")].decode() or "robot"
+        self.out = Mjcf(model=self.model)
+        self.body = {0: (0, pin.SE3.Identity(), 0)}  # MuJoCo's to joint, placement there, frame
+        self.joint: dict[int, int] = {}  # MuJoCo's to Pinocchio's
+
+    def name(self, kind: str, i: int) -> str:
+        """Of a thing; where it has none its kind and number."""
+        found = self.mujoco.mj_id2name(self.mj, getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i)
+        return str(found) if found else f"{kind}{i}"
+
+    def read(self) -> Mjcf:
+        inside = set(self.roots)
+        for b in range(1, self.mj.nbody):  # parents come first
+            if b in inside or int(self.mj.body_parentid[b]) in inside:
+                inside.add(b)
+                self._add_body(b)
+        for s in range(self.mj.nsite):
+            if int(self.mj.site_bodyid[s]) in inside:
+                self._add_site(s)
+        self._equalities()
+        self._actuators()
+        self._keyframes()
+        return self.out
+
+    def _driven(self, root: int) -> bool:
+        kinds = self.mj.jnt_type[self.mj.body_rootid[self.mj.jnt_bodyid] == root]
+        return bool((kinds != self.mujoco.mjtJoint.mjJNT_FREE).any())
+
+    def _free(self, b: int) -> bool:
+        first, count = int(self.mj.body_jntadr[b]), int(self.mj.body_jntnum[b])
+        return count > 0 and self.mj.jnt_type[first] == self.mujoco.mjtJoint.mjJNT_FREE
+
+    def _add_body(self, b: int) -> None:
+        mj, model = self.mj, self.model
+        joint, place, above = self.body[int(mj.body_parentid[b])]
+        place = place * _placement(mj.body_pos[b], mj.body_quat[b])
+        first, count = int(mj.body_jntadr[b]), int(mj.body_jntnum[b])
+        free = self._free(b)
+        if self.floating and b == self.roots[0]:
+            name = self.name("joint", first) if free else "root_joint"
+            joint, place = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), name), _none()
+            above = model.addJointFrame(joint, 0)
+        if not free:
+            self.out.shared += [self.name("joint", j) for j in range(first, first + count - 1)]
+        for j in () if free else range(first, first + count):
+            at = pin.SE3(np.eye(3), np.array(mj.jnt_pos[j]))
+            joint, above = self._add_joint(j, joint, place * at, above)
+            place = at.inverse()
+        body = pin.Inertia(
+            float(mj.body_mass[b]),
+            np.array(mj.body_ipos[b]),
+            _turned(mj.body_iquat[b], np.array(mj.body_inertia[b])),
+        )
+        model.appendBodyToJoint(joint, body, place)
+        frame = pin.Frame(self._apart("body", b), joint, above, place, pin.FrameType.BODY)
+        self.body[b] = (joint, place, int(model.addFrame(frame, False)))
+
+    def _apart(self, kind: str, i: int) -> str:
+        """A name that no frame of the model has yet, other than a joint."""
+        name = self.name(kind, i)
+        taken = [str(f.name) for f in self.model.frames if f.type != pin.FrameType.JOINT]
+        return name if name not in taken else f"{kind} {name}"
+
+    def _add_joint(self, j: int, parent: int, place: Any, above: int) -> tuple[int, int]:
+        mj, model, name = self.mj, self.model, self.name("joint", j)
+        hinge = mj.jnt_type[j] == self.mujoco.mjtJoint.mjJNT_HINGE
+        if not hinge and mj.jnt_type[j] != self.mujoco.mjtJoint.mjJNT_SLIDE:
+            raise InputError(
+                f"{self.what}: joint {name!r} is a ball or a free joint inside the robot; make hinges of it"
+            )
+        axis, zero = np.array(mj.jnt_axis[j]), float(mj.qpos0[mj.jnt_qposadr[j]])
+        # MuJoCo's bodies are where the file has them at the joint's reference, Pinocchio's at zero
+        place = place * (
+            pin.SE3(pin.exp3(-zero * axis), np.zeros(3)) if hinge else pin.SE3(np.eye(3), -zero * axis)
+        )
+        limited, lasting = bool(mj.jnt_limited[j]), int(mj.jnt_dofadr[j])
+        kind = _kind(axis, hinge, limited)
+        added = int(model.addJoint(parent, kind, place, name))
+        at = model.joints[added]
+        low, high = mj.jnt_range[j] if limited else (-np.inf, np.inf)
+        if at.nq == 1:
+            lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+            lower[at.idx_q], upper[at.idx_q] = low, high
+            model.lowerPositionLimit, model.upperPositionLimit = lower, upper
+        armature = np.array(model.armature)
+        armature[at.idx_v] = mj.dof_armature[lasting]
+        model.armature = armature
+        self.joint[j] = added
+        viscous, coulomb = float(_first(mj.dof_damping[lasting])), float(mj.dof_frictionloss[lasting])
+        if viscous or coulomb:
+            self.out.drives[name] = Actuator(viscous_friction=viscous, coulomb_friction=coulomb)
+        return added, int(model.addJointFrame(added, above))
+
+    def _add_site(self, s: int) -> None:
+        joint, place, above = self.body[int(self.mj.site_bodyid[s])]
+        place = place * _placement(self.mj.site_pos[s], self.mj.site_quat[s])
+        name = self._apart("site", s)
+        self.model.addFrame(pin.Frame(name, joint, above, place, pin.FrameType.OP_FRAME), False)
+        if joint > int(self.floating):
+            self.out.sites.append(name)
+
+    def _equalities(self) -> None:
+        mj, kinds = self.mj, self.mujoco.mjtEq
+        for e in range(mj.neq):
+            if not mj.eq_active0[e]:
+                continue
+            one, other = int(mj.eq_obj1id[e]), int(mj.eq_obj2id[e])
+            if int(mj.eq_type[e]) in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+                raise InputError(
+                    f"{self.what} closes a loop by the equality {self.name('equality', e)!r}; robots here "
+                    "are trees: take it out, with the rods that it holds"
+                )
+            if mj.eq_type[e] == kinds.mjEQ_JOINT and one in self.joint and other in self.joint:
+                self.out.coupled.append((self.name("joint", one), self.name("joint", other)))
+
+    def _actuators(self) -> None:
+        mj, kinds = self.mj, self.mujoco.mjtTrn
+        inside = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
+        most: dict[str, float] = {}
+        for a in range(mj.nu):
+            j = int(mj.actuator_trnid[a, 0])
+            if int(mj.actuator_trntype[a]) not in inside or j not in self.joint:
+                continue
+            name, gear = self.name("joint", j), abs(float(mj.actuator_gear[a, 0]))
+            affine = mj.actuator_biastype[a] == self.mujoco.mjtBias.mjBIAS_AFFINE
+            kp, kd = (-float(mj.actuator_biasprm[a, k]) * gear**2 if affine else 0.0 for k in (1, 2))
+            most[name] = most.get(name, 0.0) + _largest(mj, a, affine) * gear
+            if kp > 0 or kd > 0:
+                self.out.kp[name] = self.out.kp.get(name, 0.0) + kp
+                self.out.kd[name] = self.out.kd.get(name, 0.0) + kd
+        for j in self.joint:
+            name = self.name("joint", j)
+            if mj.jnt_actfrclimited[j]:
+                bound = float(np.abs(mj.jnt_actfrcrange[j]).min())
+                most[name] = min(most[name], bound) if name in most else bound
+            if np.isfinite(most.get(name, np.inf)):
+                self.out.torque[name] = most[name]
+            if self.out.kp.get(name, 0.0) > 0 and self.out.kd[name] == 0 and name in self.out.drives:
+                # a servo without damping of its own leans on the joint's, which is then no friction
+                drive = self.out.drives.pop(name)
+                self.out.kd[name] = drive.viscous_friction
+                if drive.coulomb_friction:
+                    self.out.drives[name] = Actuator(coulomb_friction=drive.coulomb_friction)
+
+    def _keyframes(self) -> None:
+        mj = self.mj
+        for k in range(mj.nkey):
+            q, inside = pin.neutral(self.model), True
+            for j, i in self.joint.items():
+                angle, at = float(mj.key_qpos[k][mj.jnt_qposadr[j]]), self.model.joints[i]
+                inside &= not mj.jnt_limited[j] or mj.jnt_range[j][0] <= angle <= mj.jnt_range[j][1]
+                q[at.idx_q : at.idx_q + at.nq] = angle if at.nq == 1 else (np.cos(angle), np.sin(angle))
+            if self.floating and self._free(self.roots[0]):
+                start = int(mj.jnt_qposadr[int(mj.body_jntadr[self.roots[0]])])
+                where = mj.key_qpos[k][start : start + 7]
+                q[:7] = pin.SE3ToXYZQUAT(_placement(where[:3], where[3:]))
+            if inside:  # what is outside its limits is no posture
+                self.model.referenceConfigurations[self.name("key", k)] = q
+
+
+def _largest(mj: Any, a: int, affine: bool) -> float:
+    """The largest force [N m] of an actuator; infinite where nothing bounds it."""
+    out = np.inf
+    if mj.actuator_forcelimited[a]:
+        out = float(np.abs(mj.actuator_forcerange[a]).min())
+    if mj.actuator_ctrllimited[a] and not affine:
+        out = min(out, float(np.abs(mj.actuator_ctrlrange[a]).min()) * abs(float(mj.actuator_gainprm[a, 0])))
+    return out
+
+
+def _kind(axis: Array, hinge: bool, limited: bool) -> Any:
+    """Pinocchio's joint about or along an axis."""
+    along = [k for k in range(3) if axis[k] == 1 and not np.delete(axis, k).any()]
+    if along:
+        return ((_HINGES if limited else _TURNS) if hinge else _SLIDES)[along[0]]()
+    if not hinge:
+        return pin.JointModelPrismaticUnaligned(axis)
+    unaligned = pin.JointModelRevoluteUnaligned if limited else pin.JointModelRevoluteUnboundedUnaligned
+    return unaligned(axis)
+
+
+def _placement(position: Any, quaternion: Any) -> Any:
+    return pin.SE3(_rotation(quaternion), np.array(position, dtype=np.float64))
+
+
+def _rotation(quaternion: Any) -> Array:
+    """Of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = (float(a) for a in quaternion)
+    return np.array(pin.Quaternion(w, x, y, z).normalized().matrix())
+
+
+def _turned(quaternion: Any, moments: Array) -> Array:
+    """Principal moments (3,) in the axes of a body."""
+    turn = _rotation(quaternion)
+    return turn @ np.diag(moments) @ turn.T
+
+
+def _first(value: Any) -> float:
+    """MuJoCo 4 has polynomials of damping, whose first coefficient is the linear one."""
+    return float(np.ravel(value)[0])
+
+
+def _none() -> Any:
+    return pin.SE3.Identity()

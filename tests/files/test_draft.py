@@ -1,0 +1,177 @@
+"""Problem files drafted from a URDF or an MJCF alone, for robots written here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support import urdfs
+from typer.testing import CliRunner
+
+from impactopt.cli.app import app
+from impactopt.errors import InputError
+from impactopt.files.draft.description import find_description
+from impactopt.files.draft.drafting import Draft, draft_problem
+from impactopt.files.problem_file import load_problem
+from impactopt.files.problem_file.toml import read_toml
+from impactopt.problem.doubts import doubts, hopeless
+from impactopt.problem.problem import ImpactProblem
+
+FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
+
+
+def _drafted(folder: Path, text: str, **options: Any) -> Draft:
+    (folder / "robot.urdf").write_text(text)
+    return draft_problem(folder / "robot.urdf", folder=folder, **options)
+
+
+def _problem(folder: Path, text: str, **options: Any) -> ImpactProblem:
+    (folder / "robot.toml").write_text(_drafted(folder, text, **options).text)
+    return load_problem(folder / "robot.toml")
+
+
+@pytest.mark.parametrize("behind", [False, True], ids=["ahead", "behind"])
+def test_a_biped_stands_on_the_soles_of_its_feet(tmp_path: Path, behind: bool) -> None:
+    problem = _problem(tmp_path, urdfs.biped(behind=behind))
+    robot = problem.robot
+    assert [sole.name for sole in robot.soles] == ["left", "right"]
+    length, width = urdfs.SOLE
+    for sole in robot.soles:  # the box, 4 cm ahead of the ankle, whichever way the root looks
+        assert sole.polygon.min(axis=0) == pytest.approx([0.04 - length / 2, -width / 2], abs=1e-4)
+        assert sole.polygon.max(axis=0) == pytest.approx([0.04 + length / 2, width / 2], abs=1e-4)
+        assert sole.placement.translation == pytest.approx([0.0, 0.0, -urdfs.ANKLE], abs=1e-4)
+    robot.check_stance(problem.start_posture)
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, problem.start_posture)
+    left, right = (data.oMf[robot.model.getFrameId(sole.frame)] for sole in robot.soles)
+    assert left.translation[1] > 0 > right.translation[1]
+    for side in ("left", "right"):  # knees bend to the front
+        knee, hip = (data.oMi[robot.model.getJointId(f"{side}_{name}")] for name in ("knee", "hip_pitch"))
+        assert knee.translation[0] > hip.translation[0] + 0.05
+
+
+@pytest.mark.parametrize(
+    "text", [urdfs.biped(), urdfs.arm(), urdfs.arm(wheels=True)], ids=["biped", "arm", "cart"]
+)
+def test_what_is_drafted_is_sound(tmp_path: Path, text: str) -> None:
+    problem = _problem(tmp_path, text)
+    assert hopeless(problem) == [] and doubts(problem.robot) == []
+    data = problem.robot.model.createData()
+    pin.framesForwardKinematics(problem.robot.model, data, problem.start_posture)
+    at = data.oMf[problem.robot.model.getFrameId(f"striker:{problem.striker}")].translation
+    assert problem.normal @ (problem.point - at) > 0.05  # room to swing
+
+
+def test_fingers_and_wheels_are_locked_and_a_cart_is_bolted(tmp_path: Path) -> None:
+    data = read_toml(_drafted(tmp_path, urdfs.arm(wheels=True)).text)
+    assert set(data["robot"]["locked_rad"]) == {"slide_0", "slide_1", "drive_0", "drive_1"}
+    assert data["robot"]["floating"] is False
+
+
+def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
+    data = read_toml(_drafted(tmp_path, urdfs.arm()).text)
+    (striker,) = data["robot"]["strikers"]
+    assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
+
+
+def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
+    draft = _drafted(tmp_path, urdfs.arm(effort=0.0, velocity=0.0))
+    keys = read_toml(draft.text)["robot"]
+    joints = {"turn", "shoulder", "elbow", "wrist"}
+    for key in ("armature_kg_m2", "torque_limit_N_m", "velocity_limit_rad_s"):
+        assert set(keys[key]) == joints and min(keys[key].values()) > 0
+        above = draft.text.partition(f"[robot.{key}]")[0].splitlines()[-1]
+        assert "a GUESS" in above
+    # the shoulder can hold the arm stretched out: 6 kg, 0.39 m away on average, and more
+    weight = 9.81 * (2 * 0.15 + 2 * (0.3 + 0.15) + 2.06 * 0.65)
+    assert keys["torque_limit_N_m"]["shoulder"] > weight
+    assert sum("guessed" in line for line in draft.said) == 3
+
+
+def test_numbers_that_the_file_has_are_not_guessed(tmp_path: Path) -> None:
+    keys = read_toml(_drafted(tmp_path, urdfs.arm()).text)["robot"]
+    assert "torque_limit_N_m" not in keys and "velocity_limit_rad_s" not in keys
+
+
+def test_bad_inertias_are_listed_and_their_repair_has_to_be_said(tmp_path: Path) -> None:
+    draft = _drafted(tmp_path, urdfs.biped(moments=FLAT))
+    assert "'right_elbow'" in draft.text and any("1 inertias" in line for line in draft.said)
+    file = tmp_path / "robot.toml"
+    file.write_text(draft.text)
+    with pytest.raises(InputError, match="'right_elbow'"):
+        load_problem(file)
+    file.write_text(draft.text.replace("# inertias =", "inertias ="))
+    problem = load_problem(file)
+    assert "right_elbow" in problem.describe()["inertias"][0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (urdfs.biped(legs=5), "2 legs of 5 joints each .*left_hip_roll.*two legs of 6 joints"),
+        (urdfs.biped(pairs=2), "4 legs of 6 joints each"),
+    ],
+    ids=["five joints", "four legs"],
+)
+def test_legs_that_no_plan_can_hold_are_told_first(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        _drafted(tmp_path, text)
+
+
+def test_a_drawing_of_lines_has_no_soles(tmp_path: Path) -> None:
+    x, y = urdfs.SOLE
+    text = urdfs.biped().replace(f'<box size="{x} {y} 0.04"/>', '<sphere radius="0.02"/>')
+    with pytest.raises(InputError, match=r"no flat face of 20 cm2"):
+        _drafted(tmp_path, text)
+
+
+def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""
+        <mujoco model="tiny"><worldbody><body name="base"><geom type="box" size=".1 .1 .2" pos="0 0 .2"/>
+        <body name="upper" pos="0 0 .5"><joint name="shoulder" axis="0 1 0" range="-100 100"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/><body name="lower" pos="0 0 .3">
+        <joint name="elbow" axis="0 1 0" range="-140 140"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/>
+        </body></body></body></worldbody>
+        <actuator><motor joint="elbow" ctrlrange="-30 30"/></actuator></mujoco>
+    """)
+    draft = draft_problem(path, folder=tmp_path, mjcf=True)
+    assert set(read_toml(draft.text)["robot"]["torque_limit_N_m"]) == {"shoulder"}
+    (tmp_path / "arm.toml").write_text(draft.text)
+    assert load_problem(tmp_path / "arm.toml").robot.torque_limit[1] == 30.0
+
+
+def test_robots_of_example_robot_data_go_by_name() -> None:
+    pytest.importorskip("pinocchio")
+    try:
+        assert find_description("panda").name == "panda.urdf"
+    except InputError as error:
+        pytest.skip(str(error))
+    assert find_description("ur5").name == "ur5_robot.urdf"
+    with pytest.raises(InputError, match="did you mean 'panda'"):
+        find_description("pnada")
+    with pytest.raises(InputError, match=r"several robots 'alex'.*alex_nub_hands"):
+        find_description("alex")
+
+
+def test_the_command_writes_a_file_once(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(urdfs.arm())
+    words = ["new", "--urdf", str(tmp_path / "arm.urdf"), "--out", str(tmp_path / "arm.toml")]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert "guessed" in done.output and "impactopt check" in done.output
+    assert read_toml((tmp_path / "arm.toml").read_text())["robot"]["urdf"] == "arm.urdf"
+    again = CliRunner().invoke(app, words)
+    assert again.exit_code == 2 and "already" in again.output
+    assert CliRunner().invoke(app, ["new", "punch", "--urdf", "x"]).exit_code == 2
+
+
+def test_angles_are_those_of_the_posture(tmp_path: Path) -> None:
+    problem = _problem(tmp_path, urdfs.arm())
+    q = problem.robot.joint_positions(problem.start_posture)
+    assert np.all(q > problem.robot.lower + 0.05) and np.all(q < problem.robot.upper - 0.05)

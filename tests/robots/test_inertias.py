@@ -1,0 +1,106 @@
+"""Inertias that no body can have: told all at once, repaired where one says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support import urdfs
+
+from impactopt import Robot
+from impactopt.errors import InputError
+from impactopt.files.problem_file import problem_file_from_data
+from impactopt.robots.inertias import repair_inertias
+
+LOST = 'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"'
+FLAT = 'ixx="0.001" iyy="0.002" izz="0.01" ixy="0" ixz="0" iyz="0"'
+
+
+def _model(mass: float, moments: list[float], turn: np.ndarray | None = None) -> pin.Model:
+    model, axes = pin.Model(), np.eye(3) if turn is None else turn
+    joint = model.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), "hinge")
+    body = pin.Inertia.Zero()
+    body.mass, body.lever = mass, np.array([0.1, 0.2, 0.3])
+    body.inertia = axes @ np.diag(moments) @ axes.T
+    model.inertias[joint] = body
+    return model
+
+
+def test_a_moment_above_the_sum_of_the_others_comes_down_to_what_matter_can_have() -> None:
+    turn = np.array(pin.exp3(np.array([0.3, -0.2, 0.5])))
+    model = _model(1.0, [0.001, 0.002, 0.01], turn)
+    assert len(repair_inertias(model)) == 1
+    body = model.inertias[1]
+    assert body.mass == 1.0 and np.allclose(body.lever, [0.1, 0.2, 0.3])
+    moments = np.diag(turn.T @ body.inertia @ turn)  # its axes stay
+    # second moments of mass x, y, z = 0.0055, 0.0045, -0.0035: the last one becomes a slab's, 1 cm thick
+    thin = 0.01**2 / 12
+    assert moments == pytest.approx([0.0045 + thin, 0.0055 + thin, 0.01])
+
+
+def test_a_point_becomes_a_ball() -> None:
+    model = _model(3.0, [0.0, 0.0, 0.0])
+    said = repair_inertias(model)
+    radius = (3 * 3.0 / (4 * np.pi * 2000.0)) ** (1 / 3)
+    assert np.allclose(model.inertias[1].inertia, pin.Inertia.FromSphere(3.0, radius).inertia)
+    assert "'hinge'" in said[0] and "3 kg" in said[0] and "ball" in said[0]
+
+
+@pytest.mark.parametrize("moments", [[0.01, 0.02, 0.025], [0.01, 0.01, 0.02], [1e-4, 1e-4, 1e-4]])
+def test_what_matter_can_have_is_left_alone(moments: list[float]) -> None:
+    model = _model(1.0, moments)
+    before = np.array(model.inertias[1].inertia)
+    assert repair_inertias(model) == []
+    assert (np.array(model.inertias[1].inertia) == before).all()
+
+
+def test_what_is_repaired_is_sound_and_stays_as_it_is() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        model = _model(rng.uniform(0.01, 10), list(rng.normal(0, 0.05, 3)))
+        repair_inertias(model)
+        small, middle, large = np.linalg.eigvalsh(np.array(model.inertias[1].inertia))
+        assert small > 0 and small + middle >= large * (1 - 1e-9)
+        assert repair_inertias(model) == []
+
+
+def test_all_bad_inertias_and_limits_are_told_at_once(tmp_path: Path) -> None:
+    text = urdfs.biped(moments=FLAT).replace('effort="80.0"', 'effort="0"', 1)
+    path = tmp_path / "walker.urdf"
+    path.write_text(text)
+    with pytest.raises(InputError) as error:
+        Robot.from_urdf(path)
+    assert len(error.value.mistakes) == 2
+    assert "'right_elbow'" in error.value.mistakes[0] and "torque limit" in error.value.mistakes[1]
+
+
+def test_repairs_have_to_be_said_and_are_listed(tmp_path: Path) -> None:
+    path = tmp_path / "walker.urdf"
+    path.write_text(urdfs.biped(moments=LOST))
+    with pytest.raises(InputError, match=r"'right_elbow'.*inertias=\"repaired\""):
+        Robot.from_urdf(path)
+    robot = Robot.from_urdf(path, inertias="repaired", armature=0.05)
+    assert robot.source is not None
+    assert [text.split("'")[1] for text in robot.source.repairs] == ["right_elbow"]
+    with pytest.raises(InputError, match='give "given"'):
+        Robot.from_urdf(path, inertias="fixed")
+
+
+def test_a_mass_is_not_guessed(tmp_path: Path) -> None:
+    path = tmp_path / "walker.urdf"
+    path.write_text(urdfs.biped().replace('<mass value="15.0"/>', '<mass value="-1"/>'))
+    with pytest.raises(InputError, match="mass -1"):
+        Robot.from_urdf(path, inertias="repaired")
+
+
+def test_a_preset_has_nothing_to_repair() -> None:
+    data = {
+        "problem": {"striker": "fist", "point_m": [0.5, 0.0, 0.5], "normal": [1.0, 0.0, 0.0]},
+        "robot": {"preset": "arm7", "inertias": "repaired"},
+        "target": {"mass_kg": 1.0},
+        "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 10.0},
+    }
+    with pytest.raises(InputError, match="inertias belongs to mjcf or urdf"):
+        problem_file_from_data(data, where="p.toml")

@@ -1,0 +1,253 @@
+"""Robots from MJCFs against MuJoCo itself: mass matrix, inverse dynamics, Jacobians; drives and errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from impactopt import Robot
+from impactopt.errors import InputError
+from impactopt.files.problem_file import problem_from_data
+from impactopt.robots.mjcf import read_mjcf
+
+mujoco = pytest.importorskip("mujoco")
+
+Array = NDArray[np.float64]
+
+# A floating base, two branches, a slide with a tilted axis, joints with an offset and a reference, inertias
+# of geoms and by hand, a geom that does not collide, a link fixed to another, a ball beside the robot.
+TREE = """
+<mujoco model="tree">
+  <compiler angle="degree"/>
+  <default><joint damping="0.4" frictionloss="0.2" armature="0.03"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body name="trunk" pos="0.1 0.2 1" euler="10 20 30">
+      <freejoint name="root"/>
+      <geom type="box" size=".1 .15 .2" density="800"/>
+      <site name="imu" pos="0 0 .1"/>
+      <body name="upper" pos="0 .2 .1" euler="0 15 0">
+        <joint name="shoulder" axis="1 2 0.5" pos="0.01 0.02 0.03" range="-90 80" ref="20"/>
+        <geom type="capsule" size=".04" fromto="0 0 0 0 0.1 -.3"/>
+        <body name="lower" pos="0 .1 -.3">
+          <joint name="elbow" axis="0 1 0" range="-90 90"/>
+          <geom type="cylinder" size=".03 .1" pos="0 0 -.1"/>
+          <geom type="sphere" size=".05" pos="0 0 -.2" contype="0" conaffinity="0" rgba="1 0 0 1"/>
+          <body name="hand" pos="0 0 -.2" quat="1 .2 .3 .1">
+            <geom type="ellipsoid" size=".03 .04 .05" pos=".01 0 0"/>
+            <site name="fist" pos="0.05 0 0" euler="0 90 0"/>
+          </body>
+        </body>
+      </body>
+      <body name="mast" pos="-.1 0 .2">
+        <joint name="lift" type="slide" axis="0 .1 1" range="-.1 .2" ref=".05"/>
+        <inertial mass="2" pos=".01 .02 .03" fullinertia=".02 .03 .04 .001 .002 -.001"/>
+        <body name="top" pos="0 0 .1">
+          <joint name="turn" axis="0 0 1" limited="false"/>
+          <geom type="box" size=".05 .02 .03" pos=".02 0 0"/>
+        </body>
+      </body>
+    </body>
+    <body name="ball" pos="2 0 1"><freejoint/><geom size=".1"/></body>
+  </worldbody>
+  <actuator>
+    <position name="a" joint="shoulder" kp="200" kv="7" gear="2" forcerange="-40 40"/>
+    <motor joint="elbow" gear="50" ctrlrange="-1 1"/>
+    <position joint="lift" kp="900"/>
+  </actuator>
+  <keyframe>
+    <key name="home" qpos="0 0 1 1 0 0 0 .3 .2 0.1 2 2 0 1 1 0 0 0"/>
+    <key name="broken" qpos="0 0 1 1 0 0 0 .3 9 0.1 1 2 0 1 1 0 0 0"/>
+  </keyframe>
+</mujoco>
+"""
+LACKS: dict[str, Any] = {"velocity_limit": 4.0, "torque_limit": {"lift": 100.0, "turn": 50.0}}
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    path = tmp_path / "tree.xml"
+    path.write_text(TREE)
+    return path
+
+
+class Both:
+    """A robot's model beside MuJoCo's, at states drawn in Pinocchio's coordinates: qvel = S v."""
+
+    def __init__(self, path: Path) -> None:
+        self.mj, self.model = mujoco.MjModel.from_xml_path(str(path)), read_mjcf(path).model
+        self.there, self.data = mujoco.MjData(self.mj), self.model.createData()
+
+    def states(self, count: int) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
+        """q, v, S, and dS/dt v, after a forward computation in MuJoCo."""
+        rng, model = np.random.default_rng(0), self.model
+        for _ in range(count):
+            q = pin.integrate(model, pin.neutral(model), rng.standard_normal(model.nv))
+            v = rng.standard_normal(model.nv)
+            to, drift = np.zeros((self.mj.nv, model.nv)), np.zeros(self.mj.nv)
+            for i in range(1, model.njoints):
+                joint, other = model.joints[i], self.mj.joint(model.names[i])
+                a, b = int(other.qposadr[0]), int(other.dofadr[0])
+                if joint.nq == 7:
+                    turn = pin.XYZQUATToSE3(q[:7]).rotation
+                    self.there.qpos[a : a + 7] = q[[0, 1, 2, 6, 3, 4, 5]]
+                    to[b : b + 3, :3], to[b + 3 : b + 6, 3:6] = turn, np.eye(3)
+                    drift[b : b + 3] = turn @ np.cross(v[3:6], v[:3])
+                else:
+                    x = q[joint.idx_q : joint.idx_q + joint.nq]
+                    self.there.qpos[a] = x[0] if joint.nq == 1 else np.arctan2(x[1], x[0])
+                    to[b, joint.idx_v] = 1.0
+            self.there.qvel[:] = to @ v
+            mujoco.mj_forward(self.mj, self.there)
+            yield q, v, to, drift, rng.standard_normal(model.nv)
+
+    def mass(self) -> Array:
+        """MuJoCo's mass matrix, by columns of its product with vectors."""
+        out = np.zeros((self.mj.nv, self.mj.nv))
+        for k, unit in enumerate(np.eye(self.mj.nv)):
+            mujoco.mj_mulM(self.mj, self.there, out[k], unit)
+        return out
+
+
+def test_both_engines_have_the_same_dynamics(tree: Path) -> None:
+    both = Both(tree)
+    for q, v, to, drift, a in both.states(5):
+        mass = both.mass()
+        upper = np.triu(pin.crba(both.model, both.data, q))
+        own = upper + np.triu(upper, 1).T
+        assert np.abs(own - to.T @ mass @ to).max() < 1e-12 * np.abs(own).max()
+        torque = to.T @ (mass @ (to @ a + drift) + both.there.qfrc_bias)
+        other = pin.rnea(both.model, both.data, q, v, a)
+        assert np.abs(torque - other).max() < 1e-12 * np.abs(other).max()
+
+
+def test_both_engines_have_the_same_sites(tree: Path) -> None:
+    both = Both(tree)
+    for q, _, to, _, _ in both.states(5):
+        pin.computeJointJacobians(both.model, both.data, q)
+        pin.updateFramePlacements(both.model, both.data)
+        for name in ("imu", "fist"):
+            site, frame = both.mj.site(name).id, both.model.getFrameId(name)
+            along, about = np.zeros((2, 3, both.mj.nv))
+            mujoco.mj_jacSite(both.mj, both.there, along, about, site)
+            own = pin.getFrameJacobian(both.model, both.data, frame, pin.LOCAL_WORLD_ALIGNED)
+            assert np.abs(np.vstack([along, about]) @ to - own).max() < 1e-12
+            assert np.allclose(both.data.oMf[frame].translation, both.there.site_xpos[site], atol=1e-12)
+
+
+def test_drives_are_those_of_actuators_and_joints(tree: Path) -> None:
+    robot = Robot.from_mjcf(tree, **LACKS)
+    k = {name: robot.joint_index(name) for name in robot.joint_names}
+    assert robot.kp[k["shoulder"]] == 200 * 2**2 and robot.kd[k["shoulder"]] == 7 * 2**2
+    assert robot.torque_limit[k["shoulder"]] == 80.0  # forcerange x gear
+    assert robot.torque_limit[k["elbow"]] == 50.0  # ctrlrange x gear
+    assert robot.kp[k["lift"]] == 900 and robot.kd[k["lift"]] == 0.4  # the joint's damping is its servo's
+    assert robot.actuators[k["lift"]].viscous_friction == 0.0
+    assert robot.actuators[k["elbow"]].viscous_friction == 0.4
+    assert [a.coulomb_friction for a in robot.actuators] == [0.2] * 4
+    assert (robot.armature == 0.03).all()
+    assert robot.lower[k["elbow"]] == pytest.approx(-np.pi / 2) and robot.upper[k["lift"]] == 0.2
+    assert robot.lower[k["turn"]] == -np.inf
+
+
+def test_sites_that_move_strike_and_keyframes_inside_the_limits_are_postures(tree: Path) -> None:
+    robot = Robot.from_mjcf(tree, **LACKS)
+    assert list(robot.strikers) == ["fist"]  # the trunk's is on what no joint of the robot moves
+    assert list(robot.postures) == ["home"]
+    assert robot.joint_positions(robot.posture("home")) == pytest.approx([0.3, 0.2, 0.1, 2.0])
+
+
+def test_a_free_joint_can_be_taken_out(tree: Path) -> None:
+    robot = Robot.from_mjcf(tree, floating=False, **LACKS)
+    assert not robot.floating and robot.n == 4
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, pin.neutral(robot.model))
+    assert data.oMf[robot.model.getFrameId("trunk")].translation == pytest.approx([0.1, 0.2, 1.0])
+
+
+def test_own_numbers_win_over_the_files(tree: Path) -> None:
+    robot = Robot.from_mjcf(tree, locked=["turn"], velocity_limit=4.0, torque_limit=7.0, kp={"lift": 5.0})
+    assert (robot.torque_limit == 7.0).all() and robot.kp[robot.joint_index("lift")] == 5.0
+    assert robot.kp[robot.joint_index("shoulder")] == 800.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            '<joint name="elbow" axis="0 1 0" range="-90 90"/>',
+            '<joint name="elbow" type="ball"/>',
+            "'elbow' is a ball",
+        ),
+        (
+            "<actuator>",
+            '<equality><weld name="rod" body1="hand" body2="top"/></equality><actuator>',
+            "closes a loop by the equality 'rod'",
+        ),
+        (
+            "<actuator>",
+            '<equality><joint joint1="elbow" joint2="turn"/></equality><actuator>',
+            "'elbow' follows 'turn'.*lock one",
+        ),
+        (
+            '<freejoint/><geom size=".1"/>',
+            '<freejoint/><geom size=".1"/><body><joint/><geom size=".1"/></body>',
+            "has several robots, 'trunk', 'ball'",
+        ),
+        (
+            '<joint name="turn"',
+            '<joint name="sway" axis="1 0 0" range="-10 10"/><joint name="turn"',
+            "'sway' and another one move the same body.*lock one",
+        ),
+        ("<mujoco model", "<mujoco nonsense='1' model", "MJCF .*tree.xml: .*nonsense"),
+    ],
+)
+def test_what_is_no_robot_here_is_refused(tree: Path, old: str, new: str, said: str) -> None:
+    text = TREE.replace(old, new)
+    if "<joint/>" in new or "sway" in new:  # more numbers than its keyframes have
+        text = text.partition("<keyframe>")[0] + "</mujoco>"
+    tree.write_text(text)
+    with pytest.raises(InputError, match=said):
+        Robot.from_mjcf(tree, **LACKS)
+
+
+def test_a_file_without_joints_is_no_robot(tmp_path: Path) -> None:
+    path = tmp_path / "stone.xml"
+    path.write_text('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+    with pytest.raises(InputError, match="no hinges or slides"):
+        read_mjcf(path)
+    with pytest.raises(InputError, match="no such file"):
+        read_mjcf(tmp_path / "none.xml")
+
+
+def test_a_problem_file_can_name_an_mjcf(tree: Path) -> None:
+    data: dict[str, Any] = {
+        "problem": {
+            "striker": "fist",
+            "point_m": [0.2, 0.6, 0.6],
+            "normal": [1.0, 0.0, 0.0],
+            "start": "home",
+        },
+        "robot": {
+            "mjcf": "tree.xml",
+            "floating": False,
+            "velocity_limit_rad_s": 4.0,
+            "torque_limit_N_m": {"lift": 100.0, "turn": 50.0},
+        },
+        "target": {"mass_kg": 1.0},
+        "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 100.0},
+    }
+    with pytest.raises(InputError, match="out of reach"):
+        problem_from_data(
+            {**data, "problem": {**data["problem"], "point_m": [9.0, 0.0, 0.0]}}, where=tree.parent / "p"
+        )
+    with pytest.raises(InputError, match="one of preset, urdf and mjcf"):
+        problem_from_data({**data, "robot": {**data["robot"], "urdf": "x"}}, where=tree.parent / "p")
+    with pytest.raises(InputError, match="srdf belongs to urdf"):
+        problem_from_data({**data, "robot": {**data["robot"], "srdf": "x"}}, where=tree.parent / "p")

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import is_plain_file
 from impactopt.errors import InputError, Mistakes, check_array, did_you_mean, raw_array, shortened
-from impactopt.robots.checks import HEAVIEST, check_frame
+from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame
 from impactopt.robots.parts import Striker
 
 Array = NDArray[np.float64]
@@ -340,3 +340,16 @@ def existing(path: str | PathLike[str], kind: str) -> str:
     if not is_plain_file(file):
         raise InputError(f"{kind} {shortened(str(file), 300)}: no such file")
     return str(file)
+
+
+def read_postures(model: pin.Model, given: Mapping[str, Mapping[str, float] | ArrayLike]) -> dict[str, Array]:
+    """The model's own postures, and these: configurations (nq,), or angles of some joints by name."""
+    found = reference_configurations(model)
+    postures = dict(found)
+    for name, value in given.items():
+        what = f"posture {name!r}"
+        if isinstance(value, Mapping):
+            postures[name] = set_joints(model, found.get(name, pin.neutral(model)), value, what)
+        else:
+            postures[name] = check_configuration(model, value, what)
+    return postures

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from impactopt.errors import InputError, Mistakes, check_array
+from impactopt.errors import Mistakes, check_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
@@ -321,56 +321,19 @@ class Robot:
 
     def with_tool(self, tool: Tool) -> Robot:
         """A copy of the robot that holds `tool`: its mass on the link, and a striker of its name."""
-        if tool.name in self.strikers:
-            raise InputError(f"robot {self.name!r} has a striker {tool.name!r} already; rename the tool")
-        model = tools.with_tool(self.model, tool)
-        source = self.source and dataclasses.replace(self.source, tools=(*self.source.tools, tool))
-        strikers = {**self.strikers, tool.name: tool.striker}
-        more: dict[str, Any] = {"strikers": strikers, "source": source, "tools": (*self.tools, tool)}
-        return dataclasses.replace(self, model=model, **more, **self._of_grip(model, tool))
+        return dataclasses.replace(self, **tools.holding(self, tool))
 
     def with_grip(self, name: str, grip: SoftGrip) -> Robot:
         """A copy of the robot that holds its tool of that name so softly, and no longer firmly."""
-        tool = build.pick("tool", name, {tool.name: tool for tool in self.tools}, self.name)
-        if tool.grip is not None:
-            raise InputError(f"robot {self.name!r} holds {name!r} softly already; give it one grip")
-        soft = dataclasses.replace(tool, grip=grip)
-        model = tools.with_tool(tools.let_go(self.model, tool), soft)
-        more: dict[str, Any] = {
-            "strikers": {**self.strikers, name: soft.striker},
-            "tools": tuple(soft if t is tool else t for t in self.tools),
-        }
-        if self.source is not None:
-            held = tuple(soft if t is tool else t for t in self.source.tools)
-            more["source"] = dataclasses.replace(self.source, tools=held)
-        return dataclasses.replace(self, model=model, **more, **self._of_grip(model, soft))
-
-    def _of_grip(self, model: Any, tool: Tool) -> dict[str, Any]:
-        """Numbers of all joints, and postures, with a soft grip's joint."""
-        if tool.grip is None:
-            return {}
-        joints = build.joint_names(model)
-        at, (torque, speed) = joints.index(tool.grip_joint), tools.grip_limits(tool.grip)
-        own = {
-            "kp": tool.grip.stiffness,
-            "kd": tool.grip.damping,
-            "torque_limit": torque,
-            "velocity_limit": speed,
-            "lower": -tool.grip.range,
-            "upper": tool.grip.range,
-        }
-        out: dict[str, Any] = {name: np.insert(getattr(self, name), at, x) for name, x in own.items()}
-        out["actuators"] = (*self.actuators[:at], Actuator(), *self.actuators[at:])
-        out["postures"] = {name: tools.mapped(self.model, model, q) for name, q in self.postures.items()}
-        return out
+        return dataclasses.replace(self, **tools.holding_softly(self, name, grip))
 
     @property
-    def passive(self) -> Any:
+    def passive(self) -> NDArray[np.bool_]:
         """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip: it has no
         gear.
         """
         grips = {tool.grip_joint for tool in self.tools if tool.grip is not None}
-        return np.array([name in grips for name in self.joint_names])
+        return np.array([name in grips for name in self.joint_names], dtype=bool)
 
     def with_actuators(self, actuators: Mapping[str, Actuator]) -> Robot:
         """A copy of the robot with these motors and gears, of joints by name or pattern.
@@ -431,13 +394,5 @@ class Robot:
         checks.check_stance(self.model, q, [(sole.name, sole.frame) for sole in chosen], height, tilt)
 
     def _read_postures(self, given: Mapping[str, Mapping[str, float] | ArrayLike]) -> dict[str, Array]:
-        found = build.reference_configurations(self.model)
-        postures = dict(found)
-        for name, value in given.items():
-            what = f"posture {name!r}"
-            if isinstance(value, Mapping):
-                start = found.get(name, pin.neutral(self.model))
-                postures[name] = build.set_joints(self.model, start, value, what)
-            else:
-                postures[name] = checks.check_configuration(self.model, value, what)
+        postures = build.read_postures(self.model, given)
         return {name: self.place(q) for name, q in postures.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,58 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots import build, checks
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.parts import SoftGrip, Tool
 
-__all__ = ["grip_limits", "let_go", "mapped", "with_tool", "without"]
+__all__ = ["grip_limits", "holding", "holding_softly", "let_go", "mapped", "with_tool", "without"]
 
 Array = NDArray[np.float64]
 GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip; no bound of a blow
+
+
+def holding(robot: Any, tool: Tool) -> dict[str, Any]:
+    """What changes of a `Robot` that takes a tool."""
+    if tool.name in robot.strikers:
+        raise InputError(f"robot {robot.name!r} has a striker {tool.name!r} already; rename the tool")
+    source = robot.source and replace(robot.source, tools=(*robot.source.tools, tool))
+    return {"source": source, "tools": (*robot.tools, tool), **_changes(robot, robot.model, tool)}
+
+
+def holding_softly(robot: Any, name: str, grip: SoftGrip) -> dict[str, Any]:
+    """What changes of a `Robot` that has held its tool of that name firmly."""
+    tool = build.pick("tool", name, {tool.name: tool for tool in robot.tools}, robot.name)
+    if tool.grip is not None:
+        raise InputError(f"robot {robot.name!r} holds {name!r} softly already; give it one grip")
+    soft = replace(tool, grip=grip)
+
+    def held(tools: tuple[Tool, ...]) -> tuple[Tool, ...]:
+        return tuple(soft if t is tool else t for t in tools)
+
+    source = robot.source and replace(robot.source, tools=held(robot.source.tools))
+    return {"source": source, "tools": held(robot.tools), **_changes(robot, let_go(robot.model, tool), soft)}
+
+
+def _changes(robot: Any, free: pin.Model, tool: Tool) -> dict[str, Any]:
+    """Its model, made of that without the tool, and strikers; with a soft grip's joint also numbers and
+    postures of all joints.
+    """
+    model = with_tool(free, tool)
+    out: dict[str, Any] = {"model": model, "strikers": {**robot.strikers, tool.name: tool.striker}}
+    if tool.grip is None:
+        return out
+    at, (torque, speed) = build.joint_names(model).index(tool.grip_joint), grip_limits(tool.grip)
+    own = {
+        "kp": tool.grip.stiffness,
+        "kd": tool.grip.damping,
+        "torque_limit": torque,
+        "velocity_limit": speed,
+        "lower": -tool.grip.range,
+        "upper": tool.grip.range,
+    }
+    out |= {name: np.insert(getattr(robot, name), at, x) for name, x in own.items()}
+    out["actuators"] = (*robot.actuators[:at], Actuator(), *robot.actuators[at:])
+    out["postures"] = {name: mapped(robot.model, model, q) for name, q in robot.postures.items()}
+    return out
 
 
 def with_tool(model: pin.Model, tool: Tool) -> pin.Model:

@@ -61,7 +61,7 @@ class Export:
         """By the names of their files, as a servo is to follow them: a joint that nothing drives, as a soft
         grip's, stays where its spring is at rest.
         """
-        springs = self.per_joint(self.robot.passive)
+        springs = self.robot.passive[self.order]
         of = {"motion": self.motion, **({} if self.missed is None else {"missed": self.missed})}
         return {name: springs_at_rest(motion, springs) for name, motion in of.items()}
 

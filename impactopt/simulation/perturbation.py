@@ -51,6 +51,10 @@ class Perturbation:
     torque_limit: float = 1.0
     period: float = 0.0
     delay: float = 0.0
+    push: float = 0.0
+    push_start: float = 0.0
+    push_time: float = 0.1
+    push_way: float = 0.0
 
     def __post_init__(self) -> None:
         most = {"distance": FARTHEST, **dict.fromkeys(("period", "delay", "floor_time"), SLOWEST)}

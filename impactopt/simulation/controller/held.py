@@ -26,20 +26,23 @@ class HeldDynamics:
 
     A (nv, n), a0 (nv,) : accelerations.  B (6 a sole, n), b0 : wrenches of the floor on the soles at their
     frames' origins, in world axes.  places : of the soles.  hand (3, nv) : Jacobian of the striking point.
+    back (6 a sole,) : the part of b0 that would bring soles back to where they stood.
     recoil (nv,) : how velocities change by a unit impulse against the normal.
     """
 
-    def __init__(self, robot: Robot, soles: tuple[str, ...], striker: str, normal: Array) -> None:
+    def __init__(self, robot: Robot, soles: tuple[str, ...], striker: str, normal: Array, q0: Array) -> None:
         self.robot, self.model, self.normal = robot, robot.model, normal
         self.data: Any = robot.model.createData()
         self._soles = [self.model.getFrameId(name) for name in soles]
         self._hand = self.model.getFrameId(striker)
         nv, n, rows = robot.nv, robot.n, 6 * len(soles)
-        self._left, self._right = np.zeros((nv + rows, nv + rows)), np.zeros((nv + rows, n + 2))
+        self._left, self._right = np.zeros((nv + rows, nv + rows)), np.zeros((nv + rows, n + 3))
         self._right[nv - n : nv, :n] = np.eye(n)
         self._none = np.zeros(nv)
+        pin.framesForwardKinematics(self.model, self.data, q0)
+        self._stood = [self.data.oMf[i].copy() for i in self._soles]
 
-    def look(self, q: Array, v: Array, force: float = 0.0) -> None:
+    def look(self, q: Array, v: Array, force: float = 0.0, bandwidth: float = 0.0) -> None:
         """Go to q (nq), v (nv), with a force [N] on the hand, against the normal."""
         model, data, nv, n = self.model, self.data, self.robot.nv, self.robot.n
         left, right = self._left, self._right
@@ -55,6 +58,11 @@ class HeldDynamics:
             J = pin.getFrameJacobian(model, data, i, _AXES)
             left[rows, :nv], left[:nv, rows] = J, -J.T
             right[rows, n] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
+            at, stood = self.places[-1], self._stood[k]
+            turned = pin.log3(at.rotation @ stood.rotation.T)
+            away = np.concatenate([at.translation - stood.translation, turned])
+            away[[0, 1, 5]] = 0.0  # a sole that has slid stays where it is
+            right[rows, n + 2] = -(bandwidth**2) * away - 2 * bandwidth * (J @ v)
         pin.updateFramePlacement(model, data, self._hand)
         self.hand = np.reshape(pin.getFrameJacobian(model, data, self._hand, _AXES), (6, nv))[:3]
         self.hand_place = np.array(data.oMf[self._hand].translation)
@@ -64,5 +72,7 @@ class HeldDynamics:
         right[:nv, n + 1] = -self.normal @ self.hand  # a unit force
         _, _, found, _ = dgesv(left, right)
         found[:, n] += force * found[:, n + 1]
-        self.A, self.a0, self.recoil = found[:nv, :n], found[:nv, n], found[:nv, n + 1]
-        self.B, self.b0 = found[nv:, :n], found[nv:, n]
+        self.A, self.a0 = found[:nv, :n], found[:nv, n] + found[:nv, n + 2]
+        self.recoil = found[:nv, n + 1]
+        self.B, self.b0 = found[nv:, :n], found[nv:, n] + found[nv:, n + 2]
+        self.back = found[nv:, n + 2]

@@ -48,6 +48,10 @@ class ControllerSettings(Described):
     hand: float = field(default=1.0, metadata=_weight("the hand"))
     posture: float = field(default=0.01, metadata=_weight("the posture"))
     torque: float = field(default=0.01, metadata=_weight("torques over their limits, against the plan's"))
+    wrench: float = field(default=10.0, metadata=_weight("the soles' wrenches over the robot's weight, against the plan's"))
+    sole_bandwidth: float = field(
+        default=25.0, metadata=about("of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000)
+    )
     blow: float = field(default=1000.0, metadata=_weight("torques in contact, against the plan's servos"))
     capture_gain: float = field(
         default=4.0, metadata=about("of the divergent component of motion", unit="1/s", least=0, most=1000)

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 WINDOW = 0.01  # [s] about the blow in which velocity errors are projected
 FILTER = 3e-3  # [s] of the hand's force
 TOUCH = 20.0  # [N] that the hand feels as a touch
+LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
 PRICE = 1e3  # of leaving the cones, per squared weight of the robot
 
 
@@ -46,7 +47,7 @@ class WholeBodyController:
         self.robot, self.scene, self.settings, self.kp, self.kd = robot, scene, settings, kp, kd
         self.limit = robot.torque_limit
         self.sensors = Sensors(robot, noise=settings.noise, rate=settings.rate, seed=settings.seed)
-        self.held = HeldDynamics(robot, scene.soles, scene.striker, scene.normal)
+        self.held = HeldDynamics(robot, scene.soles, scene.striker, scene.normal, np.asarray(reference.q[0]))
         self.data: Any = robot.model.createData()
         self.mass = float(pin.computeTotalMass(robot.model))
         self.weight = 9.81 * max(self.mass, 1e-9)
@@ -75,7 +76,7 @@ class WholeBodyController:
         self.felt += (1 - np.exp(-s.period / FILTER)) * (measured.force - self.felt)
         self.target.feel(t, measured.force > TOUCH)
         aim = self.target.at(t + ahead)
-        self.held.look(q, rates, self.felt)
+        self.held.look(q, rates, self.felt, s.sole_bandwidth)
         struck = self.settings.impact == "planned" and self.target.struck
         x = self._solve(q, rates, aim, self.settings.projects and self.target.near_blow(t, WINDOW), struck)
         torque = self.limit * x[:-1]
@@ -110,6 +111,9 @@ class WholeBodyController:
         if struck:  # what the plan counts on in contact
             feed = feed + self.kp * self.robot.kp * off[-n:] + self.kd * self.robot.kd * rate_error
         task(s.blow if struck else s.torque, np.eye(n), np.zeros(n), feed / self.limit)
+        if self.cones:
+            share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), len(self.cones))[:, None] / self.weight
+            task(s.wrench, share * B, share[:, 0] * held.back, share[:, 0] * (B @ (feed / self.limit)))
         P[n, n] = PRICE
         C, c = self._rows(B)
         low, high = -np.ones(n + 1), np.ones(n + 1)

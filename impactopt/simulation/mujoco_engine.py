@@ -48,8 +48,9 @@ class _Replay(MujocoRobot):
         self.scene, self.perturbation = perturbation.scene(scene), perturbation
         self.wbc: WholeBodyController | None = None
         if controller is not None:
+            world = perturbation
             self.wbc = WholeBodyController(
-                robot, reference, scene, controller, kp=perturbation.kp, kd=perturbation.kd
+                robot, reference, scene, controller, kp=world.kp, kd=world.kd, limit=world.torque_limit
             )
         solids = self.scene.solids
         near = solids.near(robot.model, reference)

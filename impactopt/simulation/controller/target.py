@@ -74,6 +74,11 @@ class Target:
             self.free = t
 
     @property
+    def before(self) -> bool:
+        """Whether the hand has felt nothing yet."""
+        return bool(np.isnan(self.felt))
+
+    @property
     def struck(self) -> bool:
         """Whether the hand is in contact, for the first time."""
         return bool(np.isfinite(self.felt) and np.isnan(self.free))

@@ -25,6 +25,7 @@ WINDOW = 0.01  # [s] about the blow in which velocity errors are projected
 FILTER = 3e-3  # [s] of the hand's force
 TOUCH = 20.0  # [N] that the hand feels as a touch
 LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
+LINEAR = 1e3
 PRICE = 1e3  # of leaving the cones, per squared weight of the robot
 
 
@@ -43,9 +44,10 @@ class WholeBodyController:
         *,
         kp: float = 1.0,
         kd: float = 1.0,
+        limit: float = 1.0,
     ) -> None:
         self.robot, self.scene, self.settings, self.kp, self.kd = robot, scene, settings, kp, kd
-        self.limit = robot.torque_limit
+        self.limit = limit * robot.torque_limit
         self.sensors = Sensors(robot, noise=settings.noise, rate=settings.rate, seed=settings.seed)
         self.held = HeldDynamics(robot, scene.soles, scene.striker, scene.normal, np.asarray(reference.q[0]))
         self.data: Any = robot.model.createData()
@@ -104,7 +106,7 @@ class WholeBodyController:
         w = s.hand_bandwidth
         away = aim.hand[0] - held.hand_place
         wanted = aim.hand[2] + self.kp * w**2 * away + self.kd * 2 * w * (held.hand @ lag)
-        task(0.0 if struck else s.hand, held.hand @ A, held.hand @ held.a0 + held.hand_drift, wanted)
+        task(s.hand if self.target.before else 0.0, held.hand @ A, held.hand @ held.a0 + held.hand_drift, wanted)
         if self.robot.floating and self.cones:
             self._momentum(q, v, lag, aim, B, task)
         feed = aim.torque
@@ -114,7 +116,7 @@ class WholeBodyController:
         if self.cones:
             share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), len(self.cones))[:, None] / self.weight
             task(s.wrench, share * B, share[:, 0] * held.back, share[:, 0] * (B @ (feed / self.limit)))
-        P[n, n] = PRICE
+        P[n, n], g[n] = PRICE, LINEAR
         C, c = self._rows(B)
         low, high = -np.ones(n + 1), np.ones(n + 1)
         low[n], high[n] = 0.0, 1e3

@@ -46,7 +46,7 @@ class ControllerSettings(Described):
     com: float = field(default=10.0, metadata=_weight("the centre of mass"))
     angular_momentum: float = field(default=1.0, metadata=_weight("the angular momentum"))
     hand: float = field(default=1.0, metadata=_weight("the hand"))
-    posture: float = field(default=0.01, metadata=_weight("the posture"))
+    posture: float = field(default=0.001, metadata=_weight("the posture"))
     torque: float = field(default=0.01, metadata=_weight("torques over their limits, against the plan's"))
     wrench: float = field(default=10.0, metadata=_weight("the soles' wrenches over the robot's weight, against the plan's"))
     sole_bandwidth: float = field(

@@ -146,6 +146,7 @@ class WholeBodyController:
         wanted[:3] = aim.com[2] + self.kp * omega * k * (aim.com[0] - com) + self.kd * (omega + k) * error[:3] / mass
         wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
         weight = np.repeat([s.com, s.angular_momentum], 3)
+        weight[2] *= float(__import__("os").environ.get("VERT", "1"))
         task(weight, rows, now, wanted)
 
     def _cone(self, corners: Array) -> Array:

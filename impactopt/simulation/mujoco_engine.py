@@ -138,8 +138,10 @@ class _Replay(MujocoRobot):
     def shove(self, t: float) -> None:
         """The perturbation's push at the base, if it is on at a time [s]."""
         world = self.perturbation
-        on = self.floating and world.push_start <= t < world.push_start + world.push_time
-        self.data.xfrc_applied[1, :2] = on * world.push * np.array([np.cos(world.push_way), np.sin(world.push_way)])
+        on = world.push_start <= t < world.push_start + world.push_time
+        way = np.array([np.cos(world.push_way), np.sin(world.push_way)])
+        if self.floating:
+            self.data.xfrc_applied[1, :2] = on * world.push * way
 
     def place_target(self) -> None:
         """Its body goes with it; what a blow has broken is put away."""
@@ -249,6 +251,7 @@ def simulate_mujoco(
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
         default: it does not notice.
+    controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 
     A fall ends the simulation early; the result says so.

@@ -9,7 +9,7 @@
 * whole_body.py the controller
 """
 
-from impactopt.simulation.controller.settings import ControllerSettings
+from impactopt.simulation.controller.settings import CONTROLLERS, ControllerSettings, controller_of
 from impactopt.simulation.controller.whole_body import WholeBodyController
 
-__all__ = ["ControllerSettings", "WholeBodyController"]
+__all__ = ["CONTROLLERS", "ControllerSettings", "WholeBodyController", "controller_of"]

@@ -1,7 +1,7 @@
 """Accelerations and sole wrenches as functions of the torques, of a robot that stands on its soles.
 
-H a + h = S' tau + J' w and J a + dJ/dt v = 0 give a = A tau + a0 and w = B tau + b0. So a QP over accelerations
-and wrenches under the equation of motion has as many unknowns as there are torques.
+H a + h = S' tau + J' w and J a + dJ/dt v = 0 give a = A tau + a0 and w = B tau + b0. So a QP over
+accelerations and wrenches under the equation of motion has as many unknowns as there are torques.
 """
 
 from __future__ import annotations
@@ -66,9 +66,7 @@ class HeldDynamics:
         pin.updateFramePlacement(model, data, self._hand)
         self.hand = np.reshape(pin.getFrameJacobian(model, data, self._hand, _AXES), (6, nv))[:3]
         self.hand_place = np.array(data.oMf[self._hand].translation)
-        self.hand_drift = np.array(
-            pin.getFrameClassicalAcceleration(model, data, self._hand, _AXES).linear
-        )
+        self.hand_drift = np.array(pin.getFrameClassicalAcceleration(model, data, self._hand, _AXES).linear)
         right[:nv, n + 1] = -self.normal @ self.hand  # a unit force
         _, _, found, _ = dgesv(left, right)
         found[:, n] += force * found[:, n + 1]

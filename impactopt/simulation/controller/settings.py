@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from impactopt.contact.fields import Described, about, abouts
-from impactopt.errors import InputError, check_array, check_whole
+from impactopt.errors import InputError, check_array, check_whole, did_you_mean
 
-__all__ = ["ControllerSettings"]
+__all__ = ["CONTROLLERS", "ControllerSettings", "controller_of"]
+
+CONTROLLERS = ("servo", "wbc")
 
 IMPACTS = ("planned", "none", "project", "spread", "both")
 
@@ -29,7 +31,8 @@ class ControllerSettings(Described):
         default=1000.0, metadata=about("of control", unit="Hz", least=100, most=10_000, key="rate_Hz")
     )
     delay: float = field(
-        default=1e-3, metadata=about("from reading the sensors to setting the torque", unit="s", least=0, most=0.1)
+        default=1e-3,
+        metadata=about("from reading the sensors to setting the torque", unit="s", least=0, most=0.1),
     )
     noise: float = field(
         default=1.0, metadata=about("factor of the sensors' errors; 0: none", least=0, most=100)
@@ -38,8 +41,9 @@ class ControllerSettings(Described):
     impact: str = field(
         default="planned",
         metadata=about(
-            "about the blow: velocity errors that an impulse at the hand makes are left out (project), or the "
-            "reference before it goes on until the hand is free again, and then that after it begins (spread)",
+            "about the blow: feedback on (none); without what an impulse at the hand does to velocities "
+            "(project); the motion before it goes on until the hand is free (spread); both; in contact the "
+            "joints' servos, which the plan counts on, and both (planned)",
             choices=IMPACTS,
         ),
     )
@@ -48,9 +52,12 @@ class ControllerSettings(Described):
     hand: float = field(default=1.0, metadata=_weight("the hand"))
     posture: float = field(default=0.001, metadata=_weight("the posture"))
     torque: float = field(default=0.01, metadata=_weight("torques over their limits, against the plan's"))
-    wrench: float = field(default=10.0, metadata=_weight("the soles' wrenches over the robot's weight, against the plan's"))
+    wrench: float = field(
+        default=10.0, metadata=_weight("the soles' wrenches over the robot's weight, against the plan's")
+    )
     sole_bandwidth: float = field(
-        default=25.0, metadata=about("of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000)
+        default=25.0,
+        metadata=about("of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000),
     )
     blow: float = field(default=1000.0, metadata=_weight("torques in contact, against the plan's servos"))
     capture_gain: float = field(
@@ -82,7 +89,9 @@ class ControllerSettings(Described):
             value = getattr(self, f.name)
             if told.choices:
                 if value not in told.choices:
-                    raise InputError(f"controller: {f.name} is {value!r}; give one of {', '.join(told.choices)}")
+                    raise InputError(
+                        f"controller: {f.name} is {value!r}; give one of {', '.join(told.choices)}"
+                    )
             elif f.name in ("seed", "iterations"):
                 check_whole(f"controller: {f.name}", value, least=int(told.least or 0), most=10**9)
             elif not told.allows(float(check_array(f"controller: {f.name}", value, ()))):
@@ -100,3 +109,24 @@ class ControllerSettings(Described):
     @property
     def spreads(self) -> bool:
         return self.impact in ("spread", "both", "planned")
+
+
+def controller_of(
+    chosen: str | ControllerSettings | None, settings: ControllerSettings | None = None
+) -> ControllerSettings | None:
+    """Settings of the whole-body controller; None: the joints' servo.
+
+    chosen : "servo" (or None), "wbc", which has `settings`, or settings themselves.
+
+    Raises
+    ------
+    InputError : there is no such controller.
+    """
+    if isinstance(chosen, ControllerSettings):
+        return chosen
+    if chosen is None or chosen == "servo":
+        return None
+    if chosen != "wbc":
+        meant = did_you_mean(str(chosen), CONTROLLERS)
+        raise InputError(f"unknown controller {chosen!r}{meant}: there are {', '.join(CONTROLLERS)}")
+    return settings if settings is not None else ControllerSettings()

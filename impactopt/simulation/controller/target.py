@@ -63,7 +63,19 @@ class Target:
         rate = pin.getFrameVelocity(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear
         gain = pin.getFrameClassicalAcceleration(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear
         com = data.com[0]
-        parts = (v, a, r.torque[k], com, h.linear / mass, dh.linear / mass, h.angular, dh.angular, at, rate, gain)
+        parts = (
+            v,
+            a,
+            r.torque[k],
+            com,
+            h.linear / mass,
+            dh.linear / mass,
+            h.angular,
+            dh.angular,
+            at,
+            rate,
+            gain,
+        )
         return np.concatenate(parts)
 
     def feel(self, t: float, touching: bool) -> None:

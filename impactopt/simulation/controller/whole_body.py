@@ -1,4 +1,4 @@
-"""The whole-body controller: at every sample a QP for the torques that track the plan and keep the soles down."""
+"""The whole-body controller: at every sample a QP for the torques that track the plan on its soles."""
 
 from __future__ import annotations
 
@@ -106,7 +106,12 @@ class WholeBodyController:
         w = s.hand_bandwidth
         away = aim.hand[0] - held.hand_place
         wanted = aim.hand[2] + self.kp * w**2 * away + self.kd * 2 * w * (held.hand @ lag)
-        task(s.hand if self.target.before else 0.0, held.hand @ A, held.hand @ held.a0 + held.hand_drift, wanted)
+        task(
+            s.hand if self.target.before else 0.0,
+            held.hand @ A,
+            held.hand @ held.a0 + held.hand_drift,
+            wanted,
+        )
         if self.robot.floating and self.cones:
             self._momentum(q, v, lag, aim, B, task)
         feed = aim.torque
@@ -130,8 +135,7 @@ class WholeBodyController:
         held, s, model, data = self.held, self.settings, self.robot.model, self.data
         Ag = pin.ccrba(model, data, q, v)
         mass, com = self.mass, data.com[0]
-        rate = data.hg.linear / mass
-        lift = np.zeros((6, 6 * len(self.cones)))
+        lift: Array = np.zeros((6, 6 * len(self.cones)))
         for k, place in enumerate(held.places):
             lift[:3, 6 * k : 6 * k + 3] = np.eye(3)
             lift[3:, 6 * k : 6 * k + 3] = pin.skew(place.translation - com)
@@ -143,10 +147,11 @@ class WholeBodyController:
         k, omega = s.capture_gain, np.sqrt(9.81 / max(com[2], 0.1))
         error = Ag @ lag
         wanted = np.zeros(6)
-        wanted[:3] = aim.com[2] + self.kp * omega * k * (aim.com[0] - com) + self.kd * (omega + k) * error[:3] / mass
+        wanted[:3] = (
+            aim.com[2] + self.kp * omega * k * (aim.com[0] - com) + self.kd * (omega + k) * error[:3] / mass
+        )
         wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
         weight = np.repeat([s.com, s.angular_momentum], 3)
-        weight[2] *= float(__import__("os").environ.get("VERT", "1"))
         task(weight, rows, now, wanted)
 
     def _cone(self, corners: Array) -> Array:
@@ -198,7 +203,10 @@ class WholeBodyController:
         self.acceleration = held.A @ torque + held.a0
         wrench = held.B @ torque + held.b0
         for k, (place, corners) in enumerate(zip(held.places, self.scene.corners, strict=True)):
-            force, moment = place.rotation.T @ wrench[6 * k : 6 * k + 3], place.rotation.T @ wrench[6 * k + 3 : 6 * k + 6]
+            force, moment = (
+                place.rotation.T @ wrench[6 * k : 6 * k + 3],
+                place.rotation.T @ wrench[6 * k + 3 : 6 * k + 6],
+            )
             self.loads[k] = max(force[2], 1e-3 * self.weight)
             low, high = corners.min(axis=0), corners.max(axis=0)
             pressed = np.array([-moment[1], moment[0]]) / self.loads[k]

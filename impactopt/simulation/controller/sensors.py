@@ -1,8 +1,8 @@
 """What encoders, an inertial unit and the hand's force sensor tell of the robot, with their errors.
 
 The inertial unit is Xsens' MTi-300 (data sheet of Movella, May 2023): roll and pitch within 0.2 degrees RMS,
-gyroscope with 0.01 deg/s/sqrt(Hz) and a bias of 10 deg/h. Encoders behind the gears have 19 bits, and rates are
-their differences over a sample; the hand's force has 2 N: both are assumptions.
+gyroscope with 0.01 deg/s/sqrt(Hz) and a bias of 10 deg/h. Encoders behind the gears have 19 bits, and rates
+are their differences over a sample; the hand's force has 2 N: both are assumptions.
 """
 
 from __future__ import annotations

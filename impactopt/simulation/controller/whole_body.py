@@ -144,11 +144,13 @@ class WholeBodyController:
         rows, now = lift @ B, lift @ held.b0
         now[:3] += model.gravity.linear
         # the divergent component of motion: com + rate / omega
-        k, omega = s.capture_gain, np.sqrt(9.81 / max(com[2], 0.1))
+        gain, omega = s.capture_gain, np.sqrt(9.81 / max(com[2], 0.1))
         error = Ag @ lag
         wanted = np.zeros(6)
         wanted[:3] = (
-            aim.com[2] + self.kp * omega * k * (aim.com[0] - com) + self.kd * (omega + k) * error[:3] / mass
+            aim.com[2]
+            + self.kp * omega * gain * (aim.com[0] - com)
+            + self.kd * (omega + gain) * error[:3] / mass
         )
         wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
         weight = np.repeat([s.com, s.angular_momentum], 3)
@@ -174,7 +176,7 @@ class WholeBodyController:
         for turn in (1, -1):
             for a in (1, -1):
                 for b in (1, -1):
-                    f, m = [a * Y, b * X, mu * (X + Y)], [turn * a * mu, turn * b * mu, turn]
+                    f, m = [a * Y, b * X, mu * (X + Y)], [-turn * a * mu, -turn * b * mu, turn]
                     rows.append([*f, *m])
         out = np.array(rows, dtype=float) @ shift
         edges = [[0, 0, -c, n[1], -n[0], 0] for n, c in zip(inward, least, strict=True)]

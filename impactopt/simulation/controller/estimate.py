@@ -55,6 +55,6 @@ class StateEstimate:
             at = pin.updateFramePlacement(model, data, i)
             place += part * (stood.act(point) - at.act(point))
             moves = pin.getFrameVelocity(model, data, i, pin.LOCAL)
-            speed -= part * (at.rotation @ (moves.linear + np.cross(moves.angular, point)))
+            speed -= part * (at.rotation @ (moves.linear - pin.skew(point) @ moves.angular))
         q[:3], v[:3] = place, measured.rotation.T @ speed
         return q, v

@@ -45,15 +45,15 @@ class Target:
         self.time = np.asarray(reference.time)
         self.q, self.v = np.asarray(reference.q), np.asarray(reference.v)
         self.contact = float(reference.contact_start), float(reference.contact_end)
-        rows = [self._row(reference, k, striker) for k in range(len(self.time))]
-        self.rows = np.array(rows)
+        data = self.model.createData()
+        self.rows = np.array([self._row(data, reference, k, striker) for k in range(len(self.time))])
         self.felt = self.free = np.nan  # [s] when the hand began and ceased to feel a force
         jump = np.flatnonzero(np.diff(self.time) == 0)
         after = jump[self.time[jump] >= self.contact[1] - 1e-9]
         self.last = int(after[0]) if after.size else len(self.time) - 1  # of the motion before
 
-    def _row(self, r: Any, k: int, striker: str) -> Array:
-        model, data = self.model, self.model.createData()
+    def _row(self, data: Any, r: Any, k: int, striker: str) -> Array:
+        model = self.model
         q, v, a = r.q[k], r.v[k], r.a[k]
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
         mass = max(float(pin.computeTotalMass(model)), 1e-9)

@@ -78,12 +78,16 @@ class _Replay(MujocoRobot):
         self.start(self.reference_q[0])
 
     def follow(self, reference: Any) -> None:
-        """What the servo, or the controller, follows from now on."""
+        """What the servo follows from now on."""
         world = self.perturbation
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
+
+    def miss(self, reference: Any) -> None:
+        """What they follow from now on, as nothing is hit."""
+        self.follow(reference)
         if self.wbc is not None:
-            self.wbc.follow(reference)
+            self.wbc.miss(reference)
 
     def asked(self, t: float, force: float) -> tuple[Array, Array]:
         """Torque demand (n,) [N m] at a time [s], and what saturation leaves of it."""
@@ -284,7 +288,7 @@ def simulate_mujoco(
             t = k * step
             mujoco.mj_step1(model, data)
             if missed is not None and t >= missed.contact_end and not touches.intervals:
-                replay.follow(missed)
+                replay.miss(missed)
                 servo, missed = replay.servo, None
             if k % hold == 0:
                 asked = replay.asked(t, force)

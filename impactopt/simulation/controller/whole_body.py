@@ -25,14 +25,15 @@ WINDOW = 0.01  # [s] about the blow in which velocity errors are projected
 FILTER = 3e-3  # [s] of the hand's force
 TOUCH = 20.0  # [N] that the hand feels as a touch
 LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
-LINEAR = 1e3
-PRICE = 1e3  # of leaving the cones, per squared weight of the robot
+PRICE, SQUARE = 1e3, 1e3  # of leaving the cones, over the robot's weight: linear, and of its square
 
 
 class WholeBodyController:
-    """torque(t, q, v, touching) of a robot on a scene's soles that follows a reference.
+    """Torques of a robot on a scene's soles that follows a reference.
 
-    kp, kd : factors of the feedback's stiffness and damping.  seconds : that the QPs took, processor time.
+    reference : as of :class:`impactopt.transcription.plan.Trajectory`.
+    kp, kd : factors of the feedback's stiffness and damping.  limit : of the torque limits, which it knows.
+    seconds : of processor time that each QP took.
     """
 
     def __init__(
@@ -57,15 +58,15 @@ class WholeBodyController:
         rows = sum(len(c) for c in self.cones)
         self.qp = TorqueQP(robot.n + 1, rows, iterations=settings.iterations)
         self.seconds: list[float] = []
-        self.follow(reference)
+        self.target = Target(robot, reference, scene.striker, spread=settings.spreads)
         self.estimate = StateEstimate(robot, scene.soles, np.asarray(reference.q[0]))
         self.loads, self.points = np.ones(len(scene.soles)), np.zeros((len(scene.soles), 3))
         self.acceleration = np.zeros(robot.nv)
         self.felt = 0.0  # [N] at the hand, filtered
 
-    def follow(self, reference: Any) -> None:
-        """What it tracks from now on."""
-        self.target = Target(self.robot, reference, self.scene.striker, spread=self.settings.spreads)
+    def miss(self, reference: Any) -> None:
+        """What it tracks from now on, as it has hit nothing."""
+        self.target = Target(self.robot, reference, self.scene.striker, spread=False)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, force: float) -> Array:
         """Torque demand (n,) [N m] at a time [s], from what the sensors make of the true state."""
@@ -121,7 +122,7 @@ class WholeBodyController:
         if self.cones:
             share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), len(self.cones))[:, None] / self.weight
             task(s.wrench, share * B, share[:, 0] * held.back, share[:, 0] * (B @ (feed / self.limit)))
-        P[n, n], g[n] = PRICE, LINEAR
+        P[n, n], g[n] = SQUARE, PRICE
         C, c = self._rows(B)
         low, high = -np.ones(n + 1), np.ones(n + 1)
         low[n], high[n] = 0.0, 1e3

@@ -73,7 +73,7 @@ class ControllerSettings(Described):
         default=15.0, metadata=about("of the posture's feedback", unit="rad/s", least=0, most=1000)
     )
     friction: float = field(
-        default=0.7, metadata=about("coefficient between soles and floor that it counts on", above=0, most=10)
+        default=0.6, metadata=about("coefficient between soles and floor that it counts on", above=0, most=10)
     )
     cop_margin: float = field(
         default=0.003,

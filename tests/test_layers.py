@@ -65,6 +65,7 @@ def test_engines_share_no_code_with_the_planner() -> None:
     names = ("result", "servo", "soles", "struck", "touch", "perturbation", "motors")
     robots = ("mujoco_world", "mujoco_robot", "pinocchio_robot")
     shared = [PACKAGE / "simulation" / f"{name}.py" for name in (*names, *robots)]
+    shared += sorted((PACKAGE / "simulation" / "controller").glob("*.py"))
     for file in [*engines, *shared]:
         assert rooms_imported(file) <= ENGINE, file
         assert not [name for name in imports(file) if "rigid_body" in name], file

@@ -12,6 +12,12 @@ import typer
 from impactopt.cli.options import AsJson, OtherProblem, Quiet, Settings, Verbose, check_loudness
 from impactopt.report.plain_errors import plain_errors
 
+
+class Controller(str, enum.Enum):
+    servo = "servo"
+    wbc = "wbc"
+
+
 FELL = 1  # exit code
 
 
@@ -37,6 +43,10 @@ def validate(
     animation: Annotated[
         Path | None, typer.Option(metavar="FILE.gif", help="Draw the robot's motion, slow around contact.")
     ] = None,
+    controller: Annotated[
+        Controller,
+        typer.Option(help="servo: of the joints; wbc: whole-body controller, as in the file's [controller]."),
+    ] = Controller.servo,
     settings: Settings = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -68,6 +78,10 @@ def validate(
     delay: Annotated[
         float, typer.Option(metavar="S", help="Delay from reading joints to setting torques.")
     ] = 0.0,
+    push: Annotated[float, typer.Option(metavar="N", help="Level push on the base.")] = 0.0,
+    push_start: Annotated[float, typer.Option(metavar="S", help="When it begins.")] = 0.0,
+    push_time: Annotated[float, typer.Option(metavar="S", help="How long it lasts.")] = 0.1,
+    push_way: Annotated[float, typer.Option(metavar="RAD", help="Its angle from x, to the left.")] = 0.0,
 ) -> None:
     """Replay a result with nothing held, as planned or with perturbations: does the robot stand?
 
@@ -97,6 +111,10 @@ def validate(
             torque_limit=torque_limit,
             period=period,
             delay=delay,
+            push=push,
+            push_start=push_start,
+            push_time=push_time,
+            push_way=push_way,
         )
         directory = None if out is None else make_directory(out)
         if animation is not None:
@@ -106,7 +124,9 @@ def validate(
         with SolveConsole(stderr, quiet=quiet, verbose=verbose) as progress:
             planned = load_planned(result, problem_file=problem, settings=changes)
             progress.say(f"{result} is read; replaying it in {engine.value}")
-            done = replay(planned, engine=engine.value, perturbation=world, **options)
+            done = replay(
+                planned, engine=engine.value, perturbation=world, controller=controller.value, **options
+            )
             if directory is not None:
                 from impactopt.report.pictures import save_pictures
 

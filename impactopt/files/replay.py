@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,12 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
-from impactopt.files.problem_file import parse_problem_file, read_problem_file
+from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
 from impactopt.planning.solution import gear_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
 from impactopt.simulation.accuracy import check_steps
+from impactopt.simulation.controller import ControllerSettings, controller_of
 from impactopt.transcription.plan import Trajectory
 
 __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "replay"]
@@ -27,13 +28,14 @@ __all__ = ["Planned", "Replay", "has_mujoco", "load_planned", "problem_of", "rep
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Planned:
     """What there is to replay: a record, its problem, the reference that the servo is to follow, and the one
-    that it goes on with if it hits nothing, where the plan has one.
+    that it goes on with if it hits nothing, where the plan has one; settings of a whole-body controller.
     """
 
     record: Record
     problem: ImpactProblem
     reference: Trajectory
     missed: Trajectory | None = None
+    controller: ControllerSettings = field(default_factory=ControllerSettings)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +78,8 @@ def load_planned(
         usual = "it is a strike, the blow alone" if strike else "the solve was stopped before there was one"
         note = record.summary.get("note", usual)
         raise InputError(f"{result} holds no motion to replay: {note}")
-    problem = problem_of(record, Path(result), problem_file, settings)
+    file = _problem_file(record, Path(result), problem_file, settings)
+    problem = _built(file, Path(result), given=problem_file is not None)
     a, robot = record.arrays, problem.robot
     if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
         raise InputError(
@@ -84,7 +87,13 @@ def load_planned(
             "solve again, or give the file of its problem with --problem"
         )
     missed = _trajectory(record, "missed") if "missed_time" in a else None
-    return Planned(record=record, problem=problem, reference=_trajectory(record, "reference"), missed=missed)
+    return Planned(
+        record=record,
+        problem=problem,
+        reference=_trajectory(record, "reference"),
+        missed=missed,
+        controller=file.controller,
+    )
 
 
 def _trajectory(record: Record, prefix: str) -> Trajectory:
@@ -105,27 +114,56 @@ def problem_of(
     ------
     InputError : the record has no problem file, or it cannot be built again.
     """
+    file = _problem_file(record, result, problem_file, settings)
+    return _built(file, result, given=problem_file is not None)
+
+
+def _problem_file(
+    record: Record,
+    result: Path,
+    problem_file: str | os.PathLike[str] | None,
+    settings: Mapping[str, Any] | None,
+) -> ProblemFile:
     if problem_file is not None:
-        return read_problem_file(problem_file, settings).build()
+        return read_problem_file(problem_file, settings)
     if not record.problem:
         raise InputError(f"{result} holds no problem file: give it with --problem FILE")
     path = record.problem_path or result / "problem.toml"
     try:
-        return parse_problem_file(record.problem, path, settings).build()
+        return parse_problem_file(record.problem, path, settings)
     except InputError as error:
-        raise InputError(
-            f"the problem in {result} cannot be built again ({error}); if its files have moved, give the "
-            "problem file with --problem FILE"
-        ) from error
+        raise _not_again(result, error) from error
+
+
+def _built(file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
+    """given : the file was, and is not the record's own text."""
+    try:
+        return file.build()
+    except InputError as error:
+        if given:
+            raise
+        raise _not_again(result, error) from error
+
+
+def _not_again(result: Path, error: InputError) -> InputError:
+    return InputError(
+        f"the problem in {result} cannot be built again ({error}); if its files have moved, give the "
+        "problem file with --problem FILE"
+    )
 
 
 def replay(
-    planned: Planned, *, engine: str = "mujoco", perturbation: Perturbation | None = None, **options: Any
+    planned: Planned,
+    *,
+    engine: str = "mujoco",
+    perturbation: Perturbation | None = None,
+    controller: str = "servo",
+    **options: Any,
 ) -> Replay:
     """Follow the plan's reference in an engine; "mujoco" lets the robot slip, lift its soles and fall.
 
-    perturbation : where the world differs from what was planned ("mujoco" only).  options : of the engine,
-        such as ``step`` [s].
+    perturbation : where the world differs from what was planned ("mujoco" only).  controller : "servo",
+        or "wbc" ("mujoco" only).  options : of the engine, such as ``step`` [s].
 
     Raises
     ------
@@ -137,6 +175,7 @@ def replay(
         options["perturbation"] = world
     if engine == "mujoco" and planned.missed is not None:
         options["missed"] = planned.missed
+    options["controller"] = controller_of(controller, planned.controller)
     problem = planned.problem
     simulation = simulate(problem, planned.reference, engine=engine, **options)
     check_steps(simulation, options.get("step"))
@@ -146,6 +185,7 @@ def replay(
             polygon=scene_of(problem).polygon,
             planned_impulse=float(planned.record.summary["impulse_Ns"]),
         )
+        | {"controller": controller}
     )
     kept = {n: v for n, v in planned.record.arrays.items() if not n.startswith("replayed_")}
     kept |= {name: np.asarray(value) for name, value in replay_arrays(simulation).items()}

@@ -1,5 +1,6 @@
 """Re-simulation of plans in full dynamics, by engines that share no code with the planner."""
 
+from impactopt.simulation.controller import ControllerSettings
 from impactopt.simulation.engines import ENGINES, simulate
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.perturbation import Perturbation
@@ -9,6 +10,7 @@ from impactopt.simulation.scene import scene_of
 
 __all__ = [
     "ENGINES",
+    "ControllerSettings",
     "Perturbation",
     "Scene",
     "Simulation",

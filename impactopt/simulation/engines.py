@@ -9,6 +9,7 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.accuracy import with_step_error
 from impactopt.simulation.clearing import with_clearance
+from impactopt.simulation.controller import controller_of
 from impactopt.simulation.mujoco_engine import simulate_mujoco
 from impactopt.simulation.pinocchio_engine import simulate_pinocchio
 from impactopt.simulation.result import Simulation
@@ -31,7 +32,7 @@ def simulate(
     """Re-simulate a reference for a problem: "pinocchio" holds the soles, "mujoco" holds nothing.
 
     reference : as of :class:`impactopt.transcription.plan.Trajectory`.  options : of the engine, such as
-        ``step`` [s].
+        ``step`` [s]; of "mujoco" also ``controller``, "servo" or "wbc", or its settings.
 
     Raises
     ------
@@ -43,6 +44,10 @@ def simulate(
         )
     run = ENGINES[engine]
     known = set(run.__kwdefaults__ or {})
+    if "controller" in options:
+        options["controller"] = controller_of(options["controller"])
+        if "controller" not in known and options.pop("controller") is not None:
+            raise InputError(f"engine {engine!r} has the joints' servo only; take engine 'mujoco'")
     for name in options:
         if name == "perturbation" and name not in known:
             raise InputError(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.besides import Besides
+from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.simulation.motors import CutWatch, Delay, Motors
@@ -37,9 +38,21 @@ LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s
 
 class _Replay(MujocoRobot):
     def __init__(
-        self, robot: Robot, reference: Any, scene: Scene, perturbation: Perturbation, solver: MujocoOptions
+        self,
+        robot: Robot,
+        reference: Any,
+        scene: Scene,
+        perturbation: Perturbation,
+        solver: MujocoOptions,
+        controller: ControllerSettings | None = None,
     ) -> None:
         self.scene, self.perturbation = perturbation.scene(scene), perturbation
+        self.wbc: WholeBodyController | None = None
+        if controller is not None:
+            world = perturbation
+            self.wbc = WholeBodyController(
+                robot, reference, scene, controller, kp=world.kp, kd=world.kd, limit=world.torque_limit
+            )
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
         super().__init__(robot, build_world(robot, self.scene, perturbation, solver, near), "striker")
@@ -71,6 +84,22 @@ class _Replay(MujocoRobot):
         world = self.perturbation
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
+
+    def miss(self, reference: Any) -> None:
+        """What they follow from now on, as nothing is hit."""
+        self.follow(reference)
+        if self.wbc is not None:
+            self.wbc.miss(reference)
+
+    def asked(self, t: float, force: float) -> tuple[Array, Array]:
+        """Torque demand (n,) [N m] at a time [s], and what saturation leaves of it."""
+        d = self.data
+        if self.wbc is None:
+            return self.servo.torque(t, d.qpos[self.place], d.qvel[self.dof])
+        _, v = self.state()
+        rotation = self.base_rotation() if self.floating else np.eye(3)
+        demand = self.wbc.torque(t, d.qpos[self.place], v, rotation, force)
+        return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
 
     def start(self, q: Array) -> None:
         self.put(q)
@@ -111,6 +140,14 @@ class _Replay(MujocoRobot):
         self.before = (speed, push.force)
         self.target, self.travel = push.state, push.travel
         return push
+
+    def shove(self, t: float) -> None:
+        """The perturbation's push at the base, if it is on at a time [s]."""
+        world = self.perturbation
+        on = world.push_start <= t < world.push_start + world.push_time
+        way = np.array([np.cos(world.push_way), np.sin(world.push_way)])
+        if self.floating:
+            self.data.xfrc_applied[1, :2] = on * world.push * way
 
     def place_target(self) -> None:
         """Its body goes with it; what a blow has broken is put away."""
@@ -209,6 +246,7 @@ def simulate_mujoco(
     record: int = 5,
     perturbation: Perturbation | None = None,
     missed: Any = None,
+    controller: ControllerSettings | None = None,
     until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, on free soles, and ``settle`` [s] beyond.
@@ -219,6 +257,7 @@ def simulate_mujoco(
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
         default: it does not notice.
+    controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 
     A fall ends the simulation early; the result says so.
@@ -230,12 +269,17 @@ def simulate_mujoco(
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
     world = perturbation if perturbation is not None else Perturbation()
-    replay = _Replay(robot, reference, scene, world, MujocoOptions(step, iterations, tolerance))
+    solver = MujocoOptions(step, iterations, tolerance)
+    replay = _Replay(robot, reference, scene, world, solver, controller)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
-    hold = max(1, round(world.period / step))
+    period, wait = world.period, world.delay
+    if controller is not None:
+        period, wait = period or controller.period, wait or controller.delay
+    hold = max(1, round(period / step))
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
-    lag = round(world.delay / step)
+    lag = round(wait / step)
     told = np.zeros((2, robot.n))  # what the servo tells the motors: demand, and what saturation leaves of it
+    force = 0.0
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
@@ -248,10 +292,10 @@ def simulate_mujoco(
             t = k * step
             mujoco.mj_step1(model, data)
             if missed is not None and t >= missed.contact_end and not touches.intervals:
-                replay.follow(missed)
+                replay.miss(missed)
                 servo, missed = replay.servo, None
             if k % hold == 0:
-                asked = servo.torque(t, data.qpos[replay.place], data.qvel[replay.dof])
+                asked = replay.asked(t, force)
                 # at rest before the start, it asked for the same
                 waiting.append((k + lag if k else 0, asked))
             while waiting and waiting[0][0] <= k:
@@ -269,6 +313,7 @@ def simulate_mujoco(
             force = push.force
             peak = max(peak, push.peak)
             replay.apply(torque, force)
+            replay.shove(t)
             touches.add(t, force, step, push.since)
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             replay.place_target()

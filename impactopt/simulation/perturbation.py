@@ -31,7 +31,8 @@ class Perturbation:
     kp, kd, torque_limit : of the servo, as factors of the robot's.
     period [s] : time between two samples of the servo, which holds its torques between them; 0: it samples in
         every step of the simulation.  delay [s] : from reading the joints to setting the torque. Both are
-        rounded to steps.
+    rounded to steps. With a whole-body controller 0 stands for its own.
+    push [N] : on the base, level, from push_start [s] for push_time [s], at an angle push_way [rad] from x.
 
     Raises
     ------
@@ -51,9 +52,16 @@ class Perturbation:
     torque_limit: float = 1.0
     period: float = 0.0
     delay: float = 0.0
+    push: float = 0.0
+    push_start: float = 0.0
+    push_time: float = 0.1
+    push_way: float = 0.0
 
     def __post_init__(self) -> None:
-        most = {"distance": FARTHEST, **dict.fromkeys(("period", "delay", "floor_time"), SLOWEST)}
+        most = {
+            "distance": FARTHEST,
+            **dict.fromkeys(("period", "delay", "floor_time", "push_start", "push_time"), SLOWEST),
+        }
         for f in fields(self):
             if f.name == "missing":
                 if not isinstance(self.missing, (bool, np.bool_)):
@@ -66,7 +74,7 @@ class Perturbation:
                     f"perturbation: {f.name}", getattr(self, f.name), (), most=most.get(f.name, LARGEST)
                 )
             )
-            if f.name != "distance" and value < 0:
+            if f.name not in ("distance", "push_way") and value < 0:
                 raise InputError(f"perturbation: {f.name} is {value:g}; give a number >= 0")
         if 0 < self.payload < LIGHTEST:
             raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,6 +18,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
 from impactopt.simulation import Perturbation, Scene, Simulation, scene_of, simulate_mujoco
 from impactopt.simulation.accuracy import check_steps, with_step_error
+from impactopt.simulation.controller import ControllerSettings
 from impactopt.simulation.mujoco_world import mujoco_module
 from impactopt.simulation.workers import map_on_workers
 
@@ -25,6 +27,7 @@ __all__ = ["PerturbationRanges", "Robustness", "draw_perturbations", "robustness
 Array = NDArray[np.float64]
 Z95 = 1.959964  # of the normal distribution: 95 % lie within
 STEP = 5e-4  # [s]: tells who stands as 1e-4 does, and costs a fifth
+MOST_SEED = 10**9
 MOST_DRAWS = 1_000_000  # each is a replay of a second
 LOGARITHMIC = ("mass", "stiffness", "kp", "kd")  # factors: half is as far from 1 as twice
 
@@ -212,6 +215,7 @@ class Shared:
     reference: Any
     scene: Scene
     step: float
+    controller: ControllerSettings | None = None
 
 
 def _simulate(
@@ -224,8 +228,13 @@ def _simulate(
 def replay(shared: Shared, perturbation: Perturbation) -> Row:
     """One draw; what goes wrong is its reason."""
     given = (shared.robot, shared.reference, shared.scene)
+    controller = shared.controller
+    if controller is not None:  # every draw has sensors of its own, whichever process replays it
+        draw = zlib.crc32(repr(perturbation).encode())
+        controller = replace(controller, seed=(controller.seed + draw) % MOST_SEED)
     try:
-        s = with_step_error(_simulate, *given, step=shared.step, perturbation=perturbation)
+        options = {"step": shared.step, "perturbation": perturbation, "controller": controller}
+        s = with_step_error(_simulate, *given, **options)
         check_steps(s, shared.step)
     except InputError as error:
         return Row(standing=False, reason=str(error))
@@ -259,6 +268,7 @@ def robustness(
     ranges: PerturbationRanges | None = None,
     workers: int = 2,
     step: float = STEP,
+    controller: ControllerSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Robustness:
     """Replay a reference in MuJoCo, on free soles, under drawn perturbations.
@@ -267,6 +277,7 @@ def robustness(
     draws, seed, ranges : as of :func:`draw_perturbations`; a wall has no mass, so none is drawn.
     workers : processes; the numbers do not depend on how many. A script that asks for more than 1 needs
         `if __name__ == "__main__":`.
+    controller : settings of a whole-body controller; None: the joints' servo.
     step [s] : of the simulation; shorter where the impulse needs it, as of `validate`.
     progress : called with how many replays are done, of how many.
 
@@ -289,7 +300,7 @@ def robustness(
     mujoco_module()
     if workers > 1:
         _check_travels(scene)
-    shared = Shared(robot=problem.robot, reference=reference, scene=scene, step=step)
+    shared = Shared(robot=problem.robot, reference=reference, scene=scene, step=step, controller=controller)
     rows = map_on_workers(replay, shared, perturbations, workers=workers, crashed=_crashed, progress=progress)
     return Robustness(
         perturbations=tuple(perturbations),

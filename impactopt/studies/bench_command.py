@@ -5,6 +5,7 @@ Exit codes: 0 done, 2 bad input, or nothing to measure.
 
 from __future__ import annotations
 
+import enum
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,14 @@ from click import get_current_context
 
 from impactopt.studies.report import Report, Say
 from impactopt.studies.running import show_reports
+
+
+class ControllerName(str, enum.Enum):
+    """servo: of the joints; wbc: a whole-body controller."""
+
+    servo = "servo"
+    wbc = "wbc"
+
 
 app = typer.Typer(
     name="bench",
@@ -30,6 +39,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn perturbations.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
+Controller = Annotated[ControllerName, typer.Option(help="What moves the joints in the replay.")]
 Compilers = Annotated[int, typer.Option(min=1, help="Processes that compile and collide.")]
 FEW_DRAWS = 10  # of the bench margins among all others, which has a dozen plans to replay
 FEW_PROBLEMS = 9  # of the bench zoo among all others
@@ -55,7 +65,7 @@ def _command(name: str) -> Callable[[Callable[..., None]], None]:
 
 
 @_command("truth")
-def _truth() -> None:
+def _truth(controller: Controller = ControllerName.servo) -> None:
     """Every problem of problems/ and variants of the demo: planned, replayed on held and on free soles."""
 
 
@@ -68,6 +78,7 @@ def _robustness(
     draws: Draws = 200,
     seed: Seed = 0,
     workers: Workers = 2,
+    controller: Controller = ControllerName.servo,
 ) -> None:
     """How often a plan stands, and how hard it hits, where target, servo and floor are not as planned."""
 
@@ -83,6 +94,7 @@ def _baselines(
     draws: Draws = 50,
     seed: Seed = 0,
     workers: Workers = 2,
+    controller: Controller = ControllerName.servo,
 ) -> None:
     """What people do today, on the same robot and in the same limits, beside our plans."""
 

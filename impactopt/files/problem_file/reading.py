@@ -32,6 +32,7 @@ from impactopt.files.problem_file.toml import (
 from impactopt.problem.checks import MANY, check_names
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.checks import check_legs
+from impactopt.simulation.controller import ControllerSettings
 
 __all__ = [
     "ProblemFile",
@@ -59,13 +60,14 @@ class ProblemFile:
     """A problem file whose text is sound.
 
     path, text : where it was read, and what it said, or says with its changes.  data : the same as tables.
-    solver : its [solver] section.
+    solver : its [solver] section.  controller : its [controller] section, or the defaults.
     """
 
     path: Path
     text: str
     data: Mapping[str, Any] = field(repr=False)
     solver: SolverSettings
+    controller: ControllerSettings
     content: File = field(repr=False)
     lines: Mapping[Place, int] = field(repr=False, default_factory=dict)
 
@@ -206,7 +208,10 @@ def _checked(data: Mapping[str, Any], path: Path, text: str, lines: Mapping[Plac
     for solver in {"ipopt", "sqp"} & given.keys():
         options[solver] = given.pop(solver)
     settings = SolverSettings(**given, options=options)
-    return ProblemFile(path=path, text=text, data=data, content=content, solver=settings, lines=lines)
+    controller = content.controller.build() if content.controller else ControllerSettings()
+    return ProblemFile(
+        path=path, text=text, data=data, content=content, solver=settings, controller=controller, lines=lines
+    )
 
 
 class _Collector:

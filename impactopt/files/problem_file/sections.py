@@ -42,6 +42,7 @@ from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.robots.robot import Robot
+from impactopt.simulation.controller import ControllerSettings
 
 ELEMENTS = ("compression", "restitution")  # keys of ImpactProblem.collision_elements
 
@@ -128,6 +129,7 @@ class CollisionSection(Section):
 
 ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
+ControllerSection: Any = section_of(ControllerSettings)
 
 
 class ObjectiveSection(Section):
@@ -159,6 +161,7 @@ class File(Section):
     objective: ObjectiveSection = optional("")
     terms: TermSections = optional("")
     solver: SolverSection = optional("")
+    controller: ControllerSection = optional("")
 
     def make_robot(self, folder: Path) -> Robot:
         """The robot of [robot], or the preset that [problem] names."""

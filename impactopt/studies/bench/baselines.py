@@ -19,9 +19,9 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Balance
-from impactopt.simulation import Simulation, simulate
+from impactopt.simulation import ControllerSettings, Simulation, simulate
 from impactopt.simulation.robustness import robustness
-from impactopt.studies.bench.planning import DEMO, plan_of
+from impactopt.studies.bench.planning import DEMO, controller_in, plan_of
 from impactopt.studies.report import Report, Say, columns_table
 from impactopt.transcription.plan import Trajectory
 
@@ -40,15 +40,24 @@ class Method:
     impulse: float
 
 
-def run(say: Say, *, file: Path = DEMO, draws: int = 50, seed: int = 0, workers: int = 2) -> Report:
-    """One row a method; ``draws`` perturbations are drawn for each."""
-    rows = []
+def run(
+    say: Say,
+    *,
+    file: Path = DEMO,
+    draws: int = 50,
+    seed: int = 0,
+    workers: int = 2,
+    controller: str = "servo",
+) -> Report:
+    """One row a method; ``draws`` perturbations are drawn for each.  controller : "servo" or "wbc"."""
+    rows, settings = [], controller_in(file, controller)
     for name, make in methods(file, say):
         try:
-            rows.append(row(make(), say, draws, seed, workers))
+            rows.append(row(make(), say, draws, seed, workers, settings))
         except InputError as error:  # a method that finds no plan stays in
             say(f"{name}: {error}")
             rows.append({**dict.fromkeys(KEYS), "method": name, "reason": str(error), "standing": False})
+        rows[-1]["controller"] = controller
     title = f"what people do today, and ours: {file}, replayed on free soles"
     table = columns_table(title, COLUMNS, rows)
     numbers = {"rows": rows, "problem": str(file), "draws": draws, "seed": seed}
@@ -101,10 +110,17 @@ def _of(name: str, solution: Solution) -> Method:
     )
 
 
-def row(method: Method, say: Say, draws: int, seed: int, workers: int) -> dict[str, Any]:
+def row(
+    method: Method,
+    say: Say,
+    draws: int,
+    seed: int,
+    workers: int,
+    controller: ControllerSettings | None = None,
+) -> dict[str, Any]:
     """What a method promises, and what comes of it."""
     say(f"replaying {method.name}")
-    replay: Simulation = simulate(method.problem, method.reference, engine="mujoco")
+    replay: Simulation = simulate(method.problem, method.reference, engine="mujoco", controller=controller)
     limit = method.problem.robot.torque_limit
     out = {
         "method": method.name,
@@ -118,7 +134,13 @@ def row(method: Method, say: Say, draws: int, seed: int, workers: int) -> dict[s
     }
     if draws:
         many = robustness(
-            method.problem, method.reference, method.impulse, draws=draws, seed=seed, workers=workers
+            method.problem,
+            method.reference,
+            method.impulse,
+            draws=draws,
+            seed=seed,
+            workers=workers,
+            controller=controller,
         )
         out["standing_rate"] = many.rate
     return out

@@ -11,6 +11,8 @@ from impactopt.files.problem_file import read_problem_file
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation import ControllerSettings
+from impactopt.simulation.controller import controller_of
 from impactopt.studies.report import Say
 
 DEMO = Path("problems/punch.toml")
@@ -30,6 +32,11 @@ def plan_of(file: Path, say: Say) -> Solution:
             f"`impactopt solve {file}` says of it"
         )
     return solution
+
+
+def controller_in(file: Path, chosen: str) -> ControllerSettings | None:
+    """Settings of the controller "wbc" in a problem file; None for "servo"."""
+    return controller_of(chosen, read_problem_file(file).controller)
 
 
 def solved(file: Path, say: Say, change: Callable[[ImpactProblem], ImpactProblem] | None = None) -> Solution:

@@ -11,22 +11,32 @@ import numpy as np
 from impactopt.report.pictures.robustness import robustness_picture
 from impactopt.simulation import Perturbation, Simulation
 from impactopt.simulation.robustness import STEP, PerturbationRanges, Robustness, robustness
-from impactopt.studies.bench.planning import DEMO, plan_of
+from impactopt.studies.bench.planning import DEMO, controller_in, plan_of
 from impactopt.studies.report import Report, Say, make_table
 
 ROBUST = Path("problems/punch_robust.toml")
 SAID_EVERY = 20  # draws
 
 
-def run(say: Say, *, file: Path | None = None, draws: int = 200, seed: int = 0, workers: int = 2) -> Report:
+def run(
+    say: Say,
+    *,
+    file: Path | None = None,
+    draws: int = 200,
+    seed: int = 0,
+    workers: int = 2,
+    controller: str = "servo",
+) -> Report:
     """Plan a problem file, and replay the plan under drawn perturbations.
 
     file : default: problems/punch_robust.toml, and where it is not there the demo's.
+    controller : "servo", or "wbc" with the file's settings.
     """
     chosen = file if file is not None else ROBUST if ROBUST.exists() else DEMO
+    settings = controller_in(chosen, controller)
     solution = plan_of(chosen, say)
     as_planned = Perturbation(period=PerturbationRanges().period)
-    nominal = solution.validate(engine="mujoco", step=STEP, perturbation=as_planned)
+    nominal = solution.validate(engine="mujoco", step=STEP, perturbation=as_planned, controller=settings)
 
     def progress(done: int, of: int) -> None:
         if done % SAID_EVERY == 0 or done == of:
@@ -39,11 +49,13 @@ def run(say: Say, *, file: Path | None = None, draws: int = 200, seed: int = 0, 
         draws=draws,
         seed=seed,
         workers=workers,
+        controller=settings,
         progress=progress,
     )
     numbers = {
         **numbers_of(result),
         "seed": seed,
+        "controller": controller,
         "problem": str(chosen),
         "nominal_standing": nominal.standing,
         "nominal_impulse_Ns": nominal.impulse,

@@ -71,9 +71,12 @@ FREE = (
 )
 
 
-def run(say: Say, *, folder: Path = DEMO.parent) -> Report:
-    """Every problem file of the folder, and the variants of the demo's punch."""
-    rows = [row(name, solution, say) for name, solution in problems(folder, say)]
+def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> Report:
+    """Every problem file of the folder, and the variants of the demo's punch.
+
+    controller : of the replay on free soles, "servo" or "wbc" with the defaults.
+    """
+    rows = [row(name, solution, say, controller) for name, solution in problems(folder, say)]
     margins = [r.get("zmp_margin_m") for r in rows]
     shown = [
         {**r, "zmp_margin_mm": None if m is None else 1e3 * m} for r, m in zip(rows, margins, strict=True)
@@ -82,7 +85,7 @@ def run(say: Say, *, folder: Path = DEMO.parent) -> Report:
         columns_table("planned, and replayed on held soles", HELD, shown),
         columns_table("replayed on free soles", FREE, shown),
     )
-    return Report(name="truth", numbers={"rows": rows}, tables=tables)
+    return Report(name="truth", numbers={"rows": rows, "controller": controller}, tables=tables)
 
 
 def problems(folder: Path, say: Say) -> Iterator[tuple[str, Callable[[], Solution]]]:
@@ -108,7 +111,7 @@ def _variant(name: str, changes: dict[str, Any], say: Say) -> Solution:
     return solve(ImpactProblem(**{**options, **changes}), time_limit=TIME_LIMIT)
 
 
-def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
+def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "servo") -> dict[str, Any]:
     """What one problem gives; an error is its status, and ends what can be said of it.
 
     clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
@@ -139,7 +142,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say) -> dict[str, Any]:
         say(f"{name}: {error}")
         return out
     try:
-        replay = solution.validate(engine="mujoco")
+        replay = solution.validate(engine="mujoco", controller=controller)
         free = solution.summary(replay)["simulated"]
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}

@@ -1,0 +1,15 @@
+"""A whole-body controller for replays: what a laboratory has between a plan and its robot's drives.
+
+* settings.py   its numbers
+* sensors.py    what encoders, an inertial unit and the striking hand's force sensor tell it
+* estimate.py   from there to the state of the robot
+* target.py     what it tracks, by what it has felt of the blow
+* held.py       accelerations and sole wrenches as functions of the torques
+* quadratic.py  its QP in OSQP, in place
+* whole_body.py the controller
+"""
+
+from impactopt.simulation.controller.settings import CONTROLLERS, ControllerSettings, controller_of
+from impactopt.simulation.controller.whole_body import WholeBodyController
+
+__all__ = ["CONTROLLERS", "ControllerSettings", "WholeBodyController", "controller_of"]

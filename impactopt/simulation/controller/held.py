@@ -1,0 +1,76 @@
+"""Accelerations and sole wrenches as functions of the torques, of a robot that stands on its soles.
+
+H a + h = S' tau + J' w and J a + dJ/dt v = 0 give a = A tau + a0 and w = B tau + b0. So a QP over
+accelerations and wrenches under the equation of motion has as many unknowns as there are torques.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
+
+from impactopt.robots.robot import Robot
+
+__all__ = ["HeldDynamics"]
+
+Array = NDArray[np.float64]
+_AXES = pin.LOCAL_WORLD_ALIGNED
+
+
+class HeldDynamics:
+    """A robot on soles, at a state.
+
+    A (nv, n), a0 (nv,) : accelerations.  B (6 a sole, n), b0 : wrenches of the floor on the soles at their
+    frames' origins, in world axes.  places : of the soles.  hand (3, nv) : Jacobian of the striking point.
+    back (6 a sole,) : the part of b0 that would bring soles back to where they stood.
+    recoil (nv,) : how velocities change by a unit impulse against the normal.
+    """
+
+    def __init__(self, robot: Robot, soles: tuple[str, ...], striker: str, normal: Array, q0: Array) -> None:
+        self.robot, self.model, self.normal = robot, robot.model, normal
+        self.data: Any = robot.model.createData()
+        self._soles = [self.model.getFrameId(name) for name in soles]
+        self._hand = self.model.getFrameId(striker)
+        nv, n, rows = robot.nv, robot.n, 6 * len(soles)
+        self._left, self._right = np.zeros((nv + rows, nv + rows)), np.zeros((nv + rows, n + 3))
+        self._right[nv - n : nv, :n] = np.eye(n)
+        self._none = np.zeros(nv)
+        pin.framesForwardKinematics(self.model, self.data, q0)
+        self._stood = [self.data.oMf[i].copy() for i in self._soles]
+
+    def look(self, q: Array, v: Array, force: float = 0.0, bandwidth: float = 0.0) -> None:
+        """Go to q (nq), v (nv), with a force [N] on the hand, against the normal."""
+        model, data, nv, n = self.model, self.data, self.robot.nv, self.robot.n
+        left, right = self._left, self._right
+        pin.forwardKinematics(model, data, q, v, self._none)
+        pin.computeJointJacobians(model, data)
+        H = pin.crba(model, data, q)
+        left[:nv, :nv] = np.triu(H) + np.triu(H, 1).T
+        right[:nv, n] = -pin.nonLinearEffects(model, data, q, v)
+        self.places = []
+        for k, i in enumerate(self._soles):
+            rows = slice(nv + 6 * k, nv + 6 * k + 6)
+            self.places.append(pin.updateFramePlacement(model, data, i).copy())
+            J = pin.getFrameJacobian(model, data, i, _AXES)
+            left[rows, :nv], left[:nv, rows] = J, -J.T
+            right[rows, n] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
+            at, stood = self.places[-1], self._stood[k]
+            turned = pin.log3(at.rotation @ stood.rotation.T)
+            away = np.concatenate([at.translation - stood.translation, turned])
+            away[[0, 1, 5]] = 0.0  # a sole that has slid stays where it is
+            right[rows, n + 2] = -(bandwidth**2) * away - 2 * bandwidth * (J @ v)
+        pin.updateFramePlacement(model, data, self._hand)
+        self.hand = np.reshape(pin.getFrameJacobian(model, data, self._hand, _AXES), (6, nv))[:3]
+        self.hand_place = np.array(data.oMf[self._hand].translation)
+        self.hand_drift = np.array(pin.getFrameClassicalAcceleration(model, data, self._hand, _AXES).linear)
+        right[:nv, n + 1] = -self.normal @ self.hand  # a unit force
+        _, _, found, _ = dgesv(left, right)
+        found[:, n] += force * found[:, n + 1]
+        self.A, self.a0 = found[:nv, :n], found[:nv, n] + found[:nv, n + 2]
+        self.recoil = found[:nv, n + 1]
+        self.B, self.b0 = found[nv:, :n], found[nv:, n] + found[nv:, n + 2]
+        self.back = found[nv:, n + 2]

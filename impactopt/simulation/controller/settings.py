@@ -1,0 +1,132 @@
+"""The numbers of the whole-body controller, and what its sensors are worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from impactopt.contact.fields import Described, about, abouts
+from impactopt.errors import InputError, check_array, check_whole, did_you_mean
+
+__all__ = ["CONTROLLERS", "ControllerSettings", "controller_of"]
+
+CONTROLLERS = ("servo", "wbc")
+
+IMPACTS = ("planned", "none", "project", "spread", "both")
+
+
+def _weight(what: str) -> Any:
+    return about(f"weight of {what}", least=0, most=1e9)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerSettings(Described):
+    """How the whole-body controller follows a plan in a replay.
+
+    Its weights are those of squared errors in accelerations: of the centre of mass [m/s^2], of the angular
+    momentum's rate over mass [m^2/s^2], of the hand [m/s^2] and of joints and trunk [rad/s^2].
+    """
+
+    rate: float = field(
+        default=1000.0, metadata=about("of control", unit="Hz", least=100, most=10_000, key="rate_Hz")
+    )
+    delay: float = field(
+        default=1e-3,
+        metadata=about("from reading the sensors to setting the torque", unit="s", least=0, most=0.1),
+    )
+    noise: float = field(
+        default=1.0, metadata=about("factor of the sensors' errors; 0: none", least=0, most=100)
+    )
+    seed: int = field(default=0, metadata=about("of the sensors' errors", least=0))
+    impact: str = field(
+        default="planned",
+        metadata=about(
+            "about the blow: feedback on (none); without what an impulse at the hand does to velocities "
+            "(project); the motion before it goes on until the hand is free (spread); both; in contact the "
+            "joints' servos, which the plan counts on, and both (planned)",
+            choices=IMPACTS,
+        ),
+    )
+    com: float = field(default=10.0, metadata=_weight("the centre of mass"))
+    angular_momentum: float = field(default=1.0, metadata=_weight("the angular momentum"))
+    hand: float = field(default=1.0, metadata=_weight("the hand"))
+    posture: float = field(default=0.001, metadata=_weight("the posture"))
+    torque: float = field(default=0.01, metadata=_weight("torques over their limits, against the plan's"))
+    wrench: float = field(
+        default=10.0, metadata=_weight("the soles' wrenches over the robot's weight, against the plan's")
+    )
+    sole_bandwidth: float = field(
+        default=25.0,
+        metadata=about("of the feedback that keeps the soles flat", unit="rad/s", least=0, most=1000),
+    )
+    blow: float = field(default=1000.0, metadata=_weight("torques in contact, against the plan's servos"))
+    capture_gain: float = field(
+        default=4.0, metadata=about("of the divergent component of motion", unit="1/s", least=0, most=1000)
+    )
+    momentum_gain: float = field(
+        default=5.0, metadata=about("of the angular momentum", unit="1/s", least=0, most=1000)
+    )
+    hand_bandwidth: float = field(
+        default=20.0, metadata=about("of the hand's feedback", unit="rad/s", least=0, most=1000)
+    )
+    posture_bandwidth: float = field(
+        default=15.0, metadata=about("of the posture's feedback", unit="rad/s", least=0, most=1000)
+    )
+    friction: float = field(
+        default=0.6, metadata=about("coefficient between soles and floor that it counts on", above=0, most=10)
+    )
+    cop_margin: float = field(
+        default=0.003,
+        metadata=about("of a sole's centre of pressure from its edges", unit="m", least=0, most=1),
+    )
+    least_force: float = field(
+        default=10.0, metadata=about("normal force of each sole", unit="N", least=0, most=1e6)
+    )
+    iterations: int = field(default=30, metadata=about("of OSQP in each QP", least=1, most=100_000))
+
+    def __post_init__(self) -> None:
+        for f, told in abouts(type(self)):
+            value = getattr(self, f.name)
+            if told.choices:
+                if value not in told.choices:
+                    raise InputError(
+                        f"controller: {f.name} is {value!r}; give one of {', '.join(told.choices)}"
+                    )
+            elif f.name in ("seed", "iterations"):
+                check_whole(f"controller: {f.name}", value, least=int(told.least or 0), most=10**9)
+            elif not told.allows(float(check_array(f"controller: {f.name}", value, ()))):
+                raise InputError(f"controller: {f.name} is {value:g}; give a number {told.range}")
+
+    @property
+    def period(self) -> float:
+        """[s] between two samples."""
+        return 1.0 / self.rate
+
+    @property
+    def projects(self) -> bool:
+        return self.impact in ("project", "both", "planned")
+
+    @property
+    def spreads(self) -> bool:
+        return self.impact in ("spread", "both", "planned")
+
+
+def controller_of(
+    chosen: str | ControllerSettings | None, settings: ControllerSettings | None = None
+) -> ControllerSettings | None:
+    """Settings of the whole-body controller; None: the joints' servo.
+
+    chosen : "servo" (or None), "wbc", which has `settings`, or settings themselves.
+
+    Raises
+    ------
+    InputError : there is no such controller.
+    """
+    if isinstance(chosen, ControllerSettings):
+        return chosen
+    if chosen is None or chosen == "servo":
+        return None
+    if chosen != "wbc":
+        meant = did_you_mean(str(chosen), CONTROLLERS)
+        raise InputError(f"unknown controller {chosen!r}{meant}: there are {', '.join(CONTROLLERS)}")
+    return settings if settings is not None else ControllerSettings()

@@ -1,0 +1,135 @@
+"""What the controller tracks: the plan's motion, by what it has felt of the blow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.robots.robot import Robot
+
+__all__ = ["Aim", "Target"]
+
+Array = NDArray[np.float64]
+PATIENCE = 0.02  # [s] beyond twice the planned contact; then the motion after it begins in any case
+
+
+@dataclass(frozen=True)
+class Aim:
+    """q (nq,), v, a (nv,), torque (n,); com, its rate and acceleration (3,) each, momentum: angular about it,
+    and its rate; hand: place, rate and acceleration (3,) of the striking point.
+    """
+
+    q: Array
+    v: Array
+    a: Array
+    torque: Array
+    com: Array
+    momentum: Array
+    hand: Array
+
+
+class Target:
+    """The reference of a plan, sampled, on the clock of what has happened.
+
+    reference : time (k,), q, v, a, torque, contact_start, contact_end, as of
+        :class:`impactopt.transcription.plan.Trajectory`.
+    spread : the motion before the blow goes on until the hand is free again, and then that after it begins.
+    """
+
+    def __init__(self, robot: Robot, reference: Any, striker: str, *, spread: bool) -> None:
+        self.robot, self.model, self.spread = robot, robot.model, spread
+        self.time = np.asarray(reference.time)
+        self.q, self.v = np.asarray(reference.q), np.asarray(reference.v)
+        self.contact = float(reference.contact_start), float(reference.contact_end)
+        data = self.model.createData()
+        self.rows = np.array([self._row(data, reference, k, striker) for k in range(len(self.time))])
+        self.felt = self.free = np.nan  # [s] when the hand began and ceased to feel a force
+        jump = np.flatnonzero(np.diff(self.time) == 0)
+        after = jump[self.time[jump] >= self.contact[1] - 1e-9]
+        self.last = int(after[0]) if after.size else len(self.time) - 1  # of the motion before
+
+    def _row(self, data: Any, r: Any, k: int, striker: str) -> Array:
+        model = self.model
+        q, v, a = r.q[k], r.v[k], r.a[k]
+        pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
+        mass = max(float(pin.computeTotalMass(model)), 1e-9)
+        h, dh = data.hg, data.dhg
+        i = model.getFrameId(striker)
+        at = pin.updateFramePlacement(model, data, i).translation
+        rate = pin.getFrameVelocity(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear
+        gain = pin.getFrameClassicalAcceleration(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear
+        com = data.com[0]
+        parts = (
+            v,
+            a,
+            r.torque[k],
+            com,
+            h.linear / mass,
+            dh.linear / mass,
+            h.angular,
+            dh.angular,
+            at,
+            rate,
+            gain,
+        )
+        return np.concatenate(parts)
+
+    def feel(self, t: float, touching: bool) -> None:
+        """What the hand feels at a time [s]."""
+        if touching and np.isnan(self.felt):
+            self.felt = t
+        elif not touching and np.isfinite(self.felt) and np.isnan(self.free):
+            self.free = t
+
+    @property
+    def before(self) -> bool:
+        """Whether the hand has felt nothing yet."""
+        return bool(np.isnan(self.felt))
+
+    @property
+    def struck(self) -> bool:
+        """Whether the hand is in contact, for the first time."""
+        return bool(np.isfinite(self.felt) and np.isnan(self.free))
+
+    def near_blow(self, t: float, window: float) -> bool:
+        """Whether the blow is on, or within a window [s] of it."""
+        if np.isfinite(self.felt):
+            return bool(np.isnan(self.free) or t < self.free + window)
+        return bool(self.contact[0] - window <= t <= self.contact[1] + window)
+
+    def clock(self, t: float) -> tuple[float, int]:
+        """Time [s] in the reference, and the last row that it may take."""
+        start, end = self.contact
+        final = len(self.time) - 1
+        if not self.spread:
+            return t, final
+        if np.isfinite(self.free):
+            return end + t - self.free, final
+        if np.isfinite(self.felt):
+            late = self.felt + 2 * (end - start) + PATIENCE
+            return (t, self.last) if t < late else (end + t - late, final)
+        return (t, self.last) if t < end + PATIENCE else (t, final)
+
+    def at(self, t: float) -> Aim:
+        """What to track at a time [s]."""
+        now, last = self.clock(t)
+        i = int(np.searchsorted(self.time[: last + 1], now, side="right")) - 1
+        i = min(max(i, 0), last - 1)
+        span = self.time[i + 1] - self.time[i]
+        f = (now - self.time[i]) / span if span > 0 else 1.0
+        beyond = max(now - self.time[last], 0.0) if last < len(self.time) - 1 else 0.0
+        f = min(f, 1.0)
+        row = (1 - f) * self.rows[i] + f * self.rows[i + 1]
+        q = pin.interpolate(self.model, self.q[i], self.q[i + 1], f)
+        n, nv = self.robot.n, self.robot.nv
+        v, a, torque = row[:nv], row[nv : 2 * nv], row[2 * nv : 2 * nv + n]
+        com, momentum, hand = np.split(row[2 * nv + n :], [9, 15])
+        if beyond:  # the motion before the blow coasts on
+            q = pin.integrate(self.model, q, beyond * v)
+            com = np.concatenate([com[:3] + beyond * com[3:6], com[3:]])
+            hand = np.concatenate([hand[:3] + beyond * hand[3:6], hand[3:]])
+        return Aim(q, v, a, torque, com.reshape(3, 3), momentum.reshape(2, 3), hand.reshape(3, 3))

@@ -1,0 +1,239 @@
+"""The whole-body controller: its QP, its sensors and state, standing and pushes, and how it is chosen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from support.small_motions import scene, standing
+from support.small_robots import arm, biped
+
+from impactopt.errors import InputError
+from impactopt.files.problem_file import read_problem_file
+from impactopt.robots.robot import Robot
+from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco
+from impactopt.simulation.controller import WholeBodyController, controller_of
+from impactopt.simulation.controller.estimate import StateEstimate
+from impactopt.simulation.controller.held import HeldDynamics
+from impactopt.simulation.controller.quadratic import TorqueQP
+from impactopt.simulation.controller.sensors import Sensors
+from impactopt.simulation.controller.target import Target
+
+Array = NDArray[np.float64]
+QUIET = ControllerSettings(noise=0.0)
+
+
+def still(robot: Robot) -> tuple[Any, Scene]:
+    """A robot that stands, as a reference with all that a trajectory has."""
+    given, where, _ = standing(robot)
+    rest = {"a": np.zeros_like(given.v), "contact_start": 0.5, "contact_end": 0.6}
+    return SimpleNamespace(**vars(given), **rest), where
+
+
+def stand(world: Perturbation | None = None, settings: ControllerSettings | None = None) -> Simulation:
+    """For a second, in steps of 1 ms."""
+    robot = biped()
+    ref, where = still(robot)
+    return simulate_mujoco(
+        robot, ref, where, step=1e-3, settle=1.0, perturbation=world, controller=settings, record=10
+    )
+
+
+# ---- the QP
+
+
+def test_the_qp_has_the_answer_of_a_dense_solver() -> None:
+    """Several in a row: matrices are updated in place, and each begins where the one before has ended."""
+    random, n, m = np.random.default_rng(3), 6, 4
+    qp = TorqueQP(n, m, iterations=200)
+    for _ in range(5):
+        root = random.normal(size=(n, n))
+        P, q, C = root @ root.T + 0.1 * np.eye(n), 3 * random.normal(size=n), random.normal(size=(m, n))
+        c, low, high = C @ (0.2 * random.normal(size=n)) - 0.1, -np.ones(n), np.ones(n)
+        exact = minimize(
+            lambda x, P=P, q=q: 0.5 * x @ P @ x + q @ x,
+            np.zeros(n),
+            jac=lambda x, P=P, q=q: P @ x + q,
+            bounds=list(zip(low, high, strict=True)),
+            constraints={"type": "ineq", "fun": lambda x, C=C, c=c: C @ x - c, "jac": lambda x, C=C: C},
+            method="SLSQP",
+            options={"ftol": 1e-12, "maxiter": 200},
+        )
+        assert exact.success
+        np.testing.assert_allclose(qp.solve(P, q, C, c, low, high), exact.x, atol=2e-4)
+
+
+def test_torques_move_a_held_robot_by_its_equation_of_motion() -> None:
+    robot = biped()
+    ref, where = still(robot)
+    q = np.asarray(ref.q[0])
+    held = HeldDynamics(robot, where.soles, where.striker, where.normal, q)
+    held.look(q, np.zeros(robot.nv), force=40.0)
+    torque = 20 * np.sin(np.arange(robot.n))
+    a, wrench = held.A @ torque + held.a0, held.B @ torque + held.b0
+    model, data = robot.model, robot.model.createData()
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    axes = pin.LOCAL_WORLD_ALIGNED
+    push = -40.0 * where.normal @ pin.getFrameJacobian(model, data, model.getFrameId(where.striker), axes)[:3]
+    push[6:] += torque
+    for name, part in zip(where.soles, wrench.reshape(-1, 6), strict=True):
+        J = pin.getFrameJacobian(model, data, model.getFrameId(name), axes)
+        push += J.T @ part
+        np.testing.assert_allclose(J @ a, 0.0, atol=1e-8)
+    np.testing.assert_allclose(pin.rnea(model, data, q, np.zeros(robot.nv), a), push, atol=1e-7)
+
+
+@pytest.mark.parametrize("friction", [0.4, 0.9])
+def test_the_cone_holds_what_corners_can_bear(friction: float) -> None:
+    """Forces at the corners inside their pyramids make wrenches inside; none pulls or turns more."""
+    robot = biped()
+    ref, where = still(robot)
+    settings = replace(QUIET, friction=friction, cop_margin=0.0)
+    cone = WholeBodyController(robot, ref, where, settings).cones[0]
+    random, corners = np.random.default_rng(1), where.corners[0]
+    at = np.column_stack([corners, np.zeros(len(corners))])
+    for _ in range(50):
+        force = random.random((len(at), 3))
+        force[:, :2] = friction * force[:, 2:] * (2 * force[:, :2] - 1)
+        wrench = np.concatenate([force.sum(axis=0), np.cross(at, force).sum(axis=0)])
+        assert (cone @ wrench).min() >= -1e-12
+    reach = friction * np.ptp(corners, axis=0).sum() / 2  # [m] of the torsion of a unit normal force
+    middle = corners.mean(axis=0)
+    straight = np.array([0.0, 0.0, 1.0, middle[1], -middle[0], 0.0])
+    for wrench in (
+        -straight,
+        straight + np.array([1.01 * friction, 0, 0, 0, 0, -1.01 * friction * middle[1]]),
+        straight + np.array([0, 0, 0, 0, 0, 1.01 * reach]),
+        straight + np.array([0, 0, 0, 1.01 * np.ptp(corners[:, 1]) / 2, 0, 0]),
+    ):
+        assert (cone @ wrench).min() < 0
+
+
+# ---- what it knows
+
+
+def test_the_state_is_known_exactly_without_errors_of_sensors() -> None:
+    """Joints that move with the soles where they stood."""
+    robot = biped()
+    ref, where = still(robot)
+    q0 = np.asarray(ref.q[0])
+    held = HeldDynamics(robot, where.soles, where.striker, where.normal, q0)
+    held.look(q0, np.zeros(robot.nv))
+    v = 0.1 * (
+        held.A @ np.sin(np.arange(robot.n))
+    )  # accelerations of a held robot are velocities of one, too
+    rotation = pin.Quaternion(q0[3:7]).toRotationMatrix()
+    measured = Sensors(robot, noise=0.0, rate=1000.0, seed=1).read(
+        robot.joint_positions(q0), v, rotation, 7.0
+    )
+    points = np.array([[0.05, 0.02, 0.0], [-0.03, 0.0, 0.0]])
+    q, rates = StateEstimate(robot, where.soles, q0).of(measured, np.array([1.0, 3.0]), points)
+    np.testing.assert_allclose(q, q0, atol=1e-12)
+    np.testing.assert_allclose(rates, v, atol=1e-12)
+    assert measured.force == 7.0
+
+
+def test_errors_of_sensors_are_of_their_seed() -> None:
+    robot = biped()
+    q, v = robot.posture("half_sitting"), np.zeros(robot.nv)
+
+    def read(seed: int) -> Array:
+        sensors = Sensors(robot, noise=1.0, rate=1000.0, seed=seed)
+        return sensors.read(robot.joint_positions(q), v, np.eye(3), 0.0).angles
+
+    assert np.array_equal(read(1), read(1))
+    assert not np.array_equal(read(1), read(2))
+
+
+def test_the_motion_before_the_blow_coasts_on_until_the_hand_is_free() -> None:
+    robot = arm()
+    time = np.array([0.0, 0.5, 0.5, 0.6, 0.6, 1.0])
+    q0, v0 = robot.posture("start"), np.full(robot.nv, 0.5)
+    q = np.array([pin.integrate(robot.model, q0, min(t, 0.6) * v0) for t in time])
+    v = np.vstack([np.tile(v0, (4, 1)), np.zeros((2, robot.nv))])
+    ref = SimpleNamespace(
+        time=time,
+        q=q,
+        v=v,
+        a=np.zeros_like(v),
+        torque=np.zeros((6, robot.n)),
+        contact_start=0.5,
+        contact_end=0.6,
+    )
+    target = Target(robot, ref, "striker:hand", spread=True)
+    target.feel(0.55, True)  # later than planned
+    late = target.at(0.64)
+    np.testing.assert_allclose(late.v, v0)
+    np.testing.assert_allclose(late.q, pin.integrate(robot.model, q0, 0.64 * v0), atol=1e-12)
+    target.feel(0.66, False)
+    np.testing.assert_allclose(target.at(0.66).v, 0.0)
+    assert target.clock(0.70)[0] == pytest.approx(0.64)
+
+
+# ---- what it does
+
+
+def test_it_stands_still_with_noise_and_delay() -> None:
+    done = stand(settings=ControllerSettings())
+    assert done.standing, done.fall
+    assert float(done.slip.max()) < 1e-3
+    assert float(done.lift.max()) < 1e-3
+    assert done.posture_error < 0.02
+
+
+def test_it_stands_after_a_push_that_the_servo_does_not_survive() -> None:
+    pushed = Perturbation(push=90.0, push_start=0.1, push_time=0.1, period=1e-3)
+    assert not stand(pushed).standing
+    done = stand(pushed, ControllerSettings())
+    assert done.standing, done.fall
+
+
+def test_an_arm_on_a_fixed_base_follows_too() -> None:
+    robot = arm()
+    q = robot.posture("start")
+    torque = np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
+    k = 3
+    ref = SimpleNamespace(
+        time=np.linspace(0, 0.2, k),
+        q=np.tile(q, (k, 1)),
+        v=np.zeros((k, robot.nv)),
+        a=np.zeros((k, robot.nv)),
+        torque=np.tile(torque, (k, 1)),
+        end=0.2,
+        contact_start=0.1,
+        contact_end=0.15,
+    )
+    done = simulate_mujoco(robot, ref, scene("striker:hand"), step=1e-3, settle=0.2, controller=QUIET)
+    assert done.posture_error < 1e-4
+
+
+# ---- how it is chosen
+
+
+def test_settings_are_refused_by_name() -> None:
+    for wrong in ({"rate": 10.0}, {"noise": -1.0}, {"impact": "never"}, {"iterations": 0}, {"com": np.nan}):
+        with pytest.raises(InputError, match=f"controller: {next(iter(wrong))}"):
+            ControllerSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_controllers_have_names() -> None:
+    assert controller_of("servo", QUIET) is None
+    assert controller_of("wbc", QUIET) is QUIET
+    with pytest.raises(InputError, match="wbc"):
+        controller_of("wbk")
+
+
+def test_a_problem_file_has_its_settings() -> None:
+    usual = read_problem_file("arm_planar").controller
+    assert usual == ControllerSettings()
+    changed = read_problem_file("arm_planar", {"controller.rate": 500.0, "controller.impact": "spread"})
+    assert changed.controller == replace(usual, rate=500.0, impact="spread")
+    with pytest.raises(InputError, match="capture_gain"):
+        read_problem_file("arm_planar", {"controller.capture_gain": -1.0})

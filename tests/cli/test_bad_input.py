@@ -98,7 +98,7 @@ def test_deep_nesting(tmp_path: Path, depth: int, begin: str, end: str) -> None:
         (ARM.replace("[objectives.target_energy]", "[objectives.target_energy]\nweight = 1e308"), "weight"),
         (ARM.replace('"planar arm and a nail"', r'"a\u001b[2Jb"'), "control characters"),
         (ARM.replace("planar_arm", "planar_arm" * 100_000), "no robot"),
-        (OWN + f'urdf = "{"a" * 5000}"\n', "preset or urdf"),
+        (OWN + f'urdf = "{"a" * 5000}"\n', "one of preset, urdf and mjcf"),
         (OWN.replace('preset = "planar_arm"', f'urdf = "{"a" * 5000}.urdf"'), "no such file"),
         (OWN.replace('preset = "planar_arm"', 'urdf = "/dev/zero"'), "no such file"),
         (PUNCH + "".join(f'\n[[scenarios]]\nname = "s{i}"' for i in range(20_000)), "give at most 100"),

@@ -305,7 +305,8 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         )
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
-    for text in (summary.get("note"), error, reach.get("error"), told_touches(summary), beyond):
+    cautions = (summary.get("caution"), told_touches(summary), beyond)
+    for text in (summary.get("note"), error, reach.get("error"), *cautions):
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)
     if len(summary["starts"]) > 1:

@@ -136,7 +136,14 @@ _OTHERS: Mapping[str, _Kinds] = {
     **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
     **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _PHASES),
     **dict.fromkeys(
-        ("duration_s?", "collision_error_pct?", "nodes_added?", "motion_price_pct?", "capture_margin_m?"),
+        (
+            "duration_s?",
+            "collision_error_pct?",
+            "nodes_added?",
+            "motion_price_pct?",
+            "capture_margin_m?",
+            "slide_mm?",
+        ),
         _NUMBER,
     ),
     **dict.fromkeys(("freezes?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),

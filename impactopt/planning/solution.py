@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.planning.multistart import Attempt
+from impactopt.planning.sliding import slide, slide_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.loads import DriveLoads
@@ -324,7 +325,7 @@ class Solution(Solved):
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
-        plan = self.plan
+        plan, way = self.plan, slide(self.problem, self.plan)
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),
@@ -338,6 +339,7 @@ class Solution(Solved):
             **self.margins(),
             **self.loads.summary(),
             **self.clearance(),
+            "slide_mm": 1e3 * way,
             "versions": versions(),
         }
         known: dict[str, Any] = {
@@ -356,6 +358,8 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
+        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way)))):
+            out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 
 

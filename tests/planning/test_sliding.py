@@ -1,0 +1,42 @@
+"""How far a striking point slides across the target: by hand, and told where it is far."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from support.small_plans import arm_problem, transcribed
+
+from impactopt.planning.sliding import FAR, slide, slide_caution
+from impactopt.solvers.ipopt import solve_ipopt
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.start import first_iterate
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    t = transcribed(arm_problem())
+    return t.decode(solve_ipopt(t.program, first_iterate(t)).x)
+
+
+def test_a_slide_is_the_way_across_the_normal(plan: Plan) -> None:
+    """Against the ends of the contact, which are the largest way of a short one; no way along the normal."""
+    problem, model = plan.problem, plan.problem.robot.model
+    data = model.createData()
+    frame = model.getFrameId(problem.robot.striker(problem.striker).model_frame)
+    ends = []
+    for y in plan.through_contact(np.array([0.0, 1.0])):
+        pin.framesForwardKinematics(model, data, plan.coordinates.join(y, np.zeros(0)))
+        ends.append(np.array(data.oMf[frame].translation))
+    way = ends[1] - ends[0]
+    across = np.linalg.norm(way - (way @ problem.normal) * problem.normal)
+    assert slide(problem, plan) == pytest.approx(across, rel=1e-6)
+    turned = replace(problem, normal=way / np.linalg.norm(way))
+    assert slide(turned, plan) < 0.1 * np.linalg.norm(way)
+
+
+def test_only_a_long_slide_is_told() -> None:
+    assert slide_caution(FAR) == ""
+    assert "slides 201 mm" in slide_caution(0.201)

@@ -120,7 +120,9 @@ def _gains(
 def _machine(
     problems: Annotated[
         list[str] | None,
-        typer.Option("--problem", metavar="NAME", help="This one of problems/; several times for several."),
+        typer.Option(
+            "--problem", metavar="NAME", help="A problem's name or file; several times for several."
+        ),
     ] = None,
 ) -> None:
     """What gears cost a blow: each problem with gear limits of 3, 2, 1.5 and 1, and without."""

@@ -31,7 +31,8 @@ def test_a_row_a_limit(tmp_path: Path) -> None:
     soft = text.replace('robot = "planar_arm"\n', "")
     (tmp_path / "soft.toml").write_text(soft + '[robot]\npreset = "planar_arm"\n' + SOFT)
     said: list[str] = []
-    report = run_bench("machine", said.append, limits=(None, 1.8), folder=tmp_path)
+    files = [str(tmp_path / f"{name}.toml") for name in ("firm", "soft")]
+    report = run_bench("machine", said.append, limits=(None, 1.8), problems=files)
     rows = report.numbers["rows"]
     assert [(row["problem"], row["gear_limit"]) for row in rows] == [
         (name, limit) for name in ("firm", "soft") for limit in (None, 1.8)
@@ -51,21 +52,18 @@ def test_a_row_a_limit(tmp_path: Path) -> None:
     json.dumps(rows)
 
 
-def test_a_plan_that_is_none_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "one.toml").touch()
-    (tmp_path / "two_infeasible.toml").touch()
-
+def test_a_plan_that_is_none_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: Any) -> None:
         raise InputError("the gear breaks")
 
     monkeypatch.setattr(machine, "solved", refused)
-    report = run_bench("machine", lambda _: None, limits=(None, 1.0), folder=tmp_path)
-    told = {"problem": "one", "status": "error", "error": "the gear breaks"}
+    monkeypatch.setattr(machine, "problem_names", lambda: ("nailing", "punch_infeasible"))
+    report = run_bench("machine", lambda _: None, limits=(None, 1.0))
+    told = {"problem": "nailing", "status": "error", "error": "the gear breaks"}
     assert report.numbers["rows"] == [{**told, "gear_limit": None}, {**told, "gear_limit": 1.0}]
     assert not report.figures["machine"]().axes[0].lines
 
 
-def test_a_problem_that_there_is_not(tmp_path: Path) -> None:
-    (tmp_path / "nailing.toml").touch()
+def test_a_problem_that_there_is_not() -> None:
     with pytest.raises(InputError, match=r"no problem 'nail'.*did you mean 'nailing'"):
-        run_bench("machine", lambda _: None, problems=["nail"], folder=tmp_path)
+        run_bench("machine", lambda _: None, problems=["nail"])

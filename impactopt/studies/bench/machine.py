@@ -13,11 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from impactopt.errors import InputError, did_you_mean
+from impactopt.errors import InputError
+from impactopt.files.problem_file.names import problem_file, problem_names
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
-from impactopt.studies.bench.planning import DEMO, solved
+from impactopt.studies.bench.planning import solved
 from impactopt.studies.report import Report, Say, columns_table
 
 __all__ = ["LIMITS", "run"]
@@ -43,23 +44,19 @@ def run(
     *,
     problems: Sequence[str] | None = None,
     limits: Sequence[float | None] = LIMITS,
-    folder: Path = DEMO.parent,
 ) -> Report:
     """One row a problem and a limit.
 
-    problems : names of files in the folder; none: all whose name does not end in "infeasible".
+    problems : names, or files; none: all of the package whose name does not end in "infeasible".
     limits : over the torque limit; None: gears bear what they have to.
 
     Raises
     ------
     InputError : no file of that name.
     """
-    files = {file.stem: file for file in sorted(folder.glob("*.toml"))}
-    for name in problems or ():
-        if name not in files:
-            raise InputError(f"there is no problem {name!r} in {folder}{did_you_mean(name, files)}")
-    chosen = problems or [name for name in files if not name.endswith("infeasible")]
-    rows = [_row(name, files[name], limit, say) for name in chosen for limit in limits]
+    chosen = problems or [name for name in problem_names() if not name.endswith("infeasible")]
+    files = [problem_file(name) for name in chosen]
+    rows = [_row(file.stem, file, limit, say) for file in files for limit in limits]
 
     def picture() -> Any:
         from impactopt.report.pictures.machine import machine_picture

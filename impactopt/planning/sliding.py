@@ -35,7 +35,6 @@ def slide_caution(length: float) -> str:
     if length <= FAR:
         return ""
     return (
-        f"The striking point slides {1e3 * length:.0f} mm across the target in contact, which has no "
-        f"friction. In replays the face ends {1e3 * FACE:.0f} mm from the hit point. A shorter contact "
-        "([collision] duration_s) keeps it there."
+        f"The striking point slides {1e3 * length:.0f} mm across the target: contact has no friction. "
+        f"In replays the face ends {1e3 * FACE:.0f} mm from the hit point; [terms.slide] keeps it there."
     )

@@ -10,6 +10,7 @@ import pytest
 from support.small_plans import arm_problem, transcribed
 
 from impactopt.planning.sliding import FAR, slide, slide_caution
+from impactopt.problem.terms import Slide
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.start import first_iterate
@@ -35,6 +36,22 @@ def test_a_slide_is_the_way_across_the_normal(plan: Plan) -> None:
     assert slide(problem, plan) == pytest.approx(across, rel=1e-6)
     turned = replace(problem, normal=way / np.linalg.norm(way))
     assert slide(turned, plan) < 0.1 * np.linalg.norm(way)
+
+
+def test_a_bound_keeps_it_short(plan: Plan) -> None:
+    """The bound is along each of two tangents, and at the end of contact; the way there may be a bit longer."""
+    most = 0.3 * slide(plan.problem, plan)
+    t = transcribed(replace(plan.problem, terms=(*plan.problem.terms, Slide(most=most))))
+    kept = t.decode(solve_ipopt(t.program, first_iterate(t)).x)
+    y = kept.through_contact(np.array([1.0]))[0]
+    model = kept.problem.robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, kept.coordinates.join(y, np.zeros(0)))
+    striker = kept.problem.robot.striker(kept.problem.striker).model_frame
+    end = data.oMf[model.getFrameId(striker)].translation - kept.problem.point
+    assert np.linalg.norm(end - (end @ kept.problem.normal) * kept.problem.normal) < 1.001 * np.sqrt(2) * most
+    assert slide(kept.problem, kept) < 2 * most
+    assert kept.impulse == pytest.approx(plan.impulse, rel=0.05)
 
 
 def test_only_a_long_slide_is_told() -> None:

@@ -20,6 +20,7 @@ from impactopt.problem.terms.motor_curve import MotorCurve
 from impactopt.problem.terms.position_limit import PositionLimit
 from impactopt.problem.terms.power_limit import PowerLimit
 from impactopt.problem.terms.self_collision import SelfCollision
+from impactopt.problem.terms.slide import Slide
 from impactopt.problem.terms.target_speed import TargetSpeed
 from impactopt.problem.terms.torque_limit import TorqueLimit
 from impactopt.problem.terms.torque_rate import TorqueRate
@@ -51,6 +52,7 @@ TERMS: tuple[type[Term], ...] = (
     PowerLimit,
     VelocityJump,
     TargetSpeed,
+    Slide,
 )
 
 __all__ = [
@@ -71,6 +73,7 @@ __all__ = [
     "PositionLimit",
     "PowerLimit",
     "SelfCollision",
+    "Slide",
     "TargetSpeed",
     "Term",
     "TorqueLimit",

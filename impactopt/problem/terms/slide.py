@@ -1,0 +1,41 @@
+"""How far the striking point slides across the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from impactopt.contact.fields import about
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import Measure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slide(Term):
+    """The striking point stays near the hit point until contact ends.
+
+    Bounded along each of two tangents, with the expected target. A contact has no friction, so a long push at
+    an angle may slide off what it pushes: in replays a target's face ends 0.2 m from the hit point.
+    """
+
+    name: ClassVar[str] = "slide"
+    unit: ClassVar[str] = "m"
+    most: float = field(default=0.1, metadata=about("largest way along each tangent", unit="m", above=0))
+
+    def add_rows(self, program: Any) -> None:
+        problem = program.problem
+        after = program.follow_spots()[0][1][0]
+        _, _, rows = np.linalg.svd(problem.normal.reshape(1, 3))
+        for k, tangent in enumerate(rows[1:], start=1):
+            place = float(tangent @ problem.point)
+            program.rows.add(
+                term=self.name,
+                place="after contact",
+                components=[f"tangent {k}"],
+                outputs=np.array([program.add_block("approach", [[after]], tangent)]),
+                lower=place - self.most,
+                upper=place + self.most,
+                measure=Measure("mm", 1e3, "too far"),
+            )

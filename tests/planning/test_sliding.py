@@ -39,7 +39,7 @@ def test_a_slide_is_the_way_across_the_normal(plan: Plan) -> None:
 
 
 def test_a_bound_keeps_it_short(plan: Plan) -> None:
-    """The bound is along each of two tangents, and at the end of contact; the way there may be a bit longer."""
+    """It is along each of two tangents, at the end of contact; the way there may be a bit longer."""
     most = 0.3 * slide(plan.problem, plan)
     t = transcribed(replace(plan.problem, terms=(*plan.problem.terms, Slide(most=most))))
     kept = t.decode(solve_ipopt(t.program, first_iterate(t)).x)

@@ -226,7 +226,7 @@ def _solve(
     quick: Annotated[bool, typer.Option("--quick", help="One start, our default solver and IPOPT.")] = False,
     seed: Seed = 0,
 ) -> None:
-    """Which solver solves which problem, how reliably and how fast: ours, IPOPT, CasADi's, SciPy's."""
+    """Which solver solves which problem, how reliably and how fast: ours, IPOPT, Uno, CasADi's, SciPy's."""
 
 
 @_command("zoo")

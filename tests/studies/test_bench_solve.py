@@ -109,6 +109,7 @@ def test_every_qp_solver_of_ours_is_compared() -> None:
 PEERS = {
     "sqpmethod:qpoases": lambda p, x: solve_sqpmethod(p, x, 20.0),
     "sqpmethod:piqp": lambda p, x: solve_sqpmethod(p, x, 20.0, qp="piqp"),
+    "ipopt-spral": lambda p, x: SOLVERS["ipopt-spral"].run(p, x, 20.0),
     "slsqp": lambda p, x: solve_slsqp(p, x, 20.0),
     "trust-constr": lambda p, x: solve_trust_constr(p, x, 20.0),
 }

@@ -33,10 +33,16 @@ def _sqp(program: NonlinearProgram, x0: Vector, time_limit: float, *, qp: str) -
     return solve_sqp(program, x0, options=SQPOptions(qp_solver=qp, time_limit=time_limit))
 
 
-def _ipopt(program: NonlinearProgram, x0: Vector, time_limit: float) -> SolverResult:
+def _ipopt(program: NonlinearProgram, x0: Vector, time_limit: float, *, linear: str) -> SolverResult:
     from impactopt.solvers.ipopt import solve_ipopt
 
-    return solve_ipopt(program, x0, time_limit=time_limit)
+    return solve_ipopt(program, x0, options={"linear_solver": linear}, time_limit=time_limit)
+
+
+def _uno(program: NonlinearProgram, x0: Vector, time_limit: float, *, preset: str) -> SolverResult:
+    from impactopt.studies.bench.uno_peer import solve_uno
+
+    return solve_uno(program, x0, time_limit, preset=preset)
 
 
 def _casadi(program: NonlinearProgram, x0: Vector, time_limit: float, *, qp: str) -> SolverResult:
@@ -55,7 +61,9 @@ def _scipy(program: NonlinearProgram, x0: Vector, time_limit: float, *, method: 
 def _table() -> dict[str, Solver]:
     ours = [Solver(name="sqp", qp=qp, run=partial(_sqp, qp=qp)) for qp in ("interior", *sorted(QP_SOLVERS))]
     others = [
-        Solver(name="ipopt", qp="", run=_ipopt),
+        Solver(name="ipopt", qp="", run=partial(_ipopt, linear="mumps")),
+        Solver(name="ipopt-spral", qp="", run=partial(_ipopt, linear="spral")),
+        *(Solver(name=f"uno-{n}", qp="", run=partial(_uno, preset=n)) for n in ("filtersqp", "ipopt")),
         *(Solver(name="sqpmethod", qp=qp, run=partial(_casadi, qp=qp)) for qp in ("qpoases", "piqp")),
         *(Solver(name=n, qp="", run=partial(_scipy, method=n)) for n in ("slsqp", "trust-constr")),
     ]

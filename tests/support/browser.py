@@ -29,9 +29,12 @@ PATIENCE = 60.0  # [s] for one page to be ready
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A page to open at a width [pixels]; then each script, an expression, is run, and its value kept."""
+    """A page to open at a width [pixels]; then each script, an expression, is run, and its value kept.
 
-    page: Path
+    page : a file, or an address.
+    """
+
+    page: Path | str
     width: int = 1280
     scripts: tuple[str, ...] = ()
     picture: Path | None = None  # a file to put one into
@@ -49,7 +52,7 @@ class Visit:
 
 def visit(*jobs: Job, flags: str = "") -> list[Visit]:
     """The jobs, one after the other, in one browser; flags : DARK, WITHOUT_3D."""
-    given = json.dumps([dataclasses.asdict(job) for job in jobs], default=lambda path: str(path.resolve()))
+    given = json.dumps([dataclasses.asdict(job) for job in jobs], default=lambda path: path.resolve().as_uri())
     environment = {
         **os.environ,
         "QT_QPA_PLATFORM": "offscreen",
@@ -115,7 +118,7 @@ def _main() -> None:
         view.setPage(page)
         view.resize(job["width"], 900)
         view.show()
-        page.load(QUrl.fromLocalFile(job["page"]))
+        page.load(QUrl(job["page"]))
         end = time.monotonic() + PATIENCE
         while not value(page, job["ready"]) and time.monotonic() < end:
             wait(50)
@@ -125,7 +128,7 @@ def _main() -> None:
             wait(50)
         if job["picture"]:
             wait(300)
-            view.grab().save(job["picture"])
+            view.grab().save(QUrl(job["picture"]).toLocalFile())
         answers.append(dataclasses.asdict(answer))
         view.close()
         view.setPage(None)

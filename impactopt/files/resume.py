@@ -61,7 +61,9 @@ def _apart(told: list[dict[str, Any]]) -> dict[ApartRow, Held]:
     count: Counter[tuple[Any, ...]] = Counter()
     for row in told:
         same = row["place"], row["joint"], row["other"]
-        held = {key: tuple(v) if isinstance(v := row[key], list) else v for key in Held._fields}
+        held: dict[str, Any] = {
+            key: tuple(v) if isinstance(v := row[key], list) else v for key in Held._fields
+        }
         rows[ApartRow(*same, count[same])] = Held(**held)
         count[same] += 1
     return rows
@@ -79,7 +81,7 @@ def _is_of(t: Transcription, record: Record) -> bool:
 def _solution(record: Record, t: Transcription) -> Solution:
     summary = record.summary
     given = {f.name: record.arrays.get(f"solver_{f.name}") for f in dataclasses.fields(SolverResult)}
-    numbers = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}
+    numbers: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}
     status = Status(summary["status"])
     result = SolverResult(**numbers, status=status, message=str(summary["message"]))
     return Solution(

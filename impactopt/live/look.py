@@ -50,7 +50,7 @@ class LiveLook:
     def __init__(self, first: Solution, *, host: str = LOCAL, port: int = 0) -> None:
         if not first.status.usable:
             raise InputError(
-                f"this plan is no solution ({first.status.value}), so none can be bent from it: solve it first"
+                f"this plan is no solution ({first.status.value}), so no other can be made of it: solve it"
             )
         self.first, self.wish = first, wish_of(first.problem)
         replanning = Replanning(first)
@@ -135,11 +135,11 @@ class LiveLook:
 
     def _look_at(self, first: Solution) -> None:
         """The camera, beside the robot and a little ahead."""
-        middle = np.array(self._track.mass[0] + self._track.hand[-1]) / 2
+        middle = 0.4 * self._track.mass[0] + 0.6 * first.problem.point
         normal = first.problem.normal
         side = np.cross([0.0, 0.0, 1.0], normal)
         side = side if np.linalg.norm(side) > 1e-3 else np.array([0.0, -1.0, 0.0])
-        away = 1.5 * side / np.linalg.norm(side) + np.array([0.6, 0.0, 0.4])
+        away = 1.8 * side / np.linalg.norm(side) + np.array([0.9, 0.0, 0.5])
         right = float(first.problem.point[1]) < float(self._track.places[0, 1:, 1].mean())
         camera = self._server.initial_camera
         camera.look_at = middle

@@ -60,10 +60,11 @@ def numbers_of(problem: ImpactProblem) -> tuple[Number, ...]:
     A wall has no mass, and an arm that is bolted down no ZMP.
     """
     found = []
-    for name, what, thing in (
+    parts: tuple[tuple[str, str, Any], ...] = (
         ("mass", "target's mass", problem.target),
         ("stiffness", "contact's stiffness", problem.law),
-    ):
+    )
+    for name, what, thing in parts:
         for field in dataclasses.fields(thing):
             if field.name == name:
                 value = float(getattr(thing, name))
@@ -71,11 +72,11 @@ def numbers_of(problem: ImpactProblem) -> tuple[Number, ...]:
                 found.append(_between(name, f"{what} [{unit}]", value, value / _RANGE, value * _RANGE))
     if problem.coordinates.legs:
         margin = 1e3 * problem.term(ContactWrenchCone).margin
-        found.append(_between("margin", "margin of the ZMP [m]", margin / 1e3, 0.0, max(2e-3 * margin, _MARGIN)))
+        found.append(
+            _between("margin", "margin of the ZMP [m]", margin / 1e3, 0.0, max(2e-3 * margin, _MARGIN))
+        )
     return tuple(found)
 
 
 def _between(name: str, label: str, value: float, least: float, most: float) -> Number:
-    return Number(
-        name=name, label=label, value=value, least=least, most=most, step=(most - least) / _STEPS
-    )
+    return Number(name=name, label=label, value=value, least=least, most=most, step=(most - least) / _STEPS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -78,7 +79,7 @@ def planned_track(solution: Solution, reference: Trajectory | None = None) -> Tr
     ------
     InputError : the plan's motion cannot be completed.
     """
-    parts = {"reference": reference or solution.trajectory, "collision": solution.collision}
+    parts: dict[str, Any] = {"reference": reference or solution.trajectory, "collision": solution.collision}
     arrays = {"polygon": solution.plan.polygon}
     for prefix, part in parts.items():
         arrays |= {f"{prefix}_{f.name}": getattr(part, f.name) for f in fields(part)}

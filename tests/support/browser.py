@@ -39,6 +39,7 @@ class Job:
     scripts: tuple[str, ...] = ()
     picture: Path | None = None  # a file to put one into
     ready: str = READY  # an expression that says that the page can be looked at
+    done: str = ""  # one that says that the scripts have had their effect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,9 @@ class Visit:
 
 def visit(*jobs: Job, flags: str = "") -> list[Visit]:
     """The jobs, one after the other, in one browser; flags : DARK, WITHOUT_3D."""
-    given = json.dumps([dataclasses.asdict(job) for job in jobs], default=lambda path: path.resolve().as_uri())
+    given = json.dumps(
+        [dataclasses.asdict(job) for job in jobs], default=lambda path: path.resolve().as_uri()
+    )
     environment = {
         **os.environ,
         "QT_QPA_PLATFORM": "offscreen",
@@ -125,6 +128,9 @@ def _main() -> None:
         wait(100)
         for script in job["scripts"]:
             answer.values.append(value(page, script))
+            wait(50)
+        end = time.monotonic() + PATIENCE
+        while job["done"] and not value(page, job["done"]) and time.monotonic() < end:
             wait(50)
         if job["picture"]:
             wait(300)

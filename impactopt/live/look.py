@@ -9,7 +9,6 @@ import socket
 import threading
 import time
 import traceback
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,7 +57,7 @@ class LiveLook:
         self._server = _served(host, port)
         shown = f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{self._server.get_port()}"
-        self._drawn = threading.RLock()
+        self._drawn, self._asking = threading.RLock(), threading.RLock()
         self._drawing = Drawing(self._server, first.problem.robot)
         self._controls()
         self._look_at(first)
@@ -123,15 +122,15 @@ class LiveLook:
         with gui.add_folder("Plan"):
             for number in numbers_of(problem):
                 slider = gui.add_slider(number.label, number.least, number.most, number.step, number.value)
-                slider.on_update(lambda _, name=number.name: self._slid(name))
+                slider.on_update(lambda _: self.changed())
                 self.sliders[number.name] = slider
             self.again = gui.add_button("back to the first plan")
         self.hit = self._server.scene.add_transform_controls(
             "/hit point", scale=0.25, disable_rotations=True, position=problem.point, depth_test=False
         )
         self.time.on_update(lambda event: self._draw() if event.client is not None else None)
-        self.hit.on_update(lambda _: self._dragged())
-        self.again.on_click(lambda _: self._reset())
+        self.hit.on_update(lambda _: self.changed())
+        self.again.on_click(lambda _: self.reset())
 
     def _look_at(self, first: Solution) -> None:
         """The camera, beside the robot and a little ahead."""
@@ -145,23 +144,24 @@ class LiveLook:
         camera.look_at = middle
         camera.position = middle + away * [1.0, -np.sign(away[1]) if right else np.sign(away[1]), 1.0]
 
-    def _slid(self, name: str) -> None:
-        numbers = dict(self.wish.numbers) | {name: float(self.sliders[name].value)}
-        if numbers != dict(self.wish.numbers):
-            self.ask(replace(self.wish, numbers=tuple(numbers.items())))
+    def changed(self) -> None:
+        """Ask for what the controls say, if that is something else than before."""
+        with self._asking:  # viser calls from several threads
+            x, y, z = (float(v) for v in self.hit.position)
+            numbers = tuple((name, float(slider.value)) for name, slider in self.sliders.items())
+            wish = Wish(point=(x, y, z), numbers=numbers)
+            if wish != self.wish:
+                self.ask(wish)
 
-    def _dragged(self) -> None:
-        x, y, z = (float(v) for v in self.hit.position)
-        if (x, y, z) != self.wish.point:
-            self.ask(replace(self.wish, point=(x, y, z)))
-
-    def _reset(self) -> None:
-        own = wish_of(self.first.problem)
-        self.wish = own  # so that the sliders ask for nothing
-        for name, value in own.numbers:
-            self.sliders[name].value = value
-        self.hit.position = np.array(own.point)
-        self.ask(own)
+    def reset(self) -> None:
+        """Put all controls, and with them the plan, back to the first."""
+        with self._asking:
+            own = wish_of(self.first.problem)
+            self.ask(own)  # at first, so that no control asks on its way
+            for name, value in own.numbers:
+                self.sliders[name].value = value
+            self.hit.position = np.array(own.point)
+            self.ask(own)
 
     def _told(self, _: Wish, answer: Answer | Exception) -> None:
         if isinstance(answer, Exception):  # a fault of ours, which must not end the page

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from impactopt.errors import InputError
 from impactopt.live.wishes import Wish
-from impactopt.planning.bent_program import bent_of
 from impactopt.planning.changes import moved_problem
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import Track, planned_track
 from impactopt.solvers.program import IterationRecord, Status
+from impactopt.transcription.plan import Plan, Trajectory
 
 __all__ = ["Answer", "Replanning"]
 
 PATIENCE = 20.0  # [s] that each of the two ways may take
-STEP = 4e-3  # [s] between instants of the motion that is drawn
+_STEPS = 3e-3, 1e-2  # [s] least and most between instants of the motion that is drawn
+_IN_CONTACT = 6  # instants, if the least step allows it
 _WORST = 5  # rows that are told
 # of the solver: the impulse is within a thousandth, in half of the iterations
 _LOOSE = {"kkt_tolerance": 1e-3, "complementarity_tolerance": 1e-3}
@@ -50,7 +54,10 @@ class Replanning:
     def __init__(self, first: Solution, *, patience: float = PATIENCE) -> None:
         self.first = self.last = first
         self.patience = patience
-        _ = bent_of(first).steady  # factored now, and not when the first slider moves
+        with contextlib.suppress(
+            InputError
+        ):  # what that needs is made now, and not when the first slider moves
+            first.moved(point=first.problem.point, options=_LOOSE)
 
     def __call__(self, wish: Wish, stale: Callable[[], bool]) -> Answer:
         began = time.perf_counter()
@@ -58,7 +65,7 @@ class Replanning:
             solution = self._plan(wish.changes(self.first.problem), stale)
             if not solution.status.usable:
                 return Answer(seconds=time.perf_counter() - began, why=why_not(solution))
-            reference = solution.plan.trajectory(step=STEP)
+            reference = _reference(solution.plan)
             track = planned_track(solution, reference)
         except InputError as error:
             return Answer(seconds=time.perf_counter() - began, why=str(error))
@@ -76,14 +83,20 @@ class Replanning:
             return stale()
 
         common: dict[str, Any] = {"callback": stop, "time_limit": self.patience, "options": _LOOSE}
-        problem = moved_problem(self.first.problem, **changes)
         try:
             bent = self.first.moved(**changes, **common)
-        except InputError:  # its program has other rows
+        except InputError:  # its program has other rows, or there is no such problem
             bent = None
         if bent is not None and (bent.status.usable or stale()):
             return bent
+        problem = moved_problem(self.first.problem, **changes)
         return solve(problem, start=self.last, **common)
+
+
+def _reference(plan: Plan) -> Trajectory:
+    """As coarse as a picture may be: it costs as much as some iterations."""
+    duration = plan.compression + plan.restitution
+    return plan.trajectory(step=float(np.clip(duration / _IN_CONTACT, *_STEPS)), hold=0.2)
 
 
 def why_not(solution: Solution) -> str:

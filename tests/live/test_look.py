@@ -74,7 +74,7 @@ def test_a_slider_makes_a_new_plan(look: LiveLook, arm: Solution) -> None:
 def test_a_dragged_hit_point_is_hit_where_it_is(look: LiveLook, arm: Solution) -> None:
     point = arm.problem.point + np.array([0.01, 0.0, -0.01])
     look.hit.position = point
-    look._dragged()
+    look.changed()
     assert look.wait(LONG)
     track = look.answer.track
     assert track is not None
@@ -85,11 +85,11 @@ def test_a_dragged_hit_point_is_hit_where_it_is(look: LiveLook, arm: Solution) -
 
 def test_what_cannot_be_hit_leaves_the_old_plan_and_says_why(look: LiveLook, arm: Solution) -> None:
     look.hit.position = arm.problem.point + np.array([0.0, 0.5, 0.0])  # out of the arm's plane
-    look._dragged()
+    look.changed()
     assert look.wait(LONG)
     assert look.answer.solution is arm
     assert "out of reach" in look.status.content
-    look._reset()
+    look.reset()
     assert look.wait(LONG)
     assert look.status.content == ""
     assert look.hit.position == pytest.approx(arm.problem.point)
@@ -101,7 +101,7 @@ def test_a_fault_of_ours_is_told_and_leaves_the_old_plan(
     def broken(*_: object, **__: object) -> Solution:
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr("impactopt.live.replanning.moved_problem", broken)
+    monkeypatch.setattr(Solution, "moved", broken)
     look.sliders["stiffness"].value = 1.1 * arm.problem.law.stiffness
     assert look.wait(LONG)
     assert look.answer.solution is arm

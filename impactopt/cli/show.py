@@ -13,6 +13,8 @@ from impactopt.cli.options import OtherProblem
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
+    from impactopt.live.blow import LiveBlow
+    from impactopt.live.look import LiveLook
     from impactopt.report.report import Report
 
 PAGE = "report.html"
@@ -43,7 +45,8 @@ def show(
         bool,
         typer.Option(
             "--live",
-            help="Serve a page on this machine whose sliders and hit point make new plans, until Ctrl-C.",
+            help="Serve a page on this machine until Ctrl-C: its sliders and hit point make new plans; of a "
+            "problem file: posture and speed of one collision.",
         ),
     ] = False,
     port: Annotated[
@@ -82,20 +85,30 @@ def show(
 
 def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> None:
     """Serve the page of a result."""
-    with plain_errors("the live page has ended"):
-        from impactopt.errors import InputError
-        from impactopt.files.replay import load_planned
-        from impactopt.files.resume import resumed
-        from impactopt.live.look import LiveLook
+    with plain_errors("the live page has ended"), _page(what, problem, port or 0) as look:
+        typer.echo(f"{look.address} (Ctrl-C ends it)")
+        if open_:
+            webbrowser.open(look.address)
+        look.run()
 
-        if _is_robot(what):
-            raise InputError(f"--live is for a result of `impactopt solve`, and {str(what)!r} is none")
+
+def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
+    """Of a result, or of a problem file's collision."""
+    from impactopt.errors import InputError
+    from impactopt.files.problem_file import read_problem_file
+    from impactopt.files.replay import load_planned
+    from impactopt.files.resume import resumed
+    from impactopt.live.blow import LiveBlow
+    from impactopt.live.look import LiveLook
+
+    if not _is_robot(what):
         planned = load_planned(what, problem_file=problem)
-        with LiveLook(resumed(planned.record, planned.problem), port=port or 0) as look:
-            typer.echo(f"{look.address} (Ctrl-C ends it)")
-            if open_:
-                webbrowser.open(look.address)
-            look.run()
+        return LiveLook(resumed(planned.record, planned.problem), port=port)
+    if what.suffix != ".toml" or problem is not None:
+        raise InputError(
+            f"--live is for a result, or for a problem file alone, which says what is hit: {str(what)!r} does not"
+        )
+    return LiveBlow(read_problem_file(what).build(), port=port)
 
 
 def _is_robot(what: Path) -> bool:

@@ -68,7 +68,15 @@ class Drawing:
             solid = cylinder(*MARK).moved(turned, self.point + self.normal * MARK[1] / 2)
             parts.append(Part(kind="target", solid=solid, moves=True))
         self.parts = [(part, self._add(k, part)) for k, part in enumerate(parts)]
-        self._lines("/path of the hand", np.stack([track.hand[:-1], track.hand[1:]], axis=1), RED)
+        self.path("/path of the hand", track.hand, RED)
+        self.polygon(polygon)
+
+    def path(self, name: str, places: Array, colour: tuple[int, int, int] = BLUE) -> None:
+        """A line through these (k, 3) [m]."""
+        self._lines(name, np.stack([places[:-1], places[1:]], axis=1), colour)
+
+    def polygon(self, polygon: Array) -> None:
+        """The support polygon's edges."""
         if len(polygon):
             corners = np.column_stack([polygon, np.full(len(polygon), 1e-3)])
             edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)

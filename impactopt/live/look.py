@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import io
-import socket
 import threading
 import time
 import traceback
@@ -13,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.errors import InputError, missing_package
+from impactopt.errors import InputError
 from impactopt.live.drawing import Drawing
 from impactopt.live.motion import moment_of
 from impactopt.live.newest import Newest
 from impactopt.live.replanning import Answer, Replanning
+from impactopt.live.serving import LOCAL, address_of, ended, served
 from impactopt.live.telling import told_failure, told_plan
 from impactopt.live.wishes import Wish, numbers_of, wish_of
 from impactopt.planning.solution import Solution
 from impactopt.report.tracks import Track
 
-__all__ = ["LOCAL", "LiveLook"]
+__all__ = ["LiveLook"]
 
-LOCAL = "127.0.0.1"
 FRAME = 1 / 30  # [s]
 SPEEDS = {"1": 1.0, "1/4": 0.25, "1/20": 0.05}
 
@@ -54,9 +50,8 @@ class LiveLook:
         self.first, self.wish = first, wish_of(first.problem)
         replanning = Replanning(first)
         self.answer = replanning(self.wish, lambda: False)
-        self._server = _served(host, port)
-        shown = f"[{host}]" if ":" in host else host
-        self.address = f"http://{shown}:{self._server.get_port()}"
+        self._server = served(host, port)
+        self.address = address_of(self._server, host)
         self._drawn, self._asking = threading.RLock(), threading.RLock()
         self._drawing = Drawing(self._server, first.problem.robot)
         self._controls()
@@ -95,8 +90,7 @@ class LiveLook:
     def close(self) -> None:
         """End all plans and the page."""
         self._newest.close(timeout=1.0)
-        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
-            self._server.stop()
+        ended(self._server)
 
     def __enter__(self) -> LiveLook:
         return self
@@ -189,25 +183,3 @@ class LiveLook:
     def _draw(self) -> None:
         with self._drawn, self._server.atomic():
             self._drawing.at(moment_of(self._track, float(self.time.value)))
-
-
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
-
-
-def _served(host: str, port: int) -> Any:
-    """A `viser.ViserServer` there."""
-    try:
-        import viser
-    except ImportError as error:
-        raise missing_package("a live look", "viser", "live") from error
-    # viser would take another port than the one that is asked for
-    try:
-        with socket.create_server((host, port), family=_family(host)):
-            pass
-    except (OSError, OverflowError) as error:
-        taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        mend = "give another --port, or none" if taken else "give another --host or --port"
-        raise InputError(f"cannot serve a page at {host}:{port}: {error}; {mend}") from error
-    with contextlib.redirect_stdout(io.StringIO()):  # it has a banner
-        return viser.ViserServer(host=host, port=port, label="impactopt", verbose=False)

@@ -16,8 +16,10 @@ import pinocchio as pin
 import pytest
 from support.browser import Job, visit
 from support.small_plans import biped_problem
+from typer.testing import CliRunner
 
 from impactopt import load_problem, solve
+from impactopt.cli.app import app
 from impactopt.contact.targets import RigidWall
 from impactopt.errors import InputError
 from impactopt.files.output import load_record, record_of, save_record
@@ -268,3 +270,18 @@ def test_the_command_serves_until_ctrl_c(saved: Path) -> None:
             process.kill()
     assert process.returncode == 130
     assert (out, err) == ("", "the live page has ended\n")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["standin", "--live"], "--live is for a result, or for a problem file"),
+        (["results/none", "--live"], "there is no"),
+        (["standin", "--port", "8000"], "--live alone"),
+        (["results/none", "--live", "--out", "page.html"], "a live page is not written"),
+    ],
+)
+def test_what_a_live_page_cannot_be_of_is_refused(given: list[str], told: str) -> None:
+    done = CliRunner().invoke(app, ["show", *given])
+    assert done.exit_code == 2
+    assert told in " ".join(done.stderr.replace("│", "").split())

@@ -194,6 +194,7 @@ app.command(
         "impactopt show results/punch --open",
         "impactopt show talos --open",
         "impactopt show results/punch --live --port 8080",
+        "impactopt show my.toml --live",
     )
 )(show)
 app.command(

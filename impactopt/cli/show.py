@@ -106,7 +106,7 @@ def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
         return LiveLook(resumed(planned.record, planned.problem), port=port)
     if what.suffix != ".toml" or problem is not None:
         raise InputError(
-            f"--live is for a result, or for a problem file alone, which says what is hit: {str(what)!r} does not"
+            f"--live is for a result, or for a problem file alone: {str(what)!r} does not say what is hit"
         )
     return LiveBlow(read_problem_file(what).build(), port=port)
 

@@ -69,6 +69,9 @@ class LiveBlow:
         self._drawing = Drawing(self._server, problem.robot)
         self._drawing.normal = problem.normal
         self._drawing.polygon(self._polygon)
+        model = problem.robot.model
+        mass = np.array(pin.centerOfMass(model, model.createData(), problem.contact_posture))
+        self._drawing.watch(mass, problem.point, problem.normal, float(mass[1]))
         self._controls()
         self.blow = Blow()
         self._newest: Newest[Array, Blow] = Newest(self._strike, self._told)

@@ -24,6 +24,8 @@ RED, BLUE, GREEN, WOOD, GREY = (214, 69, 65), (31, 119, 180), (44, 160, 44), (20
 LONGEST = 0.4  # [m] arrow of the largest force
 MARK = 0.05, 0.01  # [m] radius and thickness of the mark where no body of the target is known
 CLEAR = 0.35  # opacity
+AWAY = 1.8  # [m] of the camera
+LEVEL = 1e-3  # a normal that is less so has no side
 
 
 class Drawing:
@@ -33,7 +35,7 @@ class Drawing:
     """
 
     def __init__(self, server: Any, robot: Robot) -> None:
-        self.scene = server.scene
+        self.scene, self.camera = server.scene, server.initial_camera
         self.scene.set_up_direction("+z")
         self.scene.add_grid("/ground", width=4.0, height=4.0, cell_size=0.25)
         self.joints: dict[int, Any] = {}
@@ -81,6 +83,20 @@ class Drawing:
             corners = np.column_stack([polygon, np.full(len(polygon), 1e-3)])
             edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
             self._lines("/support polygon", edges, BLUE)
+
+    def watch(self, mass: Array, point: Array, normal: Array, middle: float) -> None:
+        """Put the camera beside the blow, a little ahead and above, on the side where the hand is.
+
+        mass, point (3,) [m]: centre of mass and hit point.  middle [m]: y of the robot's middle.
+        """
+        aside = np.array([normal[1], -normal[0], 0.0])  # to the right of the way that the hand goes
+        size = float(np.linalg.norm(aside))
+        aside = aside / size if size > LEVEL else np.array([0.0, -1.0, 0.0])
+        if (point[1] - middle) * aside[1] < 0:
+            aside = -aside
+        ahead = normal * [1.0, 1.0, 0.0]
+        self.camera.look_at = 0.4 * mass + 0.6 * point
+        self.camera.position = self.camera.look_at + AWAY * aside + 0.5 * AWAY * ahead + [0.0, 0.0, 0.5]
 
     def at(self, moment: Moment) -> None:
         """Put all where it is at this instant."""

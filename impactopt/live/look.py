@@ -55,7 +55,9 @@ class LiveLook:
         self._drawn, self._asking = threading.RLock(), threading.RLock()
         self._drawing = Drawing(self._server, first.problem.robot)
         self._controls()
-        self._look_at(first)
+        track, problem = self._track, first.problem
+        middle = float(track.places[0, 1:, 1].mean())
+        self._drawing.watch(track.mass[0], problem.point, problem.normal, middle)
         self._take(self.answer)
         self._newest: Newest[Wish, Answer] = Newest(replanning, self._told)
 
@@ -125,18 +127,6 @@ class LiveLook:
         self.time.on_update(lambda event: self._draw() if event.client is not None else None)
         self.hit.on_update(lambda _: self.changed())
         self.again.on_click(lambda _: self.reset())
-
-    def _look_at(self, first: Solution) -> None:
-        """The camera, beside the robot and a little ahead."""
-        middle = 0.4 * self._track.mass[0] + 0.6 * first.problem.point
-        normal = first.problem.normal
-        side = np.cross([0.0, 0.0, 1.0], normal)
-        side = side if np.linalg.norm(side) > 1e-3 else np.array([0.0, -1.0, 0.0])
-        away = 1.8 * side / np.linalg.norm(side) + np.array([0.9, 0.0, 0.5])
-        right = float(first.problem.point[1]) < float(self._track.places[0, 1:, 1].mean())
-        camera = self._server.initial_camera
-        camera.look_at = middle
-        camera.position = middle + away * [1.0, -np.sign(away[1]) if right else np.sign(away[1]), 1.0]
 
     def changed(self) -> None:
         """Ask for what the controls say, if that is something else than before."""

@@ -185,5 +185,5 @@ class LiveBlow:
             ratio = np.abs(hit.demand / self.problem.robot.torque_limit).max(axis=0)
             worst = int(np.argmax(ratio))
             name = self.problem.robot.joint_names[worst]
-            lines.append(f"- torque {100 * ratio[worst]:.0f} % of its limit ({name})")
+            lines.append(f"- torque demand {100 * ratio[worst]:.0f} % of the limit ({name})")
         return "\n".join([*lines, f"\n{blow.seconds:.2f} s"])

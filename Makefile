@@ -5,7 +5,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 BROWSER := $(VENV)/.browser
-EXTRAS := robots,validate,qp,peers,sweep,cluster,mcap,docs,notebooks,dev
+EXTRAS := robots,validate,qp,peers,sweep,cluster,mcap,live,docs,notebooks,dev
 ARGS   ?=
 
 .DEFAULT_GOAL := help

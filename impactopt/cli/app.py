@@ -189,7 +189,14 @@ app.command(
     )
 )(validate)
 app.command(epilog=EXAMPLES)(verify)
-app.command(epilog=examples("impactopt show results/punch --open", "impactopt show talos --open"))(show)
+app.command(
+    epilog=examples(
+        "impactopt show results/punch --open",
+        "impactopt show talos --open",
+        "impactopt show results/punch --live --port 8080",
+        "impactopt show my.toml --live",
+    )
+)(show)
 app.command(
     epilog=examples(
         "impactopt compare results/punch results/punch_robust",

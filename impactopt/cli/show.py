@@ -1,4 +1,4 @@
-"""The command `impactopt show`: a result, or the bodies of a robot, as one page for a browser."""
+"""The command `impactopt show`: a result, or the bodies of a robot, as one page for a browser; or live."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from impactopt.cli.options import OtherProblem
 from impactopt.report.plain_errors import plain_errors
 
 if TYPE_CHECKING:
+    from impactopt.live.blow import LiveBlow
+    from impactopt.live.look import LiveLook
     from impactopt.report.report import Report
 
 PAGE = "report.html"
@@ -39,14 +41,35 @@ def show(
     ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
     problem: OtherProblem = None,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            help="Serve a page on this machine until Ctrl-C: its sliders and hit point make new plans; of a "
+            "problem file: posture and speed of one collision.",
+        ),
+    ] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=65535, metavar="PORT", help="Of the live page, on 127.0.0.1 (default: a free one)."
+        ),
+    ] = None,
 ) -> None:
     """Write a result as one page: numbers, plots, the robot's motion, how it was made. It needs no network.
 
     For a robot the page shows its bodies: hulls and spheres over its meshes, how well they fit, which may
     touch.
 
-    Exit code: 0 written, 2 bad input.
+    Exit code: 0 written, 2 bad input, 130 Ctrl-C, which is how a live page ends.
     """
+    if port is not None and not live:
+        raise typer.BadParameter("it is for --live alone", param_hint="--port")
+    if live:
+        if out is not None:
+            raise typer.BadParameter("a live page is not written: leave one of them out", param_hint="--out")
+        _live(what, problem, port, open_)
+        return
     with plain_errors("interrupted before the page was written"):
         from impactopt.errors import printable
         from impactopt.files.output import make_directory
@@ -58,6 +81,34 @@ def show(
         typer.echo(printable(str(written)))
         if open_:
             webbrowser.open(written.resolve().as_uri())
+
+
+def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> None:
+    """Serve the page of a result."""
+    with plain_errors("the live page has ended"), _page(what, problem, port or 0) as look:
+        typer.echo(f"{look.address} (Ctrl-C ends it)")
+        if open_:
+            webbrowser.open(look.address)
+        look.run()
+
+
+def _page(what: Path, problem: Path | None, port: int) -> LiveLook | LiveBlow:
+    """Of a result, or of a problem file's collision."""
+    from impactopt.errors import InputError
+    from impactopt.files.problem_file import read_problem_file
+    from impactopt.files.replay import load_planned
+    from impactopt.files.resume import resumed
+    from impactopt.live.blow import LiveBlow
+    from impactopt.live.look import LiveLook
+
+    if not _is_robot(what):
+        planned = load_planned(what, problem_file=problem)
+        return LiveLook(resumed(planned.record, planned.problem), port=port)
+    if what.suffix != ".toml" or problem is not None:
+        raise InputError(
+            f"--live is for a result, or for a problem file alone: {str(what)!r} does not say what is hit"
+        )
+    return LiveBlow(read_problem_file(what).build(), port=port)
 
 
 def _is_robot(what: Path) -> bool:

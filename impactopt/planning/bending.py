@@ -18,7 +18,7 @@ from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after
 from impactopt.planning.rounds import Refining
 from impactopt.planning.solution import Solution
 from impactopt.solvers.active import ActiveSystem, Change, Offset
-from impactopt.solvers.program import SolverResult, Status, max_violation
+from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.rattle import rattle
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.transcription import Transcription
@@ -43,6 +43,7 @@ def moved_solution(
     refine: bool = False,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
+    callback: Callback | None = None,
 ) -> Solution:
     """The plan for a problem with other numbers: `Solution.moved`."""
     problem = moved_problem(
@@ -59,7 +60,7 @@ def moved_solution(
     began = time.perf_counter()
     t = bent.program_for(problem)
     built = time.perf_counter()
-    budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=None).started()
+    budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=callback).started()
     first = _first_order(solution, t, system, own)
     if not polish:
         return _solution(solution, t, first, (built - began, time.perf_counter() - built))
@@ -71,7 +72,8 @@ def moved_solution(
         result = budget.run(t.program, first, _BARRIER)
     else:
         result = budget.run(t.program, old)
-    if near and not result.status.usable and budget.left != 0:
+    stopped = result.status is Status.INTERRUPTED
+    if near and not (result.status.usable or stopped) and budget.left != 0:
         result = one_after_the_other(result, budget.run(t.program, old))
     if refine:
         t, result, _ = refining.rounds(t, result, old.x)

@@ -197,7 +197,8 @@ class Solution(Solved):
         First come Newton steps with the KKT system of this plan and its active set, factored once; then the
         solver goes on from there, with this plan's mesh. ``polish=False``: the first alone. They are quick
         and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
-        ``refine=True`` refines the mesh too, as `impactopt.solve` does.
+        ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
+        ``time_limit`` are those of `impactopt.solve`.
 
         Raises
         ------

@@ -16,7 +16,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.report.tracks import AROUND, FAR, Track, tracks_of
 from impactopt.robots.robot import Robot
 
-__all__ = ["pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
+__all__ = ["bodies_drawn", "pack_robot", "pack_solid", "pack_track", "pack_world", "stage_of"]
 
 Array = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
@@ -56,7 +56,7 @@ def pack_robot(robot: Robot, arrays: Arrays) -> list[dict[str, Any]]:
     """What the robot looks like, for the page's header; its triangles are added to `arrays`."""
     return [
         {"joint": body.joint, "colour": body.colour, **pack_solid(f"body{k}", body.solid, arrays)}
-        for k, body in enumerate(_bodies(visuals_of(robot)))
+        for k, body in enumerate(bodies_drawn(robot))
     ]
 
 
@@ -79,10 +79,10 @@ def _middle(places: Array) -> float:
     return float(places[0, 1:, 1].mean())
 
 
-def _bodies(visuals: list[Visual]) -> list[Visual]:
-    """One for each joint and colour, with few enough triangles in all."""
+def bodies_drawn(robot: Robot) -> list[Visual]:
+    """What a robot looks like: a solid for each joint and colour, with few enough triangles in all."""
     groups: dict[tuple[int, tuple[float, float, float]], list[Solid]] = {}
-    for visual in visuals:
+    for visual in visuals_of(robot):
         groups.setdefault((visual.joint, visual.colour), []).append(visual.solid)
     whole = {key: joined(solids) for key, solids in groups.items()}
     if sum(len(solid.triangles) for solid in whole.values()) > TRIANGLES:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.files.output import Record
+from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.result import centre_of_pressure, travelled
+from impactopt.transcription.plan import Trajectory
 
-__all__ = ["AROUND", "FAR", "Track", "planned_hand_speed", "tracks_of"]
+__all__ = ["AROUND", "FAR", "Track", "planned_hand_speed", "planned_track", "tracks_of"]
 
 Array = NDArray[np.float64]
 AROUND = 0.05  # [s] before and after contact that are shown slowly
@@ -65,6 +68,23 @@ def tracks_of(record: Record, problem: ImpactProblem) -> list[Track]:
     return [
         _track(record, problem, name, prefix) for name, prefix in MOTIONS if f"{prefix}_q" in record.arrays
     ]
+
+
+def planned_track(solution: Solution, reference: Trajectory | None = None) -> Track:
+    """The planned motion of a solution, of which there is no record.
+
+    reference : the servo's, sampled otherwise than `Solution.trajectory`.
+
+    Raises
+    ------
+    InputError : the plan's motion cannot be completed.
+    """
+    parts: dict[str, Any] = {"reference": reference or solution.trajectory, "collision": solution.collision}
+    arrays = {"polygon": solution.plan.polygon}
+    for prefix, part in parts.items():
+        arrays |= {f"{prefix}_{f.name}": getattr(part, f.name) for f in fields(part)}
+    record = Record(summary={"target": solution.collision.outcome}, arrays=arrays)
+    return _track(record, solution.problem, *MOTIONS[0])
 
 
 def _track(record: Record, problem: ImpactProblem, name: str, prefix: str) -> Track:

@@ -29,13 +29,17 @@ PATIENCE = 60.0  # [s] for one page to be ready
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A page to open at a width [pixels]; then each script, an expression, is run, and its value kept."""
+    """A page to open at a width [pixels]; then each script, an expression, is run, and its value kept.
 
-    page: Path
+    page : a file, or an address.
+    """
+
+    page: Path | str
     width: int = 1280
     scripts: tuple[str, ...] = ()
     picture: Path | None = None  # a file to put one into
     ready: str = READY  # an expression that says that the page can be looked at
+    done: str = ""  # one that says that the scripts have had their effect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +53,9 @@ class Visit:
 
 def visit(*jobs: Job, flags: str = "") -> list[Visit]:
     """The jobs, one after the other, in one browser; flags : DARK, WITHOUT_3D."""
-    given = json.dumps([dataclasses.asdict(job) for job in jobs], default=lambda path: str(path.resolve()))
+    given = json.dumps(
+        [dataclasses.asdict(job) for job in jobs], default=lambda path: path.resolve().as_uri()
+    )
     environment = {
         **os.environ,
         "QT_QPA_PLATFORM": "offscreen",
@@ -115,7 +121,7 @@ def _main() -> None:
         view.setPage(page)
         view.resize(job["width"], 900)
         view.show()
-        page.load(QUrl.fromLocalFile(job["page"]))
+        page.load(QUrl(job["page"]))
         end = time.monotonic() + PATIENCE
         while not value(page, job["ready"]) and time.monotonic() < end:
             wait(50)
@@ -123,9 +129,12 @@ def _main() -> None:
         for script in job["scripts"]:
             answer.values.append(value(page, script))
             wait(50)
+        end = time.monotonic() + PATIENCE
+        while job["done"] and not value(page, job["done"]) and time.monotonic() < end:
+            wait(50)
         if job["picture"]:
             wait(300)
-            view.grab().save(job["picture"])
+            view.grab().save(QUrl(job["picture"]).toLocalFile())
         answers.append(dataclasses.asdict(answer))
         view.close()
         view.setPage(None)

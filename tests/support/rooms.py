@@ -30,6 +30,7 @@ ROOMS_IN_ORDER = (
     "sweeps",
     "identification",
     "report",
+    "live",
     "studies",
     "cli",
     "__main__",

@@ -1,0 +1,103 @@
+"""Saved plans as solutions again, from which others can be planned."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from impactopt.files.output import Record
+from impactopt.planning.models import model_error
+from impactopt.planning.multistart import violations_of
+from impactopt.planning.planner import solve
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import SolverResult, Status, max_violation
+from impactopt.transcription.apart import ApartRow, Held
+from impactopt.transcription.mesh import Elements
+from impactopt.transcription.mesh_refinement import MoreNodes
+from impactopt.transcription.rattle import rattle
+from impactopt.transcription.transcription import Transcription, block_functions
+
+__all__ = ["resumed"]
+
+_SAME = 1e-6  # of rows: those of a program that is not the record's are off by more
+
+
+def resumed(record: Record, problem: ImpactProblem) -> Solution:
+    """The solution that a record is of, as far as a start has to know it: of its history it knows nothing.
+
+    The program is made again from what the record says of it. Where it says nothing, or the program is
+    another one today, the problem is solved anew, from the record's variables if they fit.
+
+    problem : the record's, as `impactopt.files.replay.load_planned` builds it.
+    """
+    made = _program(record, problem)
+    x = np.asarray(record.arrays["solver_x"])
+    if made is not None and _is_of(made, record):
+        return _solution(record, made)
+    if made is None or made.program.n != len(x):
+        return solve(problem)
+    return solve(problem, start=x)
+
+
+def _program(record: Record, problem: ImpactProblem) -> Transcription | None:
+    if "program_statement" not in record.arrays:
+        return None
+    told: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
+    elements: Elements = tuple(tuple(e) for e in told["elements"]) if told["guarded"] else ()
+    functions = block_functions(problem, problem.coordinates, None, elements)
+    nodes = MoreNodes(*(tuple(places) for places in told["more"]))
+    t = Transcription(problem, problem.coordinates, functions, nodes, elements, ())
+    return t.with_apart(_apart(told["apart"])) if told["apart"] else t
+
+
+def _apart(told: list[dict[str, Any]]) -> dict[ApartRow, Held]:
+    """Rows between bodies; those for the same two at one place are told in the order of their numbers."""
+    rows: dict[ApartRow, Held] = {}
+    count: Counter[tuple[Any, ...]] = Counter()
+    for row in told:
+        same = row["place"], row["joint"], row["other"]
+        held: dict[str, Any] = {
+            key: tuple(v) if isinstance(v := row[key], list) else v for key in Held._fields
+        }
+        rows[ApartRow(*same, count[same])] = Held(**held)
+        count[same] += 1
+    return rows
+
+
+def _is_of(t: Transcription, record: Record) -> bool:
+    """Whether a program has the record's variables and rows, and they are met as the record says."""
+    x, rows = record.arrays["solver_x"], record.arrays["solver_multipliers"]
+    if (t.program.n, t.program.m) != (len(x), len(rows)):
+        return False
+    found = max_violation(t.program, x, t.program.constraints(x))
+    return bool(found <= float(record.arrays["solver_max_violation"]) + _SAME)
+
+
+def _solution(record: Record, t: Transcription) -> Solution:
+    summary = record.summary
+    given = {f.name: record.arrays.get(f"solver_{f.name}") for f in dataclasses.fields(SolverResult)}
+    numbers: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in given.items() if v is not None}
+    status = Status(summary["status"])
+    result = SolverResult(**numbers, status=status, message=str(summary["message"]))
+    return Solution(
+        problem=t.problem,
+        plan=t.decode(result.x),
+        result=result,
+        solver=str(summary["solver"]),
+        build_seconds=float(summary["build_seconds"]),
+        solve_seconds=float(summary["solve_seconds"]),
+        violations=violations_of(t, result.x, t.program.constraints(result.x)),
+        objectives=t.achieved(result.x),
+        rattle=rattle(t, result.x) if status.usable else None,
+        model_error=model_error(t, result.x) if status.usable else None,
+        apart=t.apart_rows,
+        elements=t.hit.elements if t.hit.guarded else (),
+        shares=t.hit.shares,
+        nodes=t.nodes,
+        statement=str(record.arrays["program_statement"]),
+    )

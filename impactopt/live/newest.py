@@ -1,0 +1,73 @@
+"""Work in a thread of its own, for the newest wish alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+__all__ = ["Newest"]
+
+Wish = TypeVar("Wish")
+Outcome = TypeVar("Outcome")
+
+
+class Newest(Generic[Wish, Outcome]):
+    """Answers wishes one after the other. One that comes while another is worked on takes its place.
+
+    work : from a wish to its outcome. Its second argument says whether a newer wish is there: then it may
+        stop, as nobody will ask for what it returns.
+    tell : is given each outcome that is still wished for, or what the work raised, in the same thread.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Wish, Callable[[], bool]], Outcome],
+        tell: Callable[[Wish, Outcome | Exception], object],
+    ) -> None:
+        self._work, self._tell = work, tell
+        self._changed = threading.Condition()
+        self._asked, self._answered, self._closed = 0, 0, False
+        self._wish: Wish
+        self._thread = threading.Thread(target=self._run, name="newest wish", daemon=True)
+        self._thread.start()
+
+    def ask(self, wish: Wish) -> None:
+        """Take this wish in place of all before it."""
+        with self._changed:
+            self._wish, self._asked = wish, self._asked + 1
+            self._changed.notify_all()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until nothing is asked for any more; False after so long [s]."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._answered == self._asked, timeout)
+
+    def close(self, timeout: float | None = None) -> None:
+        """Stop: what is worked on is told no more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._answered != self._asked)
+                if self._closed:
+                    return
+                number, wish = self._asked, self._wish
+
+            def stale(number: int = number) -> bool:
+                return self._closed or self._asked != number
+
+            outcome: Outcome | Exception
+            try:
+                outcome = self._work(wish, stale)
+            except Exception as error:
+                outcome = error
+            if not stale():
+                self._tell(wish, outcome)
+            with self._changed:
+                self._answered = number
+                self._changed.notify_all()

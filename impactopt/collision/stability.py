@@ -116,7 +116,7 @@ class Stability:
         """What is frozen at q (nq), by name; InputError where rounding spoils it."""
         function = self._freeze
         at_rest = np.zeros(self._collision.robot.nv)
-        found = function.call([ca.DM(x) for x in (q, at_rest, values["normal"], 0.0)])
+        found = function.call([ca.DM(x) for x in (q, at_rest, values["normal"], np.zeros(2))])
         frozen = {name: np.array(x) for name, x in zip(function.name_out(), found, strict=True)}
         check_frozen(frozen)
         return frozen
@@ -132,7 +132,7 @@ class Stability:
         """(N) rows of a batch that the model's steps are unstable of, or that rounding spoils; inputs by name
         have a first axis of N or 1."""
         collision, count = self._collision, len(given["q"])
-        inputs = (given["q"], np.zeros((1, collision.robot.nv)), given["normal"], np.zeros((1, 1)))
+        inputs = (given["q"], np.zeros((1, collision.robot.nv)), given["normal"], np.zeros((1, 2)))
         columns = [np.broadcast_to(x, (count, x.shape[1])).T for x in inputs]
         found = self._freeze.map(count).call([ca.DM(x) for x in columns])
         frozen = {name: np.array(x).T for name, x in zip(self._freeze.name_out(), found, strict=True)}

@@ -39,6 +39,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "collision": ("bench", "collision"),
     "scaling": ("bench", "scaling"),
     "gains": ("bench", "gains"),
+    "machine": ("bench", "machine"),
     "skip": ("bench", "skip"),
     "sweep_posture_speed": ("sweep", "collision_posture_speed"),
     "sweep_gains": ("sweep", "collision_gains"),

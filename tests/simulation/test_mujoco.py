@@ -417,7 +417,7 @@ def test_every_condition_has_its_range_and_the_defaults_are_the_plan() -> None:
     for f in fields(Perturbation):
         with pytest.raises(InputError, match=f"perturbation: {f.name}.*nan"):
             Perturbation(**{f.name: float("nan")})
-        if f.name not in ("distance", "missing"):
+        if f.name not in ("distance", "missing", "push_way"):
             with pytest.raises(InputError, match=f"perturbation: {f.name} is -1"):
                 Perturbation(**{f.name: -1.0})
 

@@ -119,7 +119,7 @@ def test_what_is_timed_of_the_sdc_is_the_sdc() -> None:
     v *= np.sign(tip_speed(robot, q, v))
     freeze, steps = timing._sdc_functions(sdc)
     frozen = freeze.call(
-        [np.tile(np.reshape(x, (-1, 1)), (1, timing.MANY)) for x in (q, v, [1, 0, 0], [0.2])]
+        [np.tile(np.reshape(x, (-1, 1)), (1, timing.MANY)) for x in (q, v, [1, 0, 0], [0.2, 0.0])]
     )
     given = {name: x[:, 0] for name, x in zip(freeze.name_out(), frozen, strict=True)} | dict(sdc.settings)
     end = np.array(steps(np.zeros(steps.size1_in(0)), *[given[k] for k in steps.name_in()[1:]])).ravel()

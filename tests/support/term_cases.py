@@ -22,6 +22,8 @@ from impactopt.problem.terms import (
     JointAcceleration,
     MotorCurve,
     PowerLimit,
+    Slide,
+    TargetSpeed,
     Term,
     TorqueRate,
     VelocityJump,
@@ -116,6 +118,19 @@ def velocity_jump(plan: Solved, term: VelocityJump) -> float:
     return float(np.abs(after - before).max()) / float(term.limit)  # type: ignore[arg-type]
 
 
+def target_speed(plan: Solved, term: TargetSpeed) -> float:
+    return float(plan.plan.collision.outcome["speed_m_s"]) / term.most
+
+
+def slid(plan: Solved, term: Slide) -> float:
+    """Along the tangent in which it is farther."""
+    problem = plan.plan.problem
+    q = plan.plan.coordinates.join(plan.plan.follow.sample(0.0)[0][0], np.zeros(0))
+    way = np.array(plan.frame(f"striker:{problem.striker}", q).translation) - problem.point
+    _, _, rows = np.linalg.svd(problem.normal.reshape(1, 3))
+    return float(np.abs(rows[1:] @ way).max()) / term.most
+
+
 CASES: dict[str, Case] = {
     "torque rate": Case(TorqueRate(limit=20.0), TorqueRate(limit=30.0), TorqueRate(limit=200.0), torque_rate),
     "rate of some joints": Case(
@@ -155,6 +170,13 @@ CASES: dict[str, Case] = {
     "velocity jump": Case(
         VelocityJump(limit=0.1), VelocityJump(limit=0.13), VelocityJump(limit=2.0), velocity_jump
     ),
+    "target speed": Case(
+        TargetSpeed(least=-np.inf, most=0.8),
+        TargetSpeed(least=-np.inf, most=1.0),
+        TargetSpeed(least=0.0, most=5.0),
+        target_speed,
+    ),
+    "slide": Case(Slide(most=1e-4), Slide(most=2.5e-3), Slide(most=0.1), slid),
     "hit cone": Case(HitCone(angle=0.05), HitCone(angle=0.2), HitCone(angle=0.2), hit_cone),
 }
 # one of each kind, all of which a plan of the arm can have

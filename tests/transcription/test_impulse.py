@@ -140,7 +140,7 @@ def test_the_block_is_the_impulse_balance(request: pytest.FixtureRequest, who: s
     given, mass = 0.6, problem.target.mass
     law = [LAW.stiffness, LAW.damping]
     units = t.builder.limits.units
-    p = [*problem.normal, float(kind == "rigid"), given, *law, 1 / mass, *robot.torque_limit, *units]
+    p = [*problem.normal, float(kind == "rigid"), given, *law, 1 / mass, 0.0, *robot.torque_limit, *units]
     for _ in range(5):
         y = t.y0 + 0.1 * rng.standard_normal(c.ny)
         y[: c.base] = t.y0[: c.base] + np.array([0, 0, -0.05, 0, 0, 0])[: c.base]  # where the legs reach

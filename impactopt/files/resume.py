@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.files.output import Record
-from impactopt.planning.models import model_error
+from impactopt.planning.made_again import planned_by, program_on
 from impactopt.planning.multistart import violations_of
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
@@ -19,8 +19,7 @@ from impactopt.solvers.program import SolverResult, Status, max_violation
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import Elements
 from impactopt.transcription.mesh_refinement import MoreNodes
-from impactopt.transcription.rattle import rattle
-from impactopt.transcription.transcription import Transcription, block_functions
+from impactopt.transcription.transcription import Transcription
 
 __all__ = ["resumed"]
 
@@ -49,9 +48,8 @@ def _program(record: Record, problem: ImpactProblem) -> Transcription | None:
         return None
     told: dict[str, Any] = json.loads(str(record.arrays["program_statement"]))
     elements: Elements = tuple(tuple(e) for e in told["elements"]) if told["guarded"] else ()
-    functions = block_functions(problem, problem.coordinates, None, elements)
     nodes = MoreNodes(*(tuple(places) for places in told["more"]))
-    t = Transcription(problem, problem.coordinates, functions, nodes, elements, ())
+    t = program_on(problem, nodes, elements, ())
     return t.with_apart(_apart(told["apart"])) if told["apart"] else t
 
 
@@ -86,18 +84,12 @@ def _solution(record: Record, t: Transcription) -> Solution:
     result = SolverResult(**numbers, status=status, message=str(summary["message"]))
     return Solution(
         problem=t.problem,
-        plan=t.decode(result.x),
         result=result,
         solver=str(summary["solver"]),
         build_seconds=float(summary["build_seconds"]),
         solve_seconds=float(summary["solve_seconds"]),
         violations=violations_of(t, result.x, t.program.constraints(result.x)),
         objectives=t.achieved(result.x),
-        rattle=rattle(t, result.x) if status.usable else None,
-        model_error=model_error(t, result.x) if status.usable else None,
-        apart=t.apart_rows,
-        elements=t.hit.elements if t.hit.guarded else (),
-        shares=t.hit.shares,
-        nodes=t.nodes,
         statement=str(record.arrays["program_statement"]),
+        **planned_by(t, result),
     )

@@ -8,18 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from impactopt.planning.bent_program import bent_of
 from impactopt.planning.changes import moved_problem
 from impactopt.planning.keeping_apart import Margins
-from impactopt.planning.models import model_error
+from impactopt.planning.made_again import planned_by
 from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after_the_other, violations_of
 from impactopt.planning.rounds import Refining
 from impactopt.planning.solution import Solution
 from impactopt.solvers.active import ActiveSystem, Change, Offset
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
-from impactopt.transcription.rattle import rattle
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.transcription import Transcription
 
@@ -33,28 +31,18 @@ _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as ne
 def moved_solution(
     solution: Solution,
     *,
-    point: ArrayLike | None = None,
-    normal: ArrayLike | None = None,
-    mass: float | None = None,
-    stiffness: float | None = None,
-    damping: float | None = None,
-    margin: float | None = None,
     polish: bool = True,
     refine: bool = False,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
     callback: Callback | None = None,
+    **changes: Any,
 ) -> Solution:
-    """The plan for a problem with other numbers: `Solution.moved`."""
-    problem = moved_problem(
-        solution.problem,
-        point=point,
-        normal=normal,
-        mass=mass,
-        stiffness=stiffness,
-        damping=damping,
-        margin=margin,
-    )
+    """The plan for a problem with other numbers: `Solution.moved`.
+
+    changes : as of `impactopt.planning.changes.moved_problem`.
+    """
+    problem = moved_problem(solution.problem, **changes)
     bent = bent_of(solution)
     system, own = bent.steady
     began = time.perf_counter()
@@ -128,23 +116,16 @@ def _first_order(solution: Solution, t: Transcription, system: ActiveSystem, own
 def _solution(
     old: Solution, t: Transcription, result: SolverResult, seconds: tuple[float, float]
 ) -> Solution:
-    usable = result.status.usable
     attempt: Attempt = replace(attempt_of(t, "moved", result), kept=True)
     return Solution(
-        problem=t.problem,
-        plan=t.decode(result.x),
-        result=result,
         solver=old.solver,
         build_seconds=seconds[0],
         solve_seconds=seconds[1],
         violations=violations_of(t, result.x, t.program.constraints(result.x)),
         objectives=t.achieved(result.x),
         attempts=(attempt,),
-        rattle=rattle(t, result.x) if usable else None,
-        model_error=model_error(t, result.x) if usable else None,
-        apart=t.apart_rows,
-        elements=t.hit.elements if t.hit.guarded else (),
-        shares=t.hit.shares,
-        nodes=t.nodes,
         statement=statement_of(t) if len(t.rows.origins) == t.program.m else old.statement,
+        problem=t.problem,
+        result=result,
+        **planned_by(t, result),
     )

@@ -11,10 +11,11 @@ import numpy as np
 
 from impactopt.errors import InputError
 from impactopt.planning.keeping_apart import same_bodies
+from impactopt.planning.made_again import program_on
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.active import ActiveSystem, Offset
-from impactopt.transcription.transcription import Transcription, block_functions
+from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Bent", "bent_of"]
 
@@ -48,8 +49,7 @@ class Bent:
             t.take_program(self._spare)
             self._spare = t
             return t
-        functions = block_functions(problem, problem.coordinates, report, s.elements)
-        t = Transcription(problem, problem.coordinates, functions, s.nodes, s.elements, s.shares)
+        t = program_on(problem, s.nodes, s.elements, s.shares, report)
         if s.apart:
             if not same_bodies(problem, s.problem):
                 raise InputError("the world has other bodies then: use solve(problem, start=solution)")

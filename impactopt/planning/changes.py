@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
@@ -124,7 +124,7 @@ def parameter_of(problem: ImpactProblem, name: str) -> Parameter:
         known |= {f"{section}.{key}": (field, key, float(value)) for key, value in numbers.items()}
     others = [term for term in DEFAULT_TERMS if not any(isinstance(t, type(term)) for t in problem.terms)]
     for term in (*problem.terms, *others):
-        section = re.sub(r"(?<!^)(?=[A-Z])", "_", type(term).__name__).lower()
+        section = snake_case(type(term).__name__)
         for told in dataclasses.fields(term):
             value = getattr(term, told.name)
             if isinstance(value, float) and np.isfinite(value):

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.keeping_apart import Margins, same_bodies
-from impactopt.planning.models import carried_start, climbed, model_error
+from impactopt.planning.made_again import planned_by, program_of
+from impactopt.planning.models import carried_start, climbed
 from impactopt.planning.multistart import (
     Budget,
     Starts,
@@ -32,7 +33,6 @@ from impactopt.solvers.program import Callback, SolverResult
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
-from impactopt.transcription.rattle import rattle
 from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.strike import StrikeTranscription
@@ -114,7 +114,7 @@ def solve(
     budget = budget.started()
     t = Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
     if isinstance(start, Solution):
-        given = carried_start(t, partial(_program_of, start), start, apart)
+        given = carried_start(t, partial(program_of, start), start, apart)
     if not isinstance(given, str):
         check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
     if report is not None:
@@ -130,24 +130,11 @@ def solve(
         t, fields = _on(refining, t, fields)
     result = fields["result"] = with_reason(t, fields["result"])
     return Solution(
-        plan=t.decode(result.x),
-        nodes=t.nodes,
-        elements=t.hit.elements if t.hit.guarded else (),
-        shares=t.hit.shares,
-        model_error=model_error(t, result.x) if result.status.usable else None,
         contact_error=refining.error(t, result.x) if result.status.usable else None,
-        rattle=rattle(t, result.x) if result.status.usable else None,
-        apart=t.apart_rows,
         statement=statement_of(t),
+        **planned_by(t, result),
         **fields,
     )
-
-
-def _program_of(solution: Solution) -> Transcription:
-    """The program of a solution, without rows between bodies."""
-    p = solution.problem
-    functions = block_functions(p, p.coordinates, None, solution.elements)
-    return Transcription(p, p.coordinates, functions, solution.nodes, solution.elements, solution.shares)
 
 
 def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[Transcription, dict[str, Any]]:

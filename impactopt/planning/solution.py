@@ -299,6 +299,11 @@ class Solution(Solved):
                 )
         return least, nearest, touches
 
+    @cached_property
+    def slide(self) -> float:
+        """How far [m] the striking point goes across the target while the contact lasts, as planned."""
+        return slide(self.problem, self.plan)
+
     @property
     def collision(self) -> PlannedCollision:
         """The expected one, at more instants than the program's where they are known."""
@@ -326,7 +331,7 @@ class Solution(Solved):
 
     def summary(self, simulation: Any | None = None, replay: Any | None = None) -> dict[str, Any]:
         """The numbers of ``summary.json``; ``simulated``, and ``replayed`` on free soles, if given."""
-        plan, way = self.plan, slide(self.problem, self.plan)
+        plan, way = self.plan, self.slide
         expected, *others = self._collisions
         out: dict[str, Any] = {
             **self.outcome(),

@@ -283,7 +283,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
-    motors, delay, cuts = Motors(robot), Delay(robot), CutWatch(robot)
+    motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
     impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
@@ -307,6 +307,8 @@ def simulate_mujoco(
             cuts.look(t, wanted, cut, step)
             drive = cut if drive is None else drive
             torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
+            if passive.any():  # springs, that no computer samples
+                torque = np.where(passive, servo.springs(data.qpos[replay.place], rates), torque)
             speed = replay.hand_speed()
             target_speed = replay.struck.speed(replay.target)
             push = replay.push(speed, step)

@@ -53,6 +53,13 @@ class Servo:
         f = min((t - self.time[i]) / (self.time[i + 1] - self.time[i]), 1.0)
         return np.asarray((1 - f) * self.reference[i] + f * self.reference[i + 1])
 
+    def springs(self, angles: Array, rates: Array) -> Array:
+        """Torque (n,) [N m] of the joints that nothing drives, at any time; of the others it is none of
+        theirs.
+        """
+        n, rest = self.n, self.reference[0]
+        return rest[2 * n :] + self.kp * (rest[:n] - angles) - self.kd * rates
+
     def torque(self, t: float, angles: Array, rates: Array) -> tuple[Array, Array]:
         """Torque demand (n,) [N m] and what saturation leaves of it."""
         row, n = self.target(t), self.n

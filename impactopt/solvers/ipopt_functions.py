@@ -18,6 +18,8 @@ from impactopt.solvers.program import (
     IterationRecord,
     Matrix,
     NonlinearProgram,
+    SolverResult,
+    Status,
     Vector,
     max_violation,
     stationarity,
@@ -86,6 +88,45 @@ class Functions:
     def release(self) -> None:
         """Forget the last point and its matrices."""
         self._known = {}
+
+    def ended(
+        self,
+        status: Status,
+        x: Vector,
+        multipliers: Vector,
+        bound_multipliers: Vector,
+        *,
+        message: str,
+        since: float,
+        iterations: int,
+        seconds_qp: float = np.nan,
+    ) -> SolverResult:
+        """What came of a solver that these functions were given, measured here: where it ended, or the best
+        point seen if that is no solution.
+
+        since : the clock when it began.  Raises what was raised in the functions.
+        """
+        if self.error is not None:
+            raise self.error
+        status = Status.TIME_LIMIT if self.out_of_time else status
+        if not status.usable and self.best.x is not None:
+            x = self.best.x
+        program, seconds = self.program, time.perf_counter() - since
+        g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
+        return SolverResult(
+            x=x,
+            multipliers=multipliers,
+            bound_multipliers=bound_multipliers,
+            objective=float(program.objective(x)),
+            status=status,
+            iterations=iterations,
+            seconds=seconds,
+            seconds_functions=self.seconds,
+            seconds_qp=seconds_qp,
+            max_violation=max_violation(program, x, g),
+            kkt=stationarity(gradient, jacobian, multipliers, bound_multipliers),
+            message="out of time" if self.out_of_time else message,
+        )
 
     def objective(self, x: Vector) -> Any:
         value = self._at(x, "objective", self.program.objective)

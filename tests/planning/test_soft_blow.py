@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 from impactopt import GearLoad, ImpactProblem, SoftGrip, Solution, load_problem, solve
+from impactopt.simulation import ControllerSettings, Perturbation, Simulation
 
 GRIP = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.08])
 
@@ -93,3 +94,22 @@ def test_a_bound_of_the_gears_leaves_the_grip_out(soft: Solution) -> None:
     assert kept.status.usable
     assert kept.loads is not None
     assert np.nanmax(kept.loads.gear) < 1.03 * 0.6
+
+
+def _spring(replay: Simulation) -> np.ndarray:
+    """[N m] by which the torque in a grip is off what its spring and damper make, since the start."""
+    made = replay.torque[:, -1] + 20.0 * replay.q[:, -1] + 0.5 * replay.v[:, -1]
+    return np.asarray(made - made[0])
+
+
+def test_a_controller_steers_the_arm_and_leaves_the_spring_alone(soft: Solution) -> None:
+    exact = ControllerSettings(noise=0.0, delay=0.0)
+    replay = soft.validate(engine="mujoco", controller=exact)
+    assert replay.impulse == pytest.approx(soft.impulse, rel=0.1)
+    assert replay.outcome["depth_m"] == pytest.approx(soft.plan.collision.outcome["depth_m"], rel=0.05)
+    np.testing.assert_allclose(_spring(replay), 0.0, atol=1e-9)
+
+
+def test_a_slow_servo_does_not_slow_the_spring(soft: Solution) -> None:
+    replay = soft.validate(engine="mujoco", perturbation=Perturbation(period=5e-3, delay=5e-3))
+    np.testing.assert_allclose(_spring(replay), 0.0, atol=1e-9)

@@ -74,3 +74,9 @@ class HeldDynamics:
         self.recoil = found[:nv, n + 1]
         self.B, self.b0 = found[nv:, :n], found[nv:, n] + found[nv:, n + 2]
         self.back = found[nv:, n + 2]
+
+    def pulled(self, which: NDArray[np.bool_], torque: Array) -> None:
+        """Joints (n,) have torques (n,) [N m] that are no choice: springs'."""
+        pull = np.where(which, torque, 0.0)
+        self.a0, self.b0 = self.a0 + self.A @ pull, self.b0 + self.B @ pull
+        self.A, self.B = self.A * ~which, self.B * ~which

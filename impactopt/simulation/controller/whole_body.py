@@ -17,6 +17,7 @@ from impactopt.simulation.controller.sensors import Sensors
 from impactopt.simulation.controller.settings import ControllerSettings
 from impactopt.simulation.controller.target import Aim, Target
 from impactopt.simulation.result import Scene
+from impactopt.simulation.servo import Servo
 
 __all__ = ["WholeBodyController"]
 
@@ -63,6 +64,9 @@ class WholeBodyController:
         self.loads, self.points = np.ones(len(scene.soles)), np.zeros((len(scene.soles), 3))
         self.acceleration = np.zeros(robot.nv)
         self.felt = 0.0  # [N] at the hand, filtered
+        self.springs = Servo(robot, reference).springs
+        # what motors steer: springs are not followed, nor where a tool swings on them
+        self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - robot.passive)
 
     def miss(self, reference: Any) -> None:
         """What it tracks from now on, as it has hit nothing."""
@@ -80,6 +84,9 @@ class WholeBodyController:
         self.target.feel(t, measured.force > TOUCH)
         aim = self.target.at(t + ahead)
         self.held.look(q, rates, self.felt, s.sole_bandwidth)
+        if self.robot.passive.any():
+            angles = self.robot.joint_positions(q)
+            self.held.pulled(self.robot.passive, self.springs(angles, rates[-self.robot.n :]))
         struck = self.settings.impact == "planned" and self.target.struck
         x = self._solve(q, rates, aim, self.settings.projects and self.target.near_blow(t, WINDOW), struck)
         torque = self.limit * x[:-1]
@@ -103,16 +110,12 @@ class WholeBodyController:
             g[:n] += weighted.T @ (now - wanted)
 
         w = s.posture_bandwidth
-        task(0.0 if struck else s.posture, A, held.a0, aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag)
-        w = s.hand_bandwidth
-        away = aim.hand[0] - held.hand_place
-        wanted = aim.hand[2] + self.kp * w**2 * away + self.kd * 2 * w * (held.hand @ lag)
-        task(
-            s.hand if self.target.before else 0.0,
-            held.hand @ A,
-            held.hand @ held.a0 + held.hand_drift,
-            wanted,
-        )
+        posture = (0.0 if struck else s.posture) * self.steered
+        task(posture, A, held.a0, aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag)
+        w, hand, swing = s.hand_bandwidth, held.hand * self.steered, held.hand * (1.0 - self.steered)
+        away = aim.hand[0] - held.hand_place - swing @ off
+        wanted = aim.hand[2] - swing @ aim.a + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)
+        task(s.hand if self.target.before else 0.0, hand @ A, hand @ held.a0 + held.hand_drift, wanted)
         if self.robot.floating and self.cones:
             self._momentum(q, v, lag, aim, B, task)
         feed = aim.torque

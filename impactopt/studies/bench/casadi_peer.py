@@ -12,14 +12,7 @@ import casadi as ca
 import numpy as np
 
 from impactopt.solvers.ipopt_functions import BufferFunction, Functions, IterationCallback, Pattern
-from impactopt.solvers.program import (
-    NonlinearProgram,
-    SolverResult,
-    Status,
-    Vector,
-    max_violation,
-    stationarity,
-)
+from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
 __all__ = ["solve_sqpmethod"]
 
@@ -60,27 +53,9 @@ def solve_sqpmethod(
         x, y, z = (np.array(answer[key]).ravel() for key in ("x", "lam_g", "lam_x"))
     except RuntimeError as error:  # its QP solver gave up
         outcome = str(error).strip().splitlines()[-1]
-    if functions.error is not None:
-        raise functions.error
-    status = Status.TIME_LIMIT if functions.out_of_time else _STATUS.get(outcome, Status.FAILED)
-    if not status.usable and functions.best.x is not None:
-        x = functions.best.x
-    seconds = time.perf_counter() - began
-    g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
-    return SolverResult(
-        x=x,
-        multipliers=y,
-        bound_multipliers=z,
-        objective=float(program.objective(x)),
-        status=status,
-        iterations=max(len(progress.history) - 1, 0),
-        seconds=seconds,
-        seconds_functions=functions.seconds,
-        seconds_qp=seconds_qp,
-        max_violation=max_violation(program, x, g),
-        kkt=stationarity(gradient, jacobian, y, z),
-        message="out of time" if functions.out_of_time else outcome,
-    )
+    iterations = max(len(progress.history) - 1, 0)
+    how: dict[str, Any] = {"message": outcome, "since": began, "iterations": iterations}
+    return functions.ended(_STATUS.get(outcome, Status.FAILED), x, y, z, seconds_qp=seconds_qp, **how)
 
 
 def _build(functions: Functions, progress: IterationCallback, x0: Vector, qp: str) -> tuple[Any, list[Any]]:

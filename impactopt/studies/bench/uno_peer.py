@@ -14,14 +14,7 @@ import numpy as np
 from impactopt.errors import missing_package
 from impactopt.solvers.ipopt import IPOPT_DEFAULTS
 from impactopt.solvers.ipopt_functions import Functions, Pattern
-from impactopt.solvers.program import (
-    NonlinearProgram,
-    SolverResult,
-    Status,
-    Vector,
-    max_violation,
-    stationarity,
-)
+from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, Vector
 
 __all__ = ["solve_uno"]
 
@@ -74,31 +67,15 @@ def solve_uno(program: NonlinearProgram, x0: Vector, time_limit: float, *, prese
         solver.set_option(name, value)
     solver.set_termination_callback(lambda *_iterate: functions.stopped())
     found = solver.optimize(_model(unopy, functions, x0))
-    if functions.error is not None:
-        raise functions.error
     ended, point = found.optimization_status.name, found.solution_status.name
-    status = _STATUS.get(point if ended == "SUCCESS" else ended, Status.FAILED)
-    if functions.out_of_time:
-        status = Status.TIME_LIMIT
-    x, y = np.array(found.primal_solution), np.array(found.constraint_dual_solution)
-    z = np.array(found.lower_bound_dual_solution) + np.array(found.upper_bound_dual_solution)
-    if not status.usable and functions.best.x is not None:
-        x = functions.best.x
-    seconds = time.perf_counter() - began
-    g, gradient, jacobian = program.constraints(x), program.gradient(x), program.jacobian(x)
-    return SolverResult(
-        x=x,
-        multipliers=y,
-        bound_multipliers=z,
-        objective=float(program.objective(x)),
-        status=status,
+    return functions.ended(
+        _STATUS.get(point if ended == "SUCCESS" else ended, Status.FAILED),
+        np.array(found.primal_solution),
+        np.array(found.constraint_dual_solution),
+        np.array(found.lower_bound_dual_solution) + np.array(found.upper_bound_dual_solution),
+        message=f"{ended}, {point}",
+        since=began,
         iterations=int(found.number_iterations),
-        seconds=seconds,
-        seconds_functions=functions.seconds,
-        seconds_qp=np.nan,
-        max_violation=max_violation(program, x, g),
-        kkt=stationarity(gradient, jacobian, y, z),
-        message="out of time" if functions.out_of_time else f"{ended}, {point}",
     )
 
 

@@ -1,0 +1,49 @@
+"""From a solution to its program, and from a program's result to what a solution says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from impactopt.planning.models import model_error
+from impactopt.planning.solution import Solution
+from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.mesh import Elements, Shares
+from impactopt.transcription.mesh_refinement import MoreNodes
+from impactopt.transcription.rattle import rattle
+from impactopt.transcription.transcription import Transcription, block_functions
+
+__all__ = ["planned_by", "program_of", "program_on"]
+
+
+def program_on(
+    problem: ImpactProblem,
+    nodes: MoreNodes,
+    elements: Elements,
+    shares: Shares,
+    report: Callable[[str], None] | None = None,
+) -> Transcription:
+    """A problem's program on a mesh that is known, without rows between bodies."""
+    functions = block_functions(problem, problem.coordinates, report, elements)
+    return Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
+
+
+def program_of(solution: Solution) -> Transcription:
+    """The program of a solution, without rows between bodies."""
+    s = solution
+    return program_on(s.problem, s.nodes, s.elements, s.shares)
+
+
+def planned_by(t: Transcription, result: SolverResult) -> dict[str, Any]:
+    """Fields of the `Solution` that follow from a program and its result alone."""
+    usable = result.status.usable
+    return {
+        "plan": t.decode(result.x),
+        "nodes": t.nodes,
+        "elements": t.hit.elements if t.hit.guarded else (),
+        "shares": t.hit.shares,
+        "apart": t.apart_rows,
+        "model_error": model_error(t, result.x) if usable else None,
+        "rattle": rattle(t, result.x) if usable else None,
+    }

@@ -20,7 +20,8 @@ __all__ = ["in_lanes"]
 # a compiler takes more than linear time for a long function: it gets parts of so many operations
 _PART = 500
 # what runs one after the other stands one after the other
-_LEVEL = "-O1 -fno-toplevel-reorder"
+_ORDER = "-fno-toplevel-reorder"
+_SHORT = 20_000  # instructions, of functions for which more optimization costs no time to speak of
 
 _OF_VECTORS = {
     ca.OP_ASSIGN: "{0}",
@@ -72,18 +73,20 @@ _HEAD = """#include <math.h>
 #include <stdint.h>
 typedef double vec __attribute__((vector_size(8 * LANES)));
 #define ALL(number) ((vec){0} + (number))
+/* loops over lanes, which the passes that are left out elsewhere make vectors of */
+#define LOOPS __attribute__((optimize("O3", "no-math-errno", "no-trapping-math")))
 #define IN_EACH_LANE(name, formula) \\
-  static vec name(vec a, vec b) { \\
+  LOOPS static vec name(vec a, vec b) { \\
     vec c; \\
     for (int i = 0; i < LANES; i++) { double x = a[i], y = b[i]; c[i] = formula; } \\
     return c; \\
   }
 /* from a column an instance to a lane an instance, and back */
-static void into_lanes(const double *columns, int rows, vec *out) {
+LOOPS static void into_lanes(const double *columns, int rows, vec *out) {
   for (int k = 0; k < rows; k++)
     for (int i = 0; i < LANES; i++) out[k][i] = columns ? columns[i * rows + k] : 0;
 }
-static void out_of_lanes(const vec *rows, int count, double *columns) {
+LOOPS static void out_of_lanes(const vec *rows, int count, double *columns) {
   if (columns)
     for (int i = 0; i < LANES; i++)
       for (int k = 0; k < count; k++) columns[i * count + k] = rows[k][i];
@@ -107,8 +110,9 @@ def in_lanes(function: ca.Function, lanes: int = LANES) -> NativeCode | ca.Funct
     kinds = {function.instruction_id(k) for k in range(function.n_instructions())}
     if not kinds <= _KNOWN:
         return function
+    level = f"{'-O2' if function.n_instructions() < _SHORT else '-O1'} {_ORDER}"
     return NativeCode(
-        name=function.name(), code=_code(function, kinds, lanes), graph=lambda: function, level=_LEVEL
+        name=function.name(), code=_code(function, kinds, lanes), graph=lambda: function, level=level
     )
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 import pinocchio as pin
@@ -188,11 +190,10 @@ def _model(t: ContactProgram) -> tuple[str, int]:
 
 def _keys(t: ContactProgram) -> Iterator[tuple[str, str, str, int]]:
     """What a row is, and how many of that name come before it."""
-    seen: dict[tuple[str, str, str], int] = {}
+    seen: defaultdict[tuple[str, str, str], Iterator[int]] = defaultdict(count)
     for row in t.program.origins:
         name = row.term, row.place.name, row.component
-        seen[name] = seen.get(name, -1) + 1
-        yield *name, seen[name]
+        yield *name, next(seen[name])
 
 
 def _finished(t: ContactProgram, x: Array) -> Array:

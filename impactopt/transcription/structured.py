@@ -55,17 +55,13 @@ class StructuredProgram:
         self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
         self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
         self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
-        self._c = np.zeros(n)
-        np.add.at(self._c, objective.cols, objective.vals)
-        self._c += linear
-        self._c0 = float(objective.const.sum())
-        self._Q = sp.csc_array(quadratic)
+        self._at: tuple[Array, list[Array]] | None = None  # where functions were last asked for
+        self._take_objective(objective, quadratic, linear)
         row_of_out = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
         row_of_out[self._row_out[self._nonlinear]] = self._nonlinear
         self._jacobian = JacobianMap(self.blocks, self._lift, row_of_out, self._rows_matrix)
         self._hessian = HessianMap(self.blocks, self._lift, self._Q)
         self.seconds = 0.0
-        self._x: Array | None = None
 
     def take_numbers(
         self,
@@ -93,19 +89,27 @@ class StructuredProgram:
             setattr(self, name, np.concatenate([found, getattr(self, name)[len(found) :]]))
         constants = np.concatenate([np.zeros(0), *(affine.const for affine in rows.affine)])
         self._rows_const = np.concatenate([constants, self._rows_const[len(constants) :]])
+        self._at = None
+        self._take_objective(objective, quadratic, linear)
+
+    def _take_objective(self, linked: Affine, quadratic: sp.spmatrix | sp.sparray, linear: Array) -> None:
+        """linked(x) + 1/2 x'Qx + q'x."""
         self._c = np.zeros(self.n)
-        np.add.at(self._c, objective.cols, objective.vals)
+        np.add.at(self._c, linked.cols, linked.vals)
         self._c += linear
-        self._c0 = float(objective.const.sum())
-        self._Q = sp.csc_array(quadratic)
+        self._c0, self._Q = float(linked.const.sum()), sp.csc_array(quadratic)
 
     # ------------------------------------------------------------------ evaluation
     def _lifted(self, x: Array) -> list[Array]:
+        if self._at is not None and np.array_equal(self._at[0], x):
+            return self._at[1]
         z = self._lift @ x + self._lift_const
-        return [
+        parts = [
             z[a : a + b.count * b.n_in].reshape(b.count, b.n_in)
             for a, b in zip(self._z_offset, self.blocks, strict=False)
         ]
+        self._at = x.copy(), parts
+        return parts
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every block's outputs, name -> (count, n_out)."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.directions import across
 
 Array = NDArray[np.float64]
 TURNING, WISH = 100, 0.1  # steps that also turn the hand, and how much that is damped
@@ -78,9 +79,9 @@ def inverse_kinematics(
             damping = np.full(6 * len(coordinates.legs) + 3, 1e-8)
             if facing is not None and turning:
                 axis = data.oMf[fid].rotation @ facing[0]
-                across = np.linalg.svd(axis[None])[2][1:]  # turning about the axis changes nothing
-                errors.append(across @ _turn(axis, facing[1], across[0]))
-                jacs.append(across @ hand[3:])
+                sides = across(axis)  # turning about the axis changes nothing
+                errors.append(sides @ _turn(axis, facing[1], sides[0]))
+                jacs.append(sides @ hand[3:])
                 damping = np.concatenate([damping, [WISH, WISH]])
             e, jac = np.concatenate(errors), np.vstack(jacs)
             # joints at a limit that would leave it are held for this step

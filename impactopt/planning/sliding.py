@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 
+from impactopt.kinematics.striking_point import striking_point
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.struck import FACE
 from impactopt.transcription.plan import Plan
@@ -17,15 +17,9 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
     """[m] across the normal that the striking point goes while the contact lasts, as planned."""
     if len(plan.collision.time) < 2 or plan.collision.time[-1] <= 0:
         return 0.0
-    c, robot = plan.coordinates, problem.robot
-    data, legs = robot.model.createData(), c.split(problem.start_posture)[1]
-    frame = robot.model.getFrameId(robot.striker(problem.striker).model_frame)
-    places = []
-    for y in plan.through_contact(np.linspace(0.0, 1.0, INSTANTS)):
-        legs = c.solve_legs(y, legs)
-        pin.framesForwardKinematics(robot.model, data, c.join(y, legs))
-        places.append(np.array(data.oMf[frame].translation))
-    way = np.array(places) - places[0]
+    postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, INSTANTS)))
+    places = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
+    way = places - places[0]
     across = way - np.outer(way @ problem.normal, problem.normal)
     return float(np.linalg.norm(across, axis=1).max())
 

@@ -9,6 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.kinematics.balanced import Reach, reach
+from impactopt.kinematics.striking_point import striking_point
 from impactopt.kinematics.support import support_polygon
 
 if TYPE_CHECKING:
@@ -43,10 +44,7 @@ def doubts(robot: Robot) -> list[str]:
 
 
 def _beyond(problem: ImpactProblem) -> str:
-    model = problem.robot.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, problem.start_posture)
-    at = data.oMf[model.getFrameId(f"striker:{problem.striker}")].translation
+    at = striking_point(problem.robot, problem.striker, problem.start_posture)
     past = float(problem.normal @ (at - problem.point))
     if past <= PAST:
         return ""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 
+from impactopt.kinematics.striking_point import striking_point
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine, Array
+from impactopt.transcription.layout import Affine
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.rows import Place, millimetres
 
@@ -54,7 +54,6 @@ def _add_rows(b: Builder, term: str, spots: list[tuple[int, Place, float]], plan
 
 def _start_gap(b: Builder) -> float:
     """How far [m] behind the target's plane the striking point starts: it may stay as near as that."""
-    p, c = b.problem, b.coordinates
-    pin.framesForwardKinematics(c.model, c.data, p.start_posture)
-    at: Array = c.data.oMf[c.model.getFrameId(f"striker:{p.striker}")].translation
+    p = b.problem
+    at = striking_point(p.robot, p.striker, p.start_posture)
     return max(float(p.normal @ (p.point - at)), 0.0)

@@ -263,7 +263,7 @@ class Plan:
         last, t1, _, _ = self.segment(2, missed=missed)
         t0, end = self.contact_start, t1 + last.duration
         within = np.linspace(t0, t1, max(2, round((t1 - t0) / step) + 1))
-        during = self._closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
+        during = self.closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
         if reference is not None:
             parts = [
                 (reference.time[k], reference.q[k]) for k in (reference.phase == 0, reference.phase == 2)
@@ -271,7 +271,7 @@ class Plan:
         else:
             spans = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t1, end))]
             parts = [
-                (times, self._closed(self.independent(phase, times, missed=missed)[0]))
+                (times, self.closed(self.independent(phase, times, missed=missed)[0]))
                 for phase, times in zip((0, 2), spans, strict=True)
                 if phase or not missed
             ]
@@ -311,7 +311,7 @@ class Plan:
         within = np.interp(since, hit.time, gone, left=0.0)
         return before + within + last * np.maximum(since - hit.time[-1], 0.0)
 
-    def _closed(self, y: Array) -> Array:
+    def closed(self, y: Array) -> Array:
         """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""
         c = self.coordinates
         legs = c.split(self.problem.start_posture)[1]

@@ -20,8 +20,7 @@ __all__ = ["in_lanes"]
 # a compiler takes more than linear time for a long function: it gets parts of so many operations
 _PART = 500
 # what runs one after the other stands one after the other
-_ORDER = "-fno-toplevel-reorder"
-_SHORT = 20_000  # instructions, of functions for which more optimization costs no time to speak of
+_LEVEL = "-O1 -fno-toplevel-reorder"
 
 _OF_VECTORS = {
     ca.OP_ASSIGN: "{0}",
@@ -110,9 +109,8 @@ def in_lanes(function: ca.Function, lanes: int = LANES) -> NativeCode | ca.Funct
     kinds = {function.instruction_id(k) for k in range(function.n_instructions())}
     if not kinds <= _KNOWN:
         return function
-    level = f"{'-O2' if function.n_instructions() < _SHORT else '-O1'} {_ORDER}"
     return NativeCode(
-        name=function.name(), code=_code(function, kinds, lanes), graph=lambda: function, level=level
+        name=function.name(), code=_code(function, kinds, lanes), graph=lambda: function, level=_LEVEL
     )
 
 

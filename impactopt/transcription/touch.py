@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from impactopt.kinematics.directions import across
 from impactopt.problem.terms import HitCone, HitRegion
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.contact import ContactState
@@ -13,9 +14,7 @@ from impactopt.transcription.rows import Measure, Place, millimetres
 
 def rotation_rows(normal: Array) -> Array:
     """(3, 3) rows: the normal and two tangents."""
-    _, _, vt = np.linalg.svd(normal.reshape(1, 3))
-    rows = np.vstack([normal, vt[1:]])
-    return rows
+    return np.vstack([normal, across(normal)])
 
 
 def add_touch_rows(b: Builder, state: ContactState) -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb
 from impactopt.files.draft.postures import arm_length, bend_arm, shoulder
+from impactopt.kinematics.striking_point import striking_point
 from impactopt.robots.robot import Robot
 
 __all__ = ["Arm", "aims", "ready"]
@@ -74,9 +74,7 @@ def ready(
 
 def aims(robot: Robot, arm: Arm, q: Array, way: Array) -> Iterator[Array]:
     """Points (3,) [m] that the arm can hit from a configuration (nq,), the likeliest first."""
-    model, data = robot.model, robot.model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    start = np.array(data.oMf[model.getFrameId(f"striker:{arm.name}")].translation)
+    start = striking_point(robot, arm.name, q)
     root, length = shoulder(robot, arm.limb, q), arm_length(robot, arm.limb, arm.name)
     for height, hit in product((0.0, 0.5, 1.0), HITS):
         point = start + way * ((root - start) @ way + hit * length)

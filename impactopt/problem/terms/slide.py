@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from impactopt.contact.fields import about
+from impactopt.kinematics.directions import across
 from impactopt.problem.terms.base import Term
-from impactopt.problem.violation import Measure
+from impactopt.problem.violation import millimetres
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +28,7 @@ class Slide(Term):
     def add_rows(self, program: Any) -> None:
         problem = program.problem
         after = program.follow_spots()[0][1][0]
-        _, _, rows = np.linalg.svd(problem.normal.reshape(1, 3))
-        for k, tangent in enumerate(rows[1:], start=1):
+        for k, tangent in enumerate(across(problem.normal), start=1):
             place = float(tangent @ problem.point)
             program.rows.add(
                 term=self.name,
@@ -37,5 +37,5 @@ class Slide(Term):
                 outputs=np.array([program.add_block("approach", [[after]], tangent)]),
                 lower=place - self.most,
                 upper=place + self.most,
-                measure=Measure("mm", 1e3, "too far"),
+                measure=millimetres("too far"),
             )

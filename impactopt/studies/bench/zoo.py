@@ -21,6 +21,7 @@ from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import record_of
 from impactopt.files.problem_file import load_problem, read_problem_file
+from impactopt.kinematics.directions import across
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
@@ -152,8 +153,7 @@ def _tilted(normal: Array, rng: np.random.Generator) -> Array:
     """A unit vector (3,) within TILT of the given one, uniform on that cap of the sphere."""
     along = rng.uniform(np.cos(TILT), 1.0)
     turn = rng.uniform(0.0, 2.0 * np.pi)
-    across = np.linalg.svd(normal[None])[2][1:]
-    side = np.cos(turn) * across[0] + np.sin(turn) * across[1]
+    side = np.array([np.cos(turn), np.sin(turn)]) @ across(normal)
     return np.asarray(along * normal + np.sqrt(1.0 - along**2) * side)
 
 

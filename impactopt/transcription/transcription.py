@@ -202,7 +202,7 @@ class Transcription(ContactProgram):
         p = self.problem
         if self.robot.passive.any():
             return True
-        return any(term.needs_torques for term in p.terms) or any(o.needs_torques for o in p.objectives)
+        return any(term.needs_torques for term in p.active_terms) or any(o.needs_torques for o in p.objectives)
 
     def _add_torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
         """``outputs``: the torques over limit at each node."""

@@ -73,7 +73,8 @@ def run(
 
 def _limited(limit: float | None, problem: ImpactProblem) -> ImpactProblem:
     others = tuple(term for term in problem.terms if not isinstance(term, GearLoad))
-    return replace(problem, terms=others if limit is None else (*others, GearLoad(limit=limit)))
+    own = GearLoad(enabled=False) if limit is None else GearLoad(limit=limit)
+    return replace(problem, terms=(*others, own))
 
 
 def _row(name: str, file: Path, limit: float | None, say: Say) -> dict[str, Any]:

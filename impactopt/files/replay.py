@@ -137,8 +137,9 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """With rows on gears where the record's plan needed them by default.  given : the file was, and is not the
-    record's own text.
+    """With rows on gears where the record's plan needed them by default.
+
+    given : the file was, and is not the record's own text.
     """
     try:
         problem = file.build()

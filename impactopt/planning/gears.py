@@ -16,10 +16,10 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status
-from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.mesh_refinement import GEAR
-from impactopt.transcription.plan import PlannedCollision
+from impactopt.transcription.plan import Plan, PlannedCollision
 from impactopt.transcription.planned_loads import plan_loads, strike_loads
+from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.start import carried_over
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -100,13 +100,13 @@ def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: floa
 
 def _loads(t: Program, x: Array, finer: tuple[PlannedCollision, ...]) -> list[DriveLoads]:
     """Of all motions and all collisions."""
-    robot, planned = t.robot, t.decode(x)
+    planned: Plan | PlannedStrike = t.decode(x)
     hits = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
-    if isinstance(t, StrikeTranscription):
-        still = np.zeros(robot.nv)
-        return [strike_loads(robot, still, still, hit) for hit in hits]
+    if isinstance(planned, PlannedStrike):
+        still = np.zeros(t.robot.nv)
+        return [strike_loads(t.robot, still, still, hit) for hit in hits]
     with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
-        return plan_loads(robot, planned, hits)
+        return plan_loads(t.robot, planned, hits)
     return []
 
 

@@ -1,8 +1,8 @@
 """What gears cost a blow: each problem with less and less that a gear may bear, planned and replayed.
 
-One row a problem, a factor on its robot's armature and a limit of `GearLoad`, and one without. Planned and replayed (MuJoCo, nothing held) load
-of the worst gear over its torque limit, the joint that it is of, and what moves with the limit: the striking
-point's speed, and what becomes of the target. What fails stays in.
+One row a problem, a factor on its robot's armature and a limit of `GearLoad`, and one without. Planned and
+replayed (MuJoCo, nothing held) load of the worst gear over its torque limit, the joint that it is of, and
+what moves with the limit: the striking point's speed, and what becomes of the target. What fails stays in.
 """
 
 from __future__ import annotations

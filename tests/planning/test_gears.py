@@ -121,9 +121,20 @@ def test_a_neighbour_goes_on_with_the_rows(bounded: Solution) -> None:
     assert kept.impulse == pytest.approx(bounded.impulse, rel=1e-3)
 
 
+def test_a_moved_plan_gets_rows_where_it_needs_them() -> None:
+    """A limit just above what the plan asks for, and steel that damps more."""
+    problem = _weak(1.02 * 2.01)
+    near = solve(problem)
+    assert near.status.usable and not gear_rows(near.problem)
+    more = 1.5 * near.problem.law.parameters["damping"]
+    moved = near.moved(damping=more)
+    assert moved.status.usable and gear_rows(moved.problem)
+    assert moved.loads.gear.max() == pytest.approx(1.02 * 2.01, rel=0.03)
+
+
 def test_a_saved_plan_is_made_again_with_its_rows(bounded: Solution, tmp_path: Path) -> None:
     text = write_problem(_weak())
-    assert "gear_load" not in text
+    assert "[terms.gear_load]" not in text
     save_record(record_of(bounded, problem=text), tmp_path)
     planned = load_planned(tmp_path)
     assert gear_rows(planned.problem)

@@ -298,7 +298,13 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
 
     from impactopt.errors import printable
     from impactopt.files.result_folder import set_aside
-    from impactopt.report.console import multistart_table, result_table, told_touches, violation_table
+    from impactopt.report.console import (
+        multistart_table,
+        result_table,
+        told_off,
+        told_touches,
+        violation_table,
+    )
 
     console, summary = Console(), record.summary
     if record.completed:
@@ -312,7 +318,7 @@ def _show(record: Record, written: list[Path], as_json: bool) -> None:
         )
     error = summary.get("simulated", {}).get("error")
     beyond = summary.get("gear_caution")
-    cautions = (summary.get("caution"), told_touches(summary), beyond)
+    cautions = (summary.get("caution"), told_touches(summary), beyond, told_off(summary))
     for text in (summary.get("note"), error, reach.get("error"), *cautions):
         if text:
             console.print(printable(str(text)), markup=False, highlight=False)

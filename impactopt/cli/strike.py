@@ -87,12 +87,12 @@ def strike(
         else:
             from rich.console import Console
 
-            from impactopt.report.console import multistart_table, strike_table, violation_table
+            from impactopt.report.console import multistart_table, strike_table, told_off, violation_table
 
             shown = Console()
             shown.print(strike_table(record.summary))
-            if beyond := record.summary.get("gear_caution"):
-                shown.print(printable(str(beyond)), highlight=False, markup=False)
+            for text in filter(None, (record.summary.get("gear_caution"), told_off(record.summary))):
+                shown.print(printable(str(text)), highlight=False, markup=False)
             shown.print(multistart_table(record.summary["starts"]))
             if record.summary["violations"]:
                 shown.print(violation_table(record.summary["violations"]))

@@ -117,7 +117,7 @@ _START = {
 _PROBLEM = {
     **dict.fromkeys(("name?", "robot?", "striker?", "target?", "law?", "hash?", "collision?"), _TEXT),
     **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),
-    **dict.fromkeys(("scenarios?", "objectives?"), ([_TEXT],)),
+    **dict.fromkeys(("scenarios?", "objectives?", "off?"), ([_TEXT],)),
 }
 _SCENARIO = {**_BLOW, "name": _TEXT, **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER)}
 # of a record with arrays, whole
@@ -153,6 +153,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "replayed?": (_REPLAYED,),
     "versions?": ({"*": _TEXT},),
     "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
+    "gear_rows?": _YES,
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
     **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "collision_model?"), _TEXT),
 }

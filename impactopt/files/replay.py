@@ -15,6 +15,7 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
+from impactopt.planning.gears import with_gear_rows
 from impactopt.planning.solution import gear_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
@@ -79,7 +80,7 @@ def load_planned(
         note = record.summary.get("note", usual)
         raise InputError(f"{result} holds no motion to replay: {note}")
     file = _problem_file(record, Path(result), problem_file, settings)
-    problem = _built(file, Path(result), given=problem_file is not None)
+    problem = _built(record, file, Path(result), given=problem_file is not None)
     a, robot = record.arrays, problem.robot
     if list(a["joints"]) != list(robot.joint_names) or a["reference_q"].shape[1] != robot.model.nq:
         raise InputError(
@@ -115,7 +116,7 @@ def problem_of(
     InputError : the record has no problem file, or it cannot be built again.
     """
     file = _problem_file(record, result, problem_file, settings)
-    return _built(file, result, given=problem_file is not None)
+    return _built(record, file, result, given=problem_file is not None)
 
 
 def _problem_file(
@@ -135,10 +136,14 @@ def _problem_file(
         raise _not_again(result, error) from error
 
 
-def _built(file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """given : the file was, and is not the record's own text."""
+def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
+    """With rows on gears where the record's plan needed them by default.
+
+    given : the file was, and is not the record's own text.
+    """
     try:
-        return file.build()
+        problem = file.build()
+        return with_gear_rows(problem) if record.summary.get("gear_rows") else problem
     except InputError as error:
         if given:
             raise

@@ -8,9 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impactopt.planning.bent_program import bent_of
 from impactopt.planning.changes import moved_problem
+from impactopt.planning.gears import within_gears
 from impactopt.planning.keeping_apart import Margins
 from impactopt.planning.made_again import planned_by
 from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after_the_other, violations_of
@@ -23,6 +25,7 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["moved_solution"]
 
+Array = NDArray[np.float64]
 _FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
 _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near as that
@@ -66,6 +69,11 @@ def moved_solution(
     if refine:
         t, result, _ = refining.rounds(t, result, old.x)
     t, result = refining.judged(t, result)
+
+    def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        return refining.judged(other, budget.run(other.program, start))
+
+    t, result = within_gears(t, result, (t, old), solve, lambda *_: ())
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
+from impactopt.planning.gears import gear_rows
 from impactopt.planning.multistart import carried
 from impactopt.planning.solution import ModelError, Solved
 from impactopt.problem.problem import ImpactProblem
@@ -74,14 +75,17 @@ def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: 
 def carried_start(
     t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, rows: Any
 ) -> SolverResult:
-    """What a program starts from that has another model of the collision than a solution: that solution.
+    """What a program starts from that has another model of the collision than a solution, or has rows on
+    gears alone: that solution.
 
-    old : makes the solution's program.  rows : between bodies, of both.
+    old : makes the solution's program.  rows : between bodies, of the new one.
     """
-    was, now = start.problem, t.problem
-    if (was.collision, was.freezes) == (now.collision, now.freezes):
+    was, now = (
+        (problem.collision, problem.freezes, gear_rows(problem)) for problem in (start.problem, t.problem)
+    )
+    if was == now:
         return start.result
-    return carried(t.with_apart(rows), old().with_apart(rows), start.result)
+    return carried(t.with_apart(rows), old().with_apart(start.apart), start.result)
 
 
 def climbed(

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.gears import gear_rows, with_gear_rows, within_gears
 from impactopt.planning.keeping_apart import Margins, same_bodies
 from impactopt.planning.made_again import planned_by, program_of
 from impactopt.planning.models import carried_start, climbed
 from impactopt.planning.multistart import (
+    EFFORT,
     Budget,
     Starts,
     attempt_of,
@@ -33,6 +35,7 @@ from impactopt.solvers.program import Callback, SolverResult
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.plan import PlannedCollision
 from impactopt.transcription.start import first_iterate, iterate_from_strike, strike_iterate
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.strike import StrikeTranscription
@@ -99,6 +102,8 @@ def solve(
     shares: Shares = ()
     apart: Mapping[ApartRow, Held] = {}
     if isinstance(start, Solution):
+        if gear_rows(start.problem):  # a neighbour is likely to need them too
+            problem = with_gear_rows(problem)
         given, nodes, elements, shares = start.result, start.nodes, start.elements, start.shares
         if start.problem.keeps_apart and same_bodies(problem, start.problem):
             apart = start.apart
@@ -121,9 +126,9 @@ def solve(
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, apart, report)
-    # limbs that are in each other say nothing of what a start is worth: each is led to its end before they
-    # compare
-    each = refining.solve if margins is not None and refine else refining.first
+    # limbs that are in each other, or gears that break, say nothing of what a start is worth: each is led to
+    # its end before they compare
+    each = partial(_led, refining, refine and margins is not None)
     of_start = _starts(t, given, starts, seed, partial(clear_strike, budget, margins), refining)
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
@@ -137,12 +142,48 @@ def solve(
     )
 
 
+def _led(
+    refining: Refining, to_its_end: bool, t: Transcription, start: Array | SolverResult
+) -> tuple[Transcription, SolverResult]:
+    """What comes of a start, with rows on gears if it needs them.  to_its_end : round by round."""
+    work = refining.solve if to_its_end else refining.first
+    found, result = work(t, start)
+    return _bounded(refining, found, result, (t, start), to_its_end)
+
+
+def _bounded(
+    refining: Refining,
+    t: Transcription,
+    result: SolverResult,
+    first: tuple[Transcription, Array | SolverResult],
+    to_its_end: bool,
+) -> tuple[Transcription, SolverResult]:
+    """As `within_gears`."""
+
+    def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        own = Refining(refining.budget, refining.margins, other.apart_rows, refining.report)
+        done = own.solve(other, start) if to_its_end else own.first(other, start)
+        refining.blocked = own.blocked
+        return done
+
+    def finer(other: Transcription, x: Array) -> tuple[PlannedCollision, ...]:
+        error = refining.error(other, x)
+        return () if error is None or error.missed else error.finer
+
+    return within_gears(t, result, first, solve, finer, refining.report)
+
+
 def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[Transcription, dict[str, Any]]:
     """The best result's program with what it lacks, and the fields of its solution; a round is an attempt
     more.
     """
     began, old = time.perf_counter(), fields["result"]
     finer, result, rounds = refining.rounds(t, old, old.x)
+    within, bounded = _bounded(refining, finer, result, (t, old.x), True)
+    if within is not finer:
+        alone = {key: getattr(bounded, key) - getattr(result, key) for key in EFFORT}
+        rounds.append((within, "rows on gears", replace(bounded, **alone)))
+        finer, result = within, bounded
     if not rounds:
         return t, fields
     rows = finer.program.constraints(result.x)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.planning.gears import gear_rows, gears_beyond
 from impactopt.planning.multistart import Attempt
 from impactopt.planning.sliding import slide, slide_caution
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import GearLoad
 from impactopt.robots.loads import DriveLoads
 from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
@@ -31,6 +31,7 @@ from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import Rattle
 
 Array = NDArray[np.float64]
+_REPLAYED = 0.1  # beyond what gears may bear: replays of a plan that keeps to it stay within this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +109,7 @@ class Solved:
             "starts": [attempt.summary() for attempt in self.attempts],
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
+            "gear_rows": gear_rows(self.problem),
             "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
             "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),
@@ -382,10 +384,12 @@ def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict
 
 
 def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> dict[str, str]:
-    """What is to be said of gears that bear too much, in a plan whose problem does not bound them."""
-    if problem.extra(GearLoad) is not None:
-        return {}
-    beyond = [text for loads in found if loads is not None and (text := loads.beyond_peak())]
+    """What is to be said of gears that bear too much: of a plan that lets them, and of replays of others."""
+    loads = [one for one in found if one is not None]
+    if problem.gear_load.active:
+        text = gears_beyond(problem, loads, more=_REPLAYED)
+        return {"gear_caution": f"{text}, more than it may"} if text else {}
+    beyond = [text for one in loads if (text := one.beyond_peak())]
     return {"gear_caution": beyond[0]} if beyond else {}
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.gears import gear_rows, with_gear_rows, within_gears
 from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
@@ -30,6 +31,7 @@ from impactopt.planning.solution import Solved, blow_numbers, gear_caution, vers
 from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import GearLoad
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import contact_elements
@@ -48,6 +50,7 @@ BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.03, 1e-2, 1e-3
 # where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
 ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
+Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
 METHODS = {"collocation": StrikeTranscription, "shooting": ShootingStrike}
 
 
@@ -104,7 +107,8 @@ def optimize_strike(
 
     The motion before and after is free. So near the state at contact of a motion, the impulse of the strike
     is an upper bound on that of the motion. There are local optima: different postures can differ by a
-    factor.
+    factor. Gears bear what `GearLoad` lets them, by default too; not by shooting, which knows of no
+    accelerations in contact.
 
     method : "collocation", the whole equation of motion while the contact lasts, as in a motion; or
         "shooting", what the SDC predicts, with H, J and bias frozen at contact: a program of few variables,
@@ -147,6 +151,8 @@ def optimize_strike(
 
         return climbed(problem, run, time_limit=time_limit, report=report)
     began = time.perf_counter()
+    if isinstance(start, StrikeSolution) and gear_rows(start.problem):
+        problem = with_gear_rows(problem)
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
     functions = block_functions(problem, problem.coordinates, report, *mesh[:1])
     budget = budget.started()
@@ -157,13 +163,16 @@ def optimize_strike(
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
-    t, fields = solve_from(
-        t, _starts(t, given, starts, seed), budget, began, partial(_clean_strike, budget, margins)
-    )
+    work = partial(_clean_strike, budget, margins)
+    if method != "shooting":
+        work = partial(_bounded_strike, work, report)
+    t, fields = solve_from(t, _starts(t, given, starts, seed), budget, began, work)
     result = fields["result"] = with_reason(t, fields["result"])
     held = rattle(t, result.x) if result.status.usable else None
-    if method == "shooting":  # it is what the result is to be told as
-        fields["problem"] = problem = replace(problem, collision="sdc")
+    problem = fields["problem"]
+    if method == "shooting":  # it is what the result is to be told as: it knows of no accelerations
+        terms = (*(term for term in problem.terms if not isinstance(term, GearLoad)), GearLoad(enabled=False))
+        fields["problem"] = problem = replace(problem, collision="sdc", terms=terms)
     return StrikeSolution(
         strike=t.decode(result.x),
         rattle=held,
@@ -261,6 +270,14 @@ def _clean_strike(
     assert margins is not None
     names = (" and ".join(margins.bodies.names(row[1:3])) for row in left)
     return t, touching(result, depth, names, "strike")
+
+
+def _bounded_strike(
+    work: Work, report: Callable[[str], None] | None, t: StrikeTranscription, start: Array | SolverResult
+) -> tuple[StrikeTranscription, SolverResult]:
+    """What comes of a start, with rows on gears if it needs them."""
+    found, result = work(t, start)
+    return within_gears(found, result, (t, start), work, lambda *_: (), report)
 
 
 def _roughly(budget: Budget) -> Budget:

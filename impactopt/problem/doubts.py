@@ -39,7 +39,7 @@ def doubts(robot: Robot) -> list[str]:
     which = "no joint has" if len(without) == robot.n else f"{', '.join(without)}: no"
     return [
         f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too light "
-        "and hits too softly; give `[robot] armature_kg_m2`, by joint"
+        "and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, by joint"
     ]
 
 

@@ -51,8 +51,10 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
 
 
 def _drives(problem: Any) -> dict[str, Any]:
-    """Motors and gears, where something of the problem depends on them."""
-    return {"actuators": problem.robot.actuators} if problem.of_drives else {}
+    """Motors and gears, as far as the problem depends on them."""
+    if problem.of_drives:
+        return {"actuators": problem.robot.actuators}
+    return {"gear_limit": problem.robot.gear_limit} if problem.gear_load.active else {}
 
 
 def _contact(thing: Any) -> tuple[Any, ...]:

@@ -39,12 +39,14 @@ from impactopt.problem.checks import (
     check_moves,
     check_names,
 )
+from impactopt.problem.described import described
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
+    GearLoad,
     HandOrientation,
     HitCone,
     Incidence,
@@ -99,7 +101,8 @@ class ImpactProblem:
     scenarios : other targets, or none, that the robot has to survive with the same swing.
     body : the target's shape, which all of the robot but the striking point keeps off.
     obstacles : bodies in the world that the robot keeps off.
-    terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults.
+    terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
+        `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
         return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
@@ -275,12 +278,12 @@ class ImpactProblem:
     @property
     def of_drives(self) -> bool:
         """Whether a term is about motors or gears."""
-        return any(term.of_drives for term in self.terms)
+        return any(term.of_drives for term in self.active_terms)
 
     @property
     def first_instant(self) -> bool:
         """Whether a term looks at the first instant of a contact that has a force at once."""
-        wanted = self.lasts and any(term.first_instant for term in self.terms)
+        wanted = self.lasts and any(term.first_instant for term in self.active_terms)
         return wanted and float(self.law.branch(0.0, 1.0, True)) != 0.0
 
     @property
@@ -332,6 +335,16 @@ class ImpactProblem:
         return inverse_kinematics(*given)
 
     @property
+    def active_terms(self) -> tuple[Term, ...]:
+        """Its own terms that are not switched off."""
+        return tuple(term for term in self.terms if term.active)
+
+    @property
+    def gear_load(self) -> GearLoad:
+        """Its term on its gears: the default, where it has none of its own."""
+        return self.extra(GearLoad) or GearLoad()
+
+    @property
     def self_collision(self) -> SelfCollision:
         """Its term on its own links."""
         return self.term(SelfCollision)
@@ -378,23 +391,4 @@ class ImpactProblem:
 
     def describe(self) -> dict[str, Any]:
         """The problem in a few plain words and numbers, for reports."""
-        out: dict[str, Any] = {
-            "name": self.name,
-            "robot": self.robot.name,
-            "striker": self.striker,
-            "point_m": self.point.tolist(),
-            "normal": self.normal.tolist(),
-            "target": repr(self.target),
-            "law": repr(self.law),
-            "hash": self.hash,
-        }
-        if self.collision != "full":
-            frozen = f", {self.freezes} freezes" if self.freezes else ""
-            more = {"rigid": f", restitution {self.coefficient_of_restitution:g}", "sdc": frozen}
-            out["collision"] = self.collision + more.get(self.collision, "")
-        if self.robot.source and self.robot.source.repairs:
-            out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
-        out |= {"scenarios": [str(s) for s in self.scenarios]} if self.scenarios else {}
-        if self.objectives != DEFAULT_OBJECTIVES:
-            out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in self.objectives]
-        return out
+        return described(self)

@@ -38,6 +38,7 @@ __all__ = [
     "replay_table",
     "result_table",
     "strike_table",
+    "told_off",
     "told_touches",
     "torques_table",
     "violation_table",
@@ -246,6 +247,12 @@ def told_touches(summary: Mapping[str, Any]) -> str:
         f"{count} in each other, {worst['one']} and {worst['other']} by {worst['depth_mm']:.0f} mm; "
         "[terms.self_collision] and [terms.keep_out] keep them apart"
     )
+
+
+def told_off(summary: Mapping[str, Any]) -> str:
+    """Which bounds of every problem a plan was made without, in a sentence; "" where none is off."""
+    off = summary.get("problem", {}).get("off") or ()
+    return f"switched off: {', '.join(off)}" if off else ""
 
 
 def violation_table(violations: Sequence[Mapping[str, Any]]) -> Table:

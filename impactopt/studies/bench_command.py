@@ -124,6 +124,14 @@ def _machine(
             "--problem", metavar="NAME", help="A problem's name or file; several times for several."
         ),
     ] = None,
+    limits: Annotated[
+        list[str] | None,
+        typer.Option("--limit", metavar="N", help="Of gears over torque limits, or 'none'; for all five."),
+    ] = None,
+    armatures: Annotated[
+        list[float] | None,
+        typer.Option("--armature", metavar="FACTOR", help="Times the robot's armature, such as 0.5."),
+    ] = None,
 ) -> None:
     """What gears cost a blow: each problem with gear limits of 3, 2, 1.5 and 1, and without."""
 

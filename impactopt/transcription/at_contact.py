@@ -193,7 +193,7 @@ class ContactProgram(ABC):
         """Rows that these terms bring, those of springs, and the objective."""
         add_springs(self.builder, self._spring_points())
         for term in terms:
-            if type(term).add_rows is not Term.add_rows:  # those of the others are there
+            if type(term).add_rows is not Term.add_rows and term.active:  # those of others are there
                 term.add_rows(self)
         self.objectives = quantities(self, objectives)
         self._worth = assemble(self.layout, self.objectives, self._prices())

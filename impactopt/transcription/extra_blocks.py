@@ -58,7 +58,7 @@ def extra_blocks(
     """
     taken = {*own_blocks(problem, c)}
     out: dict[str, ExtraBlock] = {}
-    things: list[Term | Objective] = [*problem.objectives, *problem.terms]
+    things: list[Term | Objective] = [*problem.objectives, *problem.active_terms]
     for thing in sorted(things, key=lambda t: not type(t).__module__.startswith("impactopt.")):
         where = f"{type(thing).__name__}.blocks"
         for name, block in thing.blocks(problem, c).items():

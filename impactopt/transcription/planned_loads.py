@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,9 +11,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
 from impactopt.robots.loads import DriveLoads, gear_torque
 from impactopt.robots.robot import Robot
-from impactopt.transcription.plan import PlannedCollision, Trajectory
+from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 
-__all__ = ["gear_share", "motion_loads", "strike_loads"]
+__all__ = ["gear_share", "motion_loads", "plan_loads", "strike_loads"]
 
 Array = NDArray[np.float64]
 
@@ -22,6 +24,16 @@ def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveL
     rates, outside = way.v[:, base:], phase != 1
     jump = rates[phase == 2][0] - rates[phase == 0][-1]
     return _loads(robot, (way.torque[outside], rates[outside], way.a[outside, base:]), hit, jump)
+
+
+def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> list[DriveLoads]:
+    """Of a plan's motions, the one that meets nothing included, and of these collisions with its targets."""
+    expected, *others = hits
+    out = [motion_loads(robot, plan.trajectory(), expected)]
+    if plan.abort is not None:
+        out.append(motion_loads(robot, plan.trajectory(missed=True), expected))
+    still = np.zeros(robot.nv)
+    return out + [strike_loads(robot, still, still, hit) for hit in others]
 
 
 def strike_loads(robot: Robot, before: Array, after: Array, hit: PlannedCollision) -> DriveLoads:
@@ -35,7 +47,7 @@ def gear_share(problem: ImpactProblem, torque: Array, acceleration: Array) -> Ar
     joints; zeros where it bounds none.
     """
     term, robot = problem.extra(GearLoad), problem.robot
-    if term is None or not acceleration.size:
+    if term is None or not term.active or not acceleration.size:
         return np.zeros(len(torque))
     load = gear_torque(robot, torque, acceleration) / robot.torque_limit / term.most(robot)
     return np.asarray(np.abs(load).max(axis=1, initial=0.0))

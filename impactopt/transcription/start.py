@@ -128,7 +128,7 @@ def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array)
 
 def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
     """Variables, multipliers of rows and of bounds of a program with more nodes than an old one, or elements,
-    or of another model of the collision that lasts.
+    or of another model of the collision that lasts, or with a first instant of contact.
 
     What is at nodes is between those of the old nodes, and the contact is that of its polynomials;
     multipliers are those of the same rows and variables.
@@ -167,6 +167,10 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
             mine.guess_model(new, *state)
         elif t.hit.elements != old.hit.elements:
             carry_contact(mine, its, new, x)
+    if len(t.hit.first) != len(old.hit.first):
+        state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
+        for first in t.hit.first:
+            first.guess(new, *state)
     of_rows = dict(zip(_keys(old), y, strict=True))
     rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
     return _finished(t, new), rows, bounds

@@ -200,9 +200,9 @@ class Transcription(ContactProgram):
     def torques_lifted(self) -> bool:
         """Whether the torques at the nodes are variables, as something beside their limit asks for them."""
         p = self.problem
-        if self.robot.passive.any():
+        if self.robot.passive.any() or any(term.needs_torques for term in p.active_terms):
             return True
-        return any(term.needs_torques for term in p.terms) or any(o.needs_torques for o in p.objectives)
+        return any(o.needs_torques for o in p.objectives)
 
     def _add_torque_rows(self, places: list[Place], outputs: list[Index]) -> None:
         """``outputs``: the torques over limit at each node."""

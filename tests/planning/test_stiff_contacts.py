@@ -12,6 +12,7 @@ from impactopt.planning.multistart import Budget
 from impactopt.planning.verdict import second_look
 from impactopt.problem.objectives import Impulse, PeakForce
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import GearLoad
 from impactopt.solvers.program import Status
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_error import ASKED
@@ -28,11 +29,13 @@ BOARD = Board(mass=0.1, stiffness=1e5, breaking_force=700.0, damping=20.0)
 
 
 def with_stiffness(name: str, stiffness: float, *, ratio: bool = True) -> ImpactProblem:
-    """A problem with another contact stiffness [N/m]; its damping ratio stays, or else its damping."""
+    """A problem with another contact stiffness [N/m]; its damping ratio stays, or else its damping. Its gears
+    bear what they have to: steel that damps more makes a larger force at once.
+    """
     problem = load_problem(name)
     k, d = problem.law.parameters["stiffness"], problem.law.parameters["damping"]
     law = KelvinVoigt(stiffness=stiffness, damping=d * np.sqrt(stiffness / k) if ratio else d)
-    return dataclasses.replace(problem, law=law)
+    return dataclasses.replace(problem, law=law, terms=(*problem.terms, GearLoad(enabled=False)))
 
 
 def contact_of(problem: ImpactProblem) -> StrikeTranscription:

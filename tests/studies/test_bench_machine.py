@@ -59,9 +59,26 @@ def test_a_plan_that_is_none_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "solved", refused)
     monkeypatch.setattr(machine, "problem_names", lambda: ("nailing", "punch_infeasible"))
     report = run_bench("machine", lambda _: None, limits=(None, 1.0))
-    told = {"problem": "nailing", "status": "error", "error": "the gear breaks"}
+    told = {"problem": "nailing", "armature": 1.0, "status": "error", "error": "the gear breaks"}
     assert report.numbers["rows"] == [{**told, "gear_limit": None}, {**told, "gear_limit": 1.0}]
     assert not report.figures["machine"]().axes[0].lines
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_half_the_armature_spares_the_gear() -> None:
+    """A rotor takes its share of the blow through the gear: half of it, less."""
+    given: dict[str, Any] = {"problems": ["arm_planar"], "limits": ["none"], "armatures": [0.5, 1.0]}
+    report = run_bench("machine", lambda _: None, **given)
+    half, whole = report.numbers["rows"]
+    assert (half["armature"], whole["armature"]) == (0.5, 1.0)
+    assert half["gear_planned"] < whole["gear_planned"] and whole["gear_limit"] is None
+    assert half["gear_replayed"] == pytest.approx(half["gear_planned"], rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "given"), [("limit", "some"), ("limit", -1.0), ("armature", 0.0)])
+def test_a_limit_that_is_none(name: str, given: Any) -> None:
+    with pytest.raises(InputError, match=f"{name} is {given!r}; give a number > 0"):
+        run_bench("machine", lambda _: None, problems=["arm_planar"], **{f"{name}s": [given]})
 
 
 def test_a_problem_that_there_is_not() -> None:

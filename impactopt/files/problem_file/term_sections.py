@@ -14,7 +14,8 @@ _FIRST, *_, _LAST = list(_TERMS)[: len(DEFAULT_TERMS)]
 
 TermSections = sections_of(
     "TermSections",
-    f"Constraints. Those from {_FIRST} to {_LAST} hold, with their defaults, if they are left out.",
+    f"Constraints. Those from {_FIRST} to {_LAST}, and gear_load, hold with their defaults if they are "
+    "left out.",
     _TERMS,
 )
 ObjectiveSections = sections_of(

@@ -1,7 +1,9 @@
 """What a plan must respect, as named terms with units, one a file; a problem holds one of each kind at most.
 
 `base` says what a term has. DEFAULT_TERMS hold in every problem, and their rows are in the transcription; the
-others of TERMS only where they are given, and bring their own. A new one is a file here, and its lines below.
+others of TERMS bring their own, and hold only where they are given. `GearLoad` holds in every problem too,
+but a program has its rows only if it is given, or once a plan has gone beyond it. A new one is a file here,
+and its lines below.
 """
 
 from impactopt.problem.terms.balance import Balance

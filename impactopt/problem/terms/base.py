@@ -102,6 +102,11 @@ class Term(Described):
             raise InputError(f"{type(self).__name__}.angle is {value:g} rad; give one between 0 and pi/2")
 
     @property
+    def active(self) -> bool:
+        """Whether it is not switched off, as a field ``enabled`` may."""
+        return bool(getattr(self, "enabled", True))
+
+    @property
     def frames(self) -> tuple[str, ...]:
         """Frames that the robot must have."""
         return ()

@@ -27,6 +27,9 @@ class GearLoad(Term):
     That is servo torque - armature x joint acceleration. It holds at the nodes of all motions, at the
     collocation points of all contacts, and in their first instant, where the force of a damped contact jumps.
     If the limit is given by joint, joints that are not named have no bound.
+
+    It holds with its defaults where a problem does not have it. Rows are then added once a plan without them
+    goes beyond; where it is given they are there from the start.
     """
 
     name: ClassVar[str] = "gear load"
@@ -43,6 +46,7 @@ class GearLoad(Term):
             by_joint=True,
         ),
     )
+    enabled: bool = field(default=True, metadata=about("false: gears bear what they have to"))
 
     def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
         return {"rotors": BlockRecipe(lambda: rotors(coordinates))}

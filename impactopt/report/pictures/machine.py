@@ -18,8 +18,9 @@ def machine_picture(rows: Sequence[Row]) -> Picture:
     axes = figure.subplots()
     limits = sorted({row["gear_limit"] for row in rows} - {None})
     free = max(limits, default=0.0) + STEP
-    for name in dict.fromkeys(row["problem"] for row in rows):
-        own = [row for row in rows if row["problem"] == name and row.get("impulse_Ns") is not None]
+    for case in dict.fromkeys((row["problem"], row["armature"]) for row in rows):
+        own = [row for row in rows if (row["problem"], row["armature"]) == case and row.get("impulse_Ns")]
+        name = case[0] if case[1] == 1.0 else f"{case[0]}, armature x {case[1]:g}"
         whole = next((row["impulse_Ns"] for row in own if row["gear_limit"] is None), None)
         if not whole:
             continue

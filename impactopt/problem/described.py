@@ -1,0 +1,39 @@
+"""A problem in a few plain words and numbers, for reports."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from impactopt.problem.objectives import DEFAULT_OBJECTIVES
+
+if TYPE_CHECKING:
+    from impactopt.problem.problem import ImpactProblem
+
+__all__ = ["described"]
+
+
+def described(problem: ImpactProblem) -> dict[str, Any]:
+    """As of `ImpactProblem.describe`."""
+    p = problem
+    out: dict[str, Any] = {
+        "name": p.name,
+        "robot": p.robot.name,
+        "striker": p.striker,
+        "point_m": p.point.tolist(),
+        "normal": p.normal.tolist(),
+        "target": repr(p.target),
+        "law": repr(p.law),
+        "hash": p.hash,
+    }
+    if p.collision != "full":
+        frozen = f", {p.freezes} freezes" if p.freezes else ""
+        more = {"rigid": f", restitution {p.coefficient_of_restitution:g}", "sdc": frozen}
+        out["collision"] = p.collision + more.get(p.collision, "")
+    if p.robot.source and p.robot.source.repairs:
+        out["inertias"] = [f"repaired: {text}" for text in p.robot.source.repairs]
+    out |= {"scenarios": [str(s) for s in p.scenarios]} if p.scenarios else {}
+    if p.objectives != DEFAULT_OBJECTIVES:
+        out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in p.objectives]
+    if off := [term.name for term in (p.self_collision, p.keep_out, p.gear_load) if not term.active]:
+        out["off"] = off
+    return out

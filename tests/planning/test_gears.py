@@ -82,6 +82,7 @@ def test_no_blow_within_the_limit_is_told() -> None:
     found = solve(_weak(0.8))
     assert not found.status.usable
     assert any("gear load" in violation.what for violation in found.violations)
+    assert "Without a bound of its gears there is a plan, but gear of wrist: 2.01" in found.result.message
 
 
 def test_a_strike_is_bounded_too() -> None:

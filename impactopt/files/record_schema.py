@@ -153,7 +153,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "replayed?": (_REPLAYED,),
     "versions?": ({"*": _TEXT},),
     "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
-    "gear_rows?": _YES,
+    "rows_on_demand?": ([_TEXT],),
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
     **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "collision_model?"), _TEXT),
 }

@@ -15,7 +15,7 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
-from impactopt.planning.gears import with_gear_rows
+from impactopt.planning.on_demand import with_rows
 from impactopt.planning.solution import gear_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation import Perturbation, Simulation, scene_of, simulate
@@ -137,13 +137,13 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """With rows on gears where the record's plan needed them by default.
+    """With the rows on demand that the record's plan needed.
 
     given : the file was, and is not the record's own text.
     """
     try:
         problem = file.build()
-        return with_gear_rows(problem) if record.summary.get("gear_rows") else problem
+        return with_rows(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:
             raise

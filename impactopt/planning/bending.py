@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from impactopt.planning.bent_program import bent_of
 from impactopt.planning.changes import moved_problem
-from impactopt.planning.gears import within_gears
 from impactopt.planning.keeping_apart import Margins
 from impactopt.planning.made_again import planned_by
 from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after_the_other, violations_of
+from impactopt.planning.on_demand import kept_on_demand
 from impactopt.planning.rounds import Refining
 from impactopt.planning.solution import Solution
 from impactopt.solvers.active import ActiveSystem, Change, Offset
@@ -73,7 +73,7 @@ def moved_solution(
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         return refining.judged(other, budget.run(other.program, start))
 
-    t, result = within_gears(t, result, (t, old), solve, lambda *_: ())
+    t, result = kept_on_demand(t, result, (t, old), solve, lambda *_: ())
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))
 
 

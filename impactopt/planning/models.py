@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
-from impactopt.planning.gears import gear_rows
 from impactopt.planning.multistart import carried
+from impactopt.planning.on_demand import rows_on_demand
 from impactopt.planning.solution import ModelError, Solved
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
@@ -76,13 +76,11 @@ def carried_start(
     t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, rows: Any
 ) -> SolverResult:
     """What a program starts from that has another model of the collision than a solution, or has rows on
-    gears alone: that solution.
+    demand of its own: that solution.
 
     old : makes the solution's program.  rows : between bodies, of the new one.
     """
-    was, now = (
-        (problem.collision, problem.freezes, gear_rows(problem)) for problem in (start.problem, t.problem)
-    )
+    was, now = ((p.collision, p.freezes, rows_on_demand(p)) for p in (start.problem, t.problem))
     if was == now:
         return start.result
     return carried(t.with_apart(rows), old().with_apart(start.apart), start.result)

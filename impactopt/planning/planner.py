@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.gears import gear_rows, with_gear_rows, within_gears
 from impactopt.planning.keeping_apart import Margins, same_bodies
 from impactopt.planning.made_again import planned_by, program_of
 from impactopt.planning.models import carried_start, climbed
@@ -26,6 +25,7 @@ from impactopt.planning.multistart import (
     solve_from,
     violations_of,
 )
+from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
 from impactopt.planning.rounds import Refining
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
@@ -102,8 +102,7 @@ def solve(
     shares: Shares = ()
     apart: Mapping[ApartRow, Held] = {}
     if isinstance(start, Solution):
-        if gear_rows(start.problem):  # a neighbour is likely to need them too
-            problem = with_gear_rows(problem)
+        problem = with_rows(problem, rows_on_demand(start.problem))  # a neighbour is likely to need them too
         given, nodes, elements, shares = start.result, start.nodes, start.elements, start.shares
         if start.problem.keeps_apart and same_bodies(problem, start.problem):
             apart = start.apart
@@ -145,7 +144,7 @@ def solve(
 def _led(
     refining: Refining, to_its_end: bool, t: Transcription, start: Array | SolverResult
 ) -> tuple[Transcription, SolverResult]:
-    """What comes of a start, with rows on gears if it needs them.  to_its_end : round by round."""
+    """What comes of a start, with the rows on demand that it needs.  to_its_end : round by round."""
     work = refining.solve if to_its_end else refining.first
     found, result = work(t, start)
     return _bounded(refining, found, result, (t, start), to_its_end)
@@ -158,7 +157,7 @@ def _bounded(
     first: tuple[Transcription, Array | SolverResult],
     to_its_end: bool,
 ) -> tuple[Transcription, SolverResult]:
-    """As `within_gears`."""
+    """As `kept_on_demand`."""
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         own = Refining(refining.budget, refining.margins, other.apart_rows, refining.report)
@@ -170,7 +169,7 @@ def _bounded(
         error = refining.error(other, x)
         return () if error is None or error.missed else error.finer
 
-    return within_gears(t, result, first, solve, finer, refining.report)
+    return kept_on_demand(t, result, first, solve, finer, refining.report)
 
 
 def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[Transcription, dict[str, Any]]:
@@ -182,7 +181,7 @@ def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[T
     within, bounded = _bounded(refining, finer, result, (t, old.x), True)
     if within is not finer:
         alone = {key: getattr(bounded, key) - getattr(result, key) for key in EFFORT}
-        rounds.append((within, "rows on gears", replace(bounded, **alone)))
+        rounds.append((within, "rows on demand", replace(bounded, **alone)))
         finer, result = within, bounded
     if not rounds:
         return t, fields

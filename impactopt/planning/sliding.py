@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from impactopt.kinematics.directions import across
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import Slide
 from impactopt.simulation.struck import FACE
 from impactopt.transcription.plan import Plan
 
-FAR = 0.1  # [m] across the target's face: a plan that slides so far is told so
+FAR = 0.15  # [m] across the target's face: a plan that slides so far is told so
 INSTANTS = 9  # of the contact
+MORE = 0.03  # of what it may be: no more than a mesh leaves it
 
 
 def slide(problem: ImpactProblem, plan: Plan) -> float:
@@ -20,8 +23,22 @@ def slide(problem: ImpactProblem, plan: Plan) -> float:
     postures = plan.closed(plan.through_contact(np.linspace(0.0, 1.0, INSTANTS)))
     places = np.array([striking_point(problem.robot, problem.striker, q) for q in postures])
     way = places - places[0]
-    across = way - np.outer(way @ problem.normal, problem.normal)
-    return float(np.linalg.norm(across, axis=1).max())
+    aside = way @ across(problem.normal).T
+    return float(np.linalg.norm(aside, axis=1).max())
+
+
+def slides_beyond(term: Slide, plan: Plan) -> str:
+    """How far the striking point is from the hit point as contact ends, in words; "" if that is no more along
+    each tangent than it may be, but for a little.
+    """
+    problem = plan.problem
+    after = plan.closed(plan.through_contact(np.ones(1)))[0]
+    away = striking_point(problem.robot, problem.striker, after) - problem.point
+    far = float(np.abs(across(problem.normal) @ away).max())
+    if far <= (1 + MORE) * term.most:
+        return ""
+    most = f"which may be {1e3 * term.most:.0f} mm"
+    return f"the striking point slides {1e3 * far:.0f} mm across the target, {most}"
 
 
 def slide_caution(length: float) -> str:

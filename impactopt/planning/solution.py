@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.planning.gears import gear_rows, gears_beyond
+from impactopt.planning.gears import gears_beyond
 from impactopt.planning.multistart import Attempt
+from impactopt.planning.on_demand import rows_on_demand
 from impactopt.planning.sliding import slide, slide_caution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
@@ -109,7 +110,7 @@ class Solved:
             "starts": [attempt.summary() for attempt in self.attempts],
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
-            "gear_rows": gear_rows(self.problem),
+            "rows_on_demand": list(rows_on_demand(self.problem)),
             "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
             "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
-from impactopt.planning.gears import gear_rows, with_gear_rows, within_gears
 from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
@@ -27,6 +26,7 @@ from impactopt.planning.multistart import (
     touching,
     with_effort_of,
 )
+from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
 from impactopt.planning.solution import Solved, blow_numbers, gear_caution, versions
 from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
@@ -151,8 +151,8 @@ def optimize_strike(
 
         return climbed(problem, run, time_limit=time_limit, report=report)
     began = time.perf_counter()
-    if isinstance(start, StrikeSolution) and gear_rows(start.problem):
-        problem = with_gear_rows(problem)
+    if isinstance(start, StrikeSolution):
+        problem = with_rows(problem, rows_on_demand(start.problem))
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
     functions = block_functions(problem, problem.coordinates, report, *mesh[:1])
     budget = budget.started()
@@ -275,9 +275,9 @@ def _clean_strike(
 def _bounded_strike(
     work: Work, report: Callable[[str], None] | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """What comes of a start, with rows on gears if it needs them."""
+    """What comes of a start, with the rows on demand that it needs."""
     found, result = work(t, start)
-    return within_gears(found, result, (t, start), work, lambda *_: (), report)
+    return kept_on_demand(found, result, (t, start), work, lambda *_: (), report)
 
 
 def _roughly(budget: Budget) -> Budget:

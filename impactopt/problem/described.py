@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES
+from impactopt.problem.terms import Slide
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
@@ -34,6 +35,8 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
     out |= {"scenarios": [str(s) for s in p.scenarios]} if p.scenarios else {}
     if p.objectives != DEFAULT_OBJECTIVES:
         out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in p.objectives]
-    if off := [term.name for term in (p.self_collision, p.keep_out, p.gear_load) if not term.active]:
+    if off := [
+        term.name for term in (p.self_collision, p.keep_out, p.gear_load, p.term(Slide)) if not term.active
+    ]:
         out["off"] = off
     return out

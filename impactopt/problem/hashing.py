@@ -11,7 +11,7 @@ import numpy as np
 
 from impactopt.codegen.hashing import canonical, model_hash
 from impactopt.contact.laws import CustomLaw
-from impactopt.problem.terms import DEFAULT_TERMS
+from impactopt.problem.terms import DEFAULT_TERMS, ON_DEMAND_TERMS
 from impactopt.robots.robot import Robot
 
 __all__ = ["problem_hash"]
@@ -26,7 +26,7 @@ def problem_hash(problem: Any) -> str:
     from, and whether a default was given or left out make no difference. Numbers count to the last digit.
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
-    own = {type(term): term for term in (*DEFAULT_TERMS, *problem.terms)}
+    own = {type(term): term for term in (*DEFAULT_TERMS, *ON_DEMAND_TERMS, *problem.terms)}
     shape |= {
         "robot": _robot(problem.robot, problem.striker) | _drives(problem),
         "law": _contact(problem.law),

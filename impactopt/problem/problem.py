@@ -46,6 +46,7 @@ from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
+    ON_DEMAND_TERMS,
     GearLoad,
     HandOrientation,
     HitCone,
@@ -293,7 +294,7 @@ class ImpactProblem:
 
     def term(self, kind: type[AnyTerm]) -> AnyTerm:
         """The term of a kind: the problem's own, or the default."""
-        for t in (*self.terms, *DEFAULT_TERMS):
+        for t in (*self.terms, *DEFAULT_TERMS, *ON_DEMAND_TERMS):
             if isinstance(t, kind):
                 return t
         raise InputError(f"unknown kind of term {kind.__name__}")
@@ -341,8 +342,8 @@ class ImpactProblem:
 
     @property
     def gear_load(self) -> GearLoad:
-        """Its term on its gears: the default, where it has none of its own."""
-        return self.extra(GearLoad) or GearLoad()
+        """Its term on its gears."""
+        return self.term(GearLoad)
 
     @property
     def self_collision(self) -> SelfCollision:

@@ -25,7 +25,8 @@ from impactopt.files.output import record_of, record_of_strike, save_record
 from impactopt.files.problem_file.writing import write_problem
 from impactopt.files.replay import load_planned
 from impactopt.files.resume import resumed
-from impactopt.planning.gears import gear_rows, gears_beyond, with_gear_rows
+from impactopt.planning.gears import gears_beyond
+from impactopt.planning.on_demand import rows_on_demand, with_rows
 from impactopt.planning.solution import gear_caution
 from impactopt.report.report import report_of
 from impactopt.simulation import Perturbation
@@ -40,6 +41,10 @@ def _weak(limit: float = LIMIT) -> ImpactProblem:
     peaks = zip(problem.robot.joint_names, limit * problem.robot.torque_limit, strict=True)
     robot = problem.robot.with_actuators({name: Actuator(momentary_torque=peak) for name, peak in peaks})
     return replace(problem, robot=robot)
+
+
+def _on_gears(problem: ImpactProblem) -> bool:
+    return "gear_load" in rows_on_demand(problem)
 
 
 def _with(problem: ImpactProblem, term: GearLoad) -> ImpactProblem:
@@ -60,7 +65,7 @@ def test_a_plan_that_goes_beyond_gets_rows_and_goes_on(bounded: Solution) -> Non
     assert free.loads.gear.max() > 1.03 * LIMIT
     assert bounded.loads.gear.max() == pytest.approx(LIMIT, rel=0.03)
     assert bounded.impulse == pytest.approx(own.impulse, rel=1e-4) and bounded.impulse < free.impulse
-    assert gear_rows(bounded.problem) and bounded.summary()["gear_rows"]
+    assert _on_gears(bounded.problem) and bounded.summary()["rows_on_demand"]
     assert bounded.result.iterations > free.result.iterations, "the effort of both"
 
 
@@ -74,7 +79,7 @@ def test_a_plan_that_does_not_is_the_one_without_a_bound() -> None:
     problem = load_problem("arm_planar")
     free, kept = (solve(p) for p in (_with(problem, OFF), problem))
     np.testing.assert_array_equal(kept.result.x, free.result.x)
-    assert not gear_rows(kept.problem) and not kept.summary()["gear_rows"]
+    assert not _on_gears(kept.problem) and not kept.summary()["rows_on_demand"]
 
 
 def test_no_blow_within_the_limit_is_told() -> None:
@@ -82,7 +87,7 @@ def test_no_blow_within_the_limit_is_told() -> None:
     found = solve(_weak(0.8))
     assert not found.status.usable
     assert any("gear load" in violation.what for violation in found.violations)
-    assert "Without a bound of its gears there is a plan, but gear of wrist: 2.01" in found.result.message
+    assert "Without [terms.gear_load] there is a plan, but gear of wrist: 2.01" in found.result.message
 
 
 def test_a_strike_is_bounded_too() -> None:
@@ -91,13 +96,13 @@ def test_a_strike_is_bounded_too() -> None:
     assert kept.strike.loads().gear.max() == pytest.approx(LIMIT, rel=1e-3)
     assert kept.impulse < free.impulse
     again = optimize_strike(_weak(), start=kept)
-    assert again.impulse == pytest.approx(kept.impulse, rel=1e-4) and gear_rows(again.problem)
+    assert again.impulse == pytest.approx(kept.impulse, rel=1e-4) and _on_gears(again.problem)
 
 
 def test_a_strike_by_shooting_says_that_it_is_not() -> None:
     found = optimize_strike(load_problem("arm_planar"), method="shooting")
     assert found.problem.describe()["off"] == ["gear load"]
-    assert record_of_strike(found).summary["gear_rows"] is False
+    assert record_of_strike(found).summary["rows_on_demand"] == []
 
 
 def test_scenarios_count() -> None:
@@ -108,14 +113,14 @@ def test_scenarios_count() -> None:
     hit = free.plan.scenarios[0].collision
     load = np.abs(hit.torque - problem.robot.armature * hit.acceleration) / problem.robot.torque_limit
     assert load.max() > 1.03 * 2.0 > free.loads.gear.max()
-    assert gear_rows(solve(problem).problem)
+    assert _on_gears(solve(problem).problem)
 
 
 def test_a_neighbour_goes_on_with_the_rows(bounded: Solution) -> None:
     """And one that gets rows of its own from a plan that has none."""
     nearer = replace(bounded.problem, point=bounded.problem.point - [0.01, 0, 0], terms=_weak().terms)
     found = solve(nearer, start=bounded)
-    assert found.status.usable and gear_rows(found.problem)
+    assert found.status.usable and _on_gears(found.problem)
     assert found.result.iterations < bounded.result.iterations
     free = solve(_with(_weak(), OFF))
     kept = solve(_with(_weak(), GearLoad()), start=free)
@@ -126,10 +131,10 @@ def test_a_moved_plan_gets_rows_where_it_needs_them() -> None:
     """A limit just above what the plan asks for, and steel that damps more."""
     problem = _weak(1.02 * 2.01)
     near = solve(problem)
-    assert near.status.usable and not gear_rows(near.problem)
+    assert near.status.usable and not _on_gears(near.problem)
     more = 1.5 * near.problem.law.parameters["damping"]
     moved = near.moved(damping=more)
-    assert moved.status.usable and gear_rows(moved.problem)
+    assert moved.status.usable and _on_gears(moved.problem)
     assert moved.loads.gear.max() == pytest.approx(1.02 * 2.01, rel=0.03)
 
 
@@ -138,7 +143,7 @@ def test_a_saved_plan_is_made_again_with_its_rows(bounded: Solution, tmp_path: P
     assert "[terms.gear_load]" not in text
     save_record(record_of(bounded, problem=text), tmp_path)
     planned = load_planned(tmp_path)
-    assert gear_rows(planned.problem)
+    assert _on_gears(planned.problem)
     again = resumed(planned.record, planned.problem)
     np.testing.assert_array_equal(again.result.x, bounded.result.x)
 
@@ -164,7 +169,7 @@ def test_what_gears_bear_at_most_is_part_of_the_problem() -> None:
     strong, weak = load_problem("arm_planar"), _weak()
     assert strong.hash != weak.hash
     assert _with(strong, OFF).hash == _with(weak, OFF).hash
-    assert with_gear_rows(_with(weak, OFF)).gear_load == OFF
+    assert with_rows(_with(weak, OFF), ["gear_load"]).gear_load == OFF
 
 
 def test_a_replay_that_goes_beyond_is_told(bounded: Solution) -> None:

@@ -9,8 +9,11 @@ import pinocchio as pin
 import pytest
 from support.small_plans import arm_problem, transcribed
 
-from impactopt.planning.sliding import FAR, slide, slide_caution
-from impactopt.problem.terms import Slide
+from impactopt import solve
+from impactopt.planning import on_demand
+from impactopt.planning.sliding import FAR, slide, slide_caution, slides_beyond
+from impactopt.problem import problem as problems
+from impactopt.problem.terms import GearLoad, Slide
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.start import first_iterate
@@ -57,3 +60,18 @@ def test_a_bound_keeps_it_short(plan: Plan) -> None:
 def test_only_a_long_slide_is_told() -> None:
     assert slide_caution(FAR) == ""
     assert "slides 201 mm" in slide_caution(0.201)
+
+
+def test_a_plan_that_slides_too_far_gets_rows(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> None:
+    """To the plan that rows from the start lead to; and none where it is switched off."""
+    most = 0.3 * slide(plan.problem, plan)
+    monkeypatch.setattr(on_demand, "_KINDS", {"slide": Slide})
+    monkeypatch.setattr(problems, "ON_DEMAND_TERMS", (GearLoad(), Slide(most=most)))
+    kept = solve(plan.problem)
+    assert kept.status.usable
+    assert kept.summary()["rows_on_demand"] == ["slide"]
+    assert slides_beyond(Slide(most=most), kept.plan) == ""
+    free = solve(replace(plan.problem, terms=(*plan.problem.terms, Slide(most=most, enabled=False))))
+    assert free.summary()["rows_on_demand"] == []
+    assert "which may be" in slides_beyond(Slide(most=most), free.plan)
+    assert free.problem.describe()["off"] == ["slide"]

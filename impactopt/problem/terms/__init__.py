@@ -1,9 +1,9 @@
 """What a plan must respect, as named terms with units, one a file; a problem holds one of each kind at most.
 
 `base` says what a term has. DEFAULT_TERMS hold in every problem, and their rows are in the transcription; the
-others of TERMS bring their own, and hold only where they are given. `GearLoad` holds in every problem too,
-but a program has its rows only if it is given, or once a plan has gone beyond it. A new one is a file here,
-and its lines below.
+others of TERMS bring their own. ON_DEMAND_TERMS hold in every problem too, but a program has their rows only
+if they are given, or once a plan without them has broken them (`impactopt.planning.on_demand`). The rest hold
+where they are given. A new one is a file here, and its lines below.
 """
 
 from impactopt.problem.terms.balance import Balance
@@ -40,6 +40,7 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     SelfCollision(),
     KeepOut(),
 )
+ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide())
 # all that problem files know, in their order
 TERMS: tuple[type[Term], ...] = (
     *map(type, DEFAULT_TERMS),
@@ -59,6 +60,7 @@ TERMS: tuple[type[Term], ...] = (
 
 __all__ = [
     "DEFAULT_TERMS",
+    "ON_DEMAND_TERMS",
     "TERMS",
     "Balance",
     "ContactWrenchCone",

@@ -19,11 +19,15 @@ class Slide(Term):
 
     Bounded along each of two tangents, with the expected target. A contact has no friction, so a long push at
     an angle may slide off what it pushes: in replays a target's face ends 0.2 m from the hit point.
+
+    It holds with its defaults where a problem does not have it. Rows are then added once a motion without
+    them goes beyond; where it is given they are there from the start, and in strikes.
     """
 
     name: ClassVar[str] = "slide"
     unit: ClassVar[str] = "m"
     most: float = field(default=0.1, metadata=about("largest way along each tangent", unit="m", above=0))
+    enabled: bool = field(default=True, metadata=about("false: it goes as far as it goes"))
 
     def add_rows(self, program: Any) -> None:
         problem = program.problem

@@ -1,0 +1,142 @@
+"""Terms that hold by default and get rows once a plan without them breaks them: what gears bear, how far a
+blow slides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.fields import snake_case
+from impactopt.errors import InputError
+from impactopt.planning.gears import gears_beyond
+from impactopt.planning.multistart import carried, one_after_the_other
+from impactopt.planning.sliding import slides_beyond
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
+from impactopt.robots.loads import DriveLoads
+from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.plan import Plan, PlannedCollision
+from impactopt.transcription.planned_loads import plan_loads, strike_loads
+from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.start import carried_over
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription, block_functions
+
+__all__ = ["kept_on_demand", "rows_on_demand", "with_rows"]
+
+Array = NDArray[np.float64]
+Program = TypeVar("Program", Transcription, StrikeTranscription)
+_KNOWN = ("start_posture", "coordinates", "contact_posture", "world", "bodies")  # to both problems, once made
+_KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
+
+
+def rows_on_demand(problem: ImpactProblem) -> tuple[str, ...]:
+    """Names, as in files, of the terms on demand whose rows a problem's programs have from the start."""
+    own = {type(term) for term in problem.active_terms}
+    return tuple(name for name, kind in _KINDS.items() if kind in own)
+
+
+def with_rows(problem: ImpactProblem, names: Iterable[str]) -> ImpactProblem:
+    """The same with the rows of these terms on demand from the start; itself if it has them, or has switched
+    them off.
+    """
+    kinds = [_KINDS[name] for name in names if name in _KINDS and problem.extra(_KINDS[name]) is None]
+    if not kinds:
+        return problem
+    bounded = replace(problem, terms=(*problem.terms, *(problem.term(kind) for kind in kinds)))
+    bounded.__dict__.update({name: problem.__dict__[name] for name in _KNOWN if name in problem.__dict__})
+    return bounded
+
+
+def kept_on_demand(
+    t: Program,
+    result: SolverResult,
+    first: tuple[Program, Array | SolverResult],
+    solve: Callable[[Program, Array | SolverResult], tuple[Program, SolverResult]],
+    finer: Callable[[Program, Array], tuple[PlannedCollision, ...]],
+    report: Callable[[str], None] | None = None,
+) -> tuple[Program, SolverResult]:
+    """A program's result if it keeps to the terms on demand; else that of the program with the rows that it
+    lacks: from there, and where that leads nowhere from the start. It has the effort of all.
+
+    first : the program that it came from, and its start.  solve : a program from a start; it keeps bodies
+    apart, from the rows between them that the program has.  finer : the collisions, if known at more
+    instants than the program's.
+    """
+    for _ in _KINDS:  # rows of one may break another
+        broken = _broken(t, result, finer) if result.status.usable else {}
+        if not broken:
+            break
+        said = "; ".join(broken.values())
+        if report is not None:
+            report(f"{said}: on with rows of {', '.join(_words(name) for name in broken)}")
+        bounded = with_rows(t.problem, broken)
+        warm = _program(t, bounded, report)
+        found, new = solve(warm, carried(warm, t, result))
+        if not new.status.usable and new.status is not Status.INTERRUPTED:
+            origin, start = first
+            x0 = start.x if isinstance(start, SolverResult) else start
+            cold = _program(origin.with_apart({}), bounded, report)
+            none = np.zeros(origin.program.m), np.zeros(origin.layout.n)
+            again = solve(cold, carried_over(cold, origin, x0, *none)[0])
+            found, new = again[0], one_after_the_other(new, again[1])
+        if not new.status.usable and new.status is not Status.INTERRUPTED:
+            without = ", ".join(f"[terms.{name}]" for name in broken)
+            new = replace(new, message=f"{new.message} Without {without} there is a plan, but {said}.")
+        t, result = found, one_after_the_other(result, new)
+    return t, result
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _broken(
+    t: Program, result: SolverResult, finer: Callable[[Program, Array], tuple[PlannedCollision, ...]]
+) -> dict[str, str]:
+    """What is broken of terms on demand that have no rows, by name, in words."""
+    problem, has, out = t.problem, rows_on_demand(t.problem), dict[str, str]()
+    planned: Plan | PlannedStrike = t.decode(result.x)
+    for name, kind in _KINDS.items():
+        term = problem.term(kind)
+        if name in has or not term.active:
+            continue
+        words = ""
+        if isinstance(term, GearLoad):
+            words = gears_beyond(problem, _loads(t, planned, finer(t, result.x)))
+        elif isinstance(term, Slide) and isinstance(planned, Plan):
+            words = slides_beyond(term, planned)
+        if words:
+            out[name] = words
+    return out
+
+
+def _loads(
+    t: Program, planned: Plan | PlannedStrike, finer: tuple[PlannedCollision, ...]
+) -> list[DriveLoads]:
+    """Of all motions and all collisions."""
+    hits = finer or [planned.collision, *(scenario.collision for scenario in planned.scenarios)]
+    if isinstance(planned, PlannedStrike):
+        still = np.zeros(t.robot.nv)
+        return [strike_loads(t.robot, still, still, hit) for hit in hits]
+    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+        return plan_loads(t.robot, planned, hits)
+    return []
+
+
+def _program(t: Program, problem: ImpactProblem, report: Callable[[str], None] | None) -> Program:
+    """The program of another problem on the same mesh, with the same rows between bodies."""
+    elements = t.hit.elements if t.hit.guarded else ()
+    functions = block_functions(problem, t.coordinates, report, elements)
+    new: Program
+    if isinstance(t, StrikeTranscription):
+        new = type(t)(problem, t.coordinates, functions, elements, t.hit.shares)
+    else:
+        new = Transcription(problem, t.coordinates, functions, t.nodes, elements, t.hit.shares)
+    return new.with_apart(t.apart_rows) if t.apart_rows else new

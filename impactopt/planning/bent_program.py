@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import fields
 from functools import cached_property
@@ -10,6 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from impactopt.errors import InputError
+from impactopt.planning.changes import changed
 from impactopt.planning.keeping_apart import same_bodies
 from impactopt.planning.made_again import program_on
 from impactopt.planning.solution import Solution
@@ -19,6 +21,7 @@ from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Bent", "bent_of"]
 
+_MORE, _ASIDE = 1.01, 1e-3  # of law and target; [m]
 _PROXIMAL = 1e-2  # [N s] beside the objective's curvature, per square of a variable of order one
 
 
@@ -27,9 +30,8 @@ class Bent:
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
-        self._spare: Transcription | None = None
-        self.program = self.program_for(solution.problem)
-        self._spare = self.program_for(solution.problem)
+        self.program = self._built(solution.problem)
+        self._moving = self._follows()
 
     def program_for(
         self, problem: ImpactProblem, report: Callable[[str], None] | None = None
@@ -42,13 +44,23 @@ class Bent:
         ------
         InputError : they are others.
         """
+        if self._moving is not None and _alike(problem, self.solution.problem):
+            self._moving.move_to(problem)
+            return self._moving
+        return self._built(problem, report)
+
+    def _follows(self) -> Transcription | None:
+        """A program that follows the problem; None if parts of it do not, such as a term of someone's own."""
+        problem = self.solution.problem
+        try:
+            t = self._built(_beside(problem))
+        except InputError:
+            return None
+        t.move_to(problem)
+        return t if t.program.same_numbers(self.program.program) else None
+
+    def _built(self, problem: ImpactProblem, report: Callable[[str], None] | None = None) -> Transcription:
         s = self.solution
-        if self._spare is not None and _alike(problem, s.problem):
-            functions = self._spare.functions
-            t = Transcription(problem, problem.coordinates, functions, s.nodes, s.elements, s.shares)
-            t.take_program(self._spare)
-            self._spare = t
-            return t
         t = program_on(problem, s.nodes, s.elements, s.shares, report)
         if s.apart:
             if not same_bodies(problem, s.problem):
@@ -85,7 +97,19 @@ def _alike(problem: ImpactProblem, other: ImpactProblem) -> bool:
         for one, two in pairs
     )
     kinds = type(problem.law) is type(other.law) and type(problem.target) is type(other.target)
+    kinds = kinds and problem.target.speed_before() == other.target.speed_before()
     return same and kinds and (not problem.keeps_apart or same_bodies(problem, other))
+
+
+def _beside(problem: ImpactProblem) -> ImpactProblem:
+    """A problem with a point, law and target that are a little others."""
+    law, target = (
+        type(part)(**{name: _MORE * value for name, value in part.parameters.items()})
+        for part in (problem.law, problem.target)
+    )
+    with contextlib.suppress(InputError):  # an arm in a plane reaches no point beside it
+        return changed(problem, law=law, target=target, point=problem.point + _ASIDE)
+    return changed(problem, law=law, target=target, point=problem.point + _ASIDE * problem.normal)
 
 
 _known: WeakKeyDictionary[Solution, Bent] = WeakKeyDictionary()

@@ -20,10 +20,11 @@ _KEPT = ("coordinates", "start_posture")  # of a problem on the same robot, stan
 
 def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
     """`dataclasses.replace`, without computing anew what stays: robot, stance and start are the same."""
-    new = dataclasses.replace(problem, **fields)
-    for name in _KEPT:
-        if name in problem.__dict__:
-            new.__dict__[name] = problem.__dict__[name]
+    new = object.__new__(type(problem))
+    new.__dict__.update({f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)} | fields)
+    # before the checks, which need them too
+    new.__dict__.update({name: problem.__dict__[name] for name in _KEPT if name in problem.__dict__})
+    new.__post_init__()
     return new
 
 

@@ -60,9 +60,8 @@ class Collision(Collocated):
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in phases]
         self._named = named = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
-        self.law, self.target = p.law.parameters, p.target.parameters
-        if scenario is not None:
-            self.law, self.target = scenario.numbers(p.law, p.target)
+        self.mass = mass
+        self.renew()
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
         n, self._switches = len(stages), switches(p.law)
@@ -70,10 +69,7 @@ class Collision(Collocated):
         def add(name: str, size: int, **options: Any) -> Group:
             return b.layout.add(named + name, n, size, **options)
 
-        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(law, target, mass)[-1])
-        self.shortest, longest = shortest_phases(p, self.natural), p.contact_duration[1]
+        longest = p.contact_duration[1]
         self.T = [
             b.duration(f"{named}{name} duration", (least, longest), 0.01)
             for name, least in zip(p.target.phases, self.shortest, strict=True)
@@ -102,6 +98,26 @@ class Collision(Collocated):
         wanted = int(after is not None)
         self.after = b.layout.add(f"{named}position after contact", wanted, b.ny, **(after or {}))
 
+    def renew(self, mass: float | None = None) -> None:
+        """Take the numbers of the builder's problem.  mass : of the robot at its striker [kg], if it is
+        another.
+        """
+        p = self._b.problem
+        self.mass = self.mass if mass is None else mass
+        self.law, self.target = p.law.parameters, p.target.parameters
+        if self.scenario is not None:
+            self.law, self.target = self.scenario.numbers(p.law, p.target)
+        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
+        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
+        self.natural = float(natural_durations(law, target, self.mass)[-1])
+        self.shortest = shortest_phases(p, self.natural)
+
+    def follow(self) -> None:
+        """Bounds of durations follow the problem."""
+        longest = self._b.problem.contact_duration[1]
+        for T, least in zip(self.T, self.shortest, strict=True):
+            self._b.layout.bound(T, least, longest)
+
     def _add_reference(self, count: int) -> None:
         """Variables of the legs of the reference: angles and rates, at so many instants."""
         nl, add, labels = self._b.nl, self._b.layout.add, {"labels": self._b.coordinates.leg_labels}
@@ -122,29 +138,35 @@ class Collision(Collocated):
         """Slots and parameters of each block's instances, one a stage."""
         b, p = self._b, self._b.problem
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
-        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
-        within = phases if p.target.guards else phases[:, :0]
-        collision, force, force_p = [], [], []
+        collision, force = [], []
         for i, s in enumerate(self.stages):
             state = self._slots(self.state, i, still)
             travelled = self._slots(self.xt, i, none, anew=True)
             given, x1 = self._slots(self.p, i, none)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
             force.append([*self._of_hand(i), self.f[i], *state, *travelled, x1, given])
-            branch = [float(self._restitution(i)), *within[s.phase]]
-            numbers = [*self.law.values(), *self.target.values()]
-            force_p.append([*p.point, *p.normal, *branch, *numbers])
         gains = np.concatenate([*self._gains(), b.robot.torque_limit, b.limits.units])
         collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], gains]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
-            "force": (force, force_p),
+            "force": (force, self.force_numbers()),
             **self._reference(),
         }
         if p.target.guards:
             join = self._join()
             out["join"] = join, [np.zeros(0)] * len(join)
         return out
+
+    def force_numbers(self) -> list[list[float]]:
+        """Parameters of the block ``force``, of each stage."""
+        p = self._b.problem
+        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
+        within = phases if p.target.guards else phases[:, :0]
+        numbers = [*self.law.values(), *self.target.values()]
+        return [
+            [*p.point, *p.normal, float(self._restitution(i)), *within[s.phase], *numbers]
+            for i, s in enumerate(self.stages)
+        ]
 
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``."""

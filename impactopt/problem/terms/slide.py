@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,6 +31,8 @@ class Slide(Term):
         _, _, rows = np.linalg.svd(problem.normal.reshape(1, 3))
         for k, tangent in enumerate(rows[1:], start=1):
             place = float(tangent @ problem.point)
+            row = len(program.rows.lower)
+            program.builder.follow(partial(self._follow, row=row, tangent=tangent))
             program.rows.add(
                 term=self.name,
                 place="after contact",
@@ -39,3 +42,7 @@ class Slide(Term):
                 upper=place + self.most,
                 measure=Measure("mm", 1e3, "too far"),
             )
+
+    def _follow(self, b: Any, row: int, tangent: Any) -> None:
+        place = float(tangent @ b.problem.point)
+        b.rows.bound(row, place - self.most, place + self.most)

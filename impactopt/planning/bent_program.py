@@ -17,6 +17,7 @@ from impactopt.planning.made_again import program_on
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.active import ActiveSystem, Offset
+from impactopt.solvers.predictor import Predictor
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Bent", "bent_of"]
@@ -69,6 +70,11 @@ class Bent:
         if (t.program.n, t.program.m) != (len(s.result.x), len(s.result.multipliers)):
             raise InputError("the program has other rows then: use solve(problem, start=solution)")
         return t
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        r = self.solution.result
+        return Predictor(self.program.program, r.x, r.multipliers, r.bound_multipliers)
 
     @cached_property
     def system(self) -> ActiveSystem:

@@ -28,7 +28,7 @@ from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 from impactopt.transcription.planned_loads import motion_loads
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.rattle import Rattle
+from impactopt.transcription.rattle import HeldBlow, Rattle
 
 Array = NDArray[np.float64]
 
@@ -64,8 +64,7 @@ class Solved:
     elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
         they are finer than the problem asks for; and the share of each phase in the contact's time, where
         something is frozen during contact. Else ().
-    rattle : error of a plan in which a nail and a striker that rattle stay together; None if they do not
-        rattle.
+    held_blow : the blow of a plan in which a nail and a striker stay together; None if they need not.
     """
 
     problem: ImpactProblem
@@ -76,7 +75,7 @@ class Solved:
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
-    rattle: Rattle | None = None
+    held_blow: HeldBlow | None = None
     model_error: ModelError | None = None
     apart: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
@@ -89,6 +88,13 @@ class Solved:
             f"<{type(self).__name__} of {self.problem.name or self.problem.robot.name!r}: "
             f"{self.status.value}, {impulse:.2f} N s, {self.result.iterations} iterations>"
         )
+
+    @property
+    def rattle(self) -> Rattle | None:
+        """Error of a plan in which a nail and a striker that rattle stay together; None if they do not
+        rattle.
+        """
+        return None if self.held_blow is None else self.held_blow.rattle
 
     @property
     def status(self) -> Status:

@@ -48,7 +48,7 @@ def moved_solution(
     bent = bent_of(solution)
     _ = bent.predictor  # what all that is moved shares
     began = time.perf_counter()
-    t = bent.program_for(problem)
+    t = bent.program_for(problem, anew=polish)
     built = time.perf_counter()
     budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=callback).started()
     first = _first_order(solution, t, bent)

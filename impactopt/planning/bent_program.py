@@ -35,18 +35,23 @@ class Bent:
         self._moving = self._follows()
 
     def program_for(
-        self, problem: ImpactProblem, report: Callable[[str], None] | None = None
+        self,
+        problem: ImpactProblem,
+        report: Callable[[str], None] | None = None,
+        *,
+        anew: bool = True,
     ) -> Transcription:
         """The solution's program with the numbers of another problem: the same variables and rows.
 
         Where point, contact law and target alone are others it is good until the next one is asked for.
+        anew : as of `ContactProgram.move_to`.
 
         Raises
         ------
         InputError : they are others.
         """
         if self._moving is not None and _alike(problem, self.solution.problem):
-            self._moving.move_to(problem)
+            self._moving.move_to(problem, anew=anew)
             return self._moving
         return self._built(problem, report)
 

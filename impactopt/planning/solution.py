@@ -91,9 +91,7 @@ class Solved:
 
     @property
     def rattle(self) -> Rattle | None:
-        """Error of a plan in which a nail and a striker that rattle stay together; None if they do not
-        rattle.
-        """
+        """Error of a plan in which a nail and a striker that rattle stay together; None if they do not."""
         return None if self.held_blow is None else self.held_blow.rattle
 
     @property
@@ -200,7 +198,7 @@ class Solution(Solved):
         """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
         ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
 
-        First come Newton steps with the KKT system of this plan and its active set, factored once; then the
+        First come quadratic programs about this plan, which find rows that begin and cease to hold; then the
         solver goes on from there, with this plan's mesh. ``polish=False``: the first alone. They are quick
         and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
         ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and

@@ -1,7 +1,7 @@
 """What becomes of a program's solution when the program's numbers change: a few quadratic programs.
 
-Each has the changed program's rows made linear, and the Hessian of the known solution. Its active set is found
-by Newton's method on its augmented Lagrangian, with exact line searches: rows that begin to hold and rows
+Each has the changed program's rows made linear, and the known solution's Hessian. Its active set is found by
+Newton's method on its augmented Lagrangian, with exact line searches: rows that begin to hold and rows
 that let go are no matter, where a step with the solution's own active set is off.
 
 Source: Hermans, Themelis, Patrinos, "QPALM: a Newton-type proximal augmented Lagrangian method for quadratic
@@ -11,11 +11,12 @@ programs", CDC 2019.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from impactopt.solvers.program import Matrix, NonlinearProgram, Vector, max_violation
 from impactopt.solvers.sqp.newton import acquire
@@ -29,6 +30,12 @@ _PROXIMAL = 1e-2  # curvature more of every variable, so that what hardly matter
 _STEPS, _SETS = 5, 20  # QPs, and active sets of each
 _SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it gets nowhere
 _ENOUGH = 1e-4  # of rows: no more QPs
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    """Its making takes as long as a QP."""
+    return ThreadpoolController()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +100,7 @@ class Predictor:
         found: Prediction | None = None
         x, y, z, sides = self.x, self.y, self.z, self._sides
         g = program.constraints(x)
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _threads().limit(limits=1, user_api="blas"):
             for k in range(_STEPS):
                 if not np.isfinite(g).all():
                     break

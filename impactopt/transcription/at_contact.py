@@ -228,8 +228,10 @@ class ContactProgram(ABC):
         add_apart_rows(other.builder, [*self.swing_spots(), *self.follow_spots()], other.apart_rows)
         return other
 
-    def move_to(self, problem: ImpactProblem) -> None:
+    def move_to(self, problem: ImpactProblem, *, anew: bool = True) -> None:
         """Take the numbers of a problem with another point, law or target, and leave the rest as it is built.
+
+        anew : the least durations of a contact's phases too, which else are kept where numbers are alike.
 
         What follows the problem then is what parts have told `Builder.follow`; whether that is all,
         `StructuredProgram.same_numbers` finds.
@@ -238,7 +240,7 @@ class ContactProgram(ABC):
         builders = [self._bare] if self._bare is self.builder else [self._bare, self.builder]
         for b in builders:
             b.problem = problem
-        self.hit.renew()
+        self.hit.renew(anew=anew)
         for b in builders:
             for take in b.followers:
                 take(b)

@@ -19,18 +19,19 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collocated import Collocated
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
+from impactopt.transcription.contact_numbers import ContactNumbers
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import blow, coasted, effective_mass, natural_durations
+from impactopt.transcription.guess import blow, coasted, effective_mass
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.nodes import add_cone_rows
-from impactopt.transcription.phases import pulls_apart, shortest_phases, switches
+from impactopt.transcription.phases import pulls_apart, switches
 from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
 from impactopt.transcription.rows import Measure, Place, along, by_leg, percent, rates
 
 
-class Collision(Collocated):
+class Collision(ContactNumbers, Collocated):
     """Variables and rows of the contact with one target.
 
     contact : what all start from.  stages : collocation points of its phases.
@@ -98,26 +99,6 @@ class Collision(Collocated):
         wanted = int(after is not None)
         self.after = b.layout.add(f"{named}position after contact", wanted, b.ny, **(after or {}))
 
-    def renew(self, mass: float | None = None) -> None:
-        """Take the numbers of the builder's problem.  mass : of the robot at its striker [kg], if it is
-        another.
-        """
-        p = self._b.problem
-        self.mass = self.mass if mass is None else mass
-        self.law, self.target = p.law.parameters, p.target.parameters
-        if self.scenario is not None:
-            self.law, self.target = self.scenario.numbers(p.law, p.target)
-        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(law, target, self.mass)[-1])
-        self.shortest = shortest_phases(p, self.natural)
-
-    def follow(self) -> None:
-        """Bounds of durations follow the problem."""
-        longest = self._b.problem.contact_duration[1]
-        for T, least in zip(self.T, self.shortest, strict=True):
-            self._b.layout.bound(T, least, longest)
-
     def _add_reference(self, count: int) -> None:
         """Variables of the legs of the reference: angles and rates, at so many instants."""
         nl, add, labels = self._b.nl, self._b.layout.add, {"labels": self._b.coordinates.leg_labels}
@@ -156,17 +137,6 @@ class Collision(Collocated):
             join = self._join()
             out["join"] = join, [np.zeros(0)] * len(join)
         return out
-
-    def force_numbers(self) -> list[list[float]]:
-        """Parameters of the block ``force``, of each stage."""
-        p = self._b.problem
-        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
-        within = phases if p.target.guards else phases[:, :0]
-        numbers = [*self.law.values(), *self.target.values()]
-        return [
-            [*p.point, *p.normal, float(self._restitution(i)), *within[s.phase], *numbers]
-            for i, s in enumerate(self.stages)
-        ]
 
     def _dynamics(self, i: int) -> list[Affine]:
         """Slots of the block ``collision``."""

@@ -100,12 +100,12 @@ class Hit(Contacts):
             for k, each in enumerate(self.first):
                 each.add_rows(at + k * b.blocks[-1].n_out)
 
-    def renew(self) -> None:
-        """Take the numbers of the builder's problem."""
+    def renew(self, *, anew: bool) -> None:
+        """As of :meth:`impactopt.transcription.collision.Collision.renew`."""
         self.__dict__.pop("mass", None)
         lasting = [c for c in self.collisions if isinstance(c, Collision)]
         for collision in lasting:
-            collision.renew(self.mass)
+            collision.renew(self.mass, anew=anew)
         for first, collision in zip(self.first, lasting, strict=False):
             first.law = collision.law
 

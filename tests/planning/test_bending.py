@@ -97,8 +97,8 @@ def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> N
         target=dataclasses.replace(arm.problem.target, mass=0.07, depth=0.004),
         law=dataclasses.replace(arm.problem.law, stiffness=3e5),
     )
-    quick = bent.program_for(problem).program
-    assert bent._moving is not None and quick is bent._moving.program
+    quick, moving = bent.program_for(problem).program, bent._moving
+    assert moving is not None and quick is moving.program
     whole = bent._built(problem).program
     x, y = arm.result.x, arm.result.multipliers
     for name in ("x_lower", "x_upper", "g_lower", "g_upper"):

@@ -118,6 +118,10 @@ def solve(
     ] = Start.reach,
     starts: Starts = 1,
     seed: Seed = 0,
+    store: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Start from the nearest plan kept there, and keep this one too."),
+    ] = None,
     time_limit: TimeLimit = None,
     settings: Settings = None,
     as_json: AsJson = False,
@@ -136,6 +140,7 @@ def solve(
     with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
+        from impactopt.files.solved import SolvedFolder
         from impactopt.planning.planner import solve as plan
         from impactopt.report.console import SolveConsole
 
@@ -148,15 +153,15 @@ def solve(
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
             progress.say("building the program (compiles for a minute or two the first time)")
-            solution = plan(
-                problem,
-                start=start.value,
-                starts=starts,
-                seed=seed,
-                report=progress.say,
-                callback=progress.iteration,
-                **chosen,
-            )
+            chosen |= {"start": start.value, "starts": starts, "seed": seed}
+            chosen |= {"report": progress.say, "callback": progress.iteration}
+            if store is None:
+                solution = plan(problem, **chosen)
+            else:
+                kept = SolvedFolder(store)
+                solution, near = kept.solve(problem, read, **chosen)
+                kept.keep(solution, read)
+                progress.say(f"started from {near}" if near else f"no plan in {store} is near enough")
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
             if solution.rattle is not None:
                 progress.say(str(solution.rattle))

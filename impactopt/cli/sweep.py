@@ -103,6 +103,8 @@ def _show(result: SweepResult) -> None:
     }
     if result.best is not None:
         rows["largest impulse"] = f"{result.best:.2f} N s, in case {result.best_case}"
+    if result.iterations:
+        rows["iterations"] = ", ".join(f"{n:.0f} from a {start}" for start, n in result.iterations.items())
     for name, value in rows.items():
         table.add_row(name, value)
     console = Console()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.planning.bent_program import bent_of
+from impactopt.planning.bent_program import Bent, bent_of
 from impactopt.planning.changes import moved_problem
 from impactopt.planning.keeping_apart import Margins
 from impactopt.planning.made_again import planned_by
@@ -18,7 +18,8 @@ from impactopt.planning.multistart import Attempt, Budget, attempt_of, one_after
 from impactopt.planning.on_demand import kept_on_demand
 from impactopt.planning.rounds import Refining
 from impactopt.planning.solution import Solution
-from impactopt.solvers.active import ActiveSystem, Change, Offset
+from impactopt.solvers.active import Change
+from impactopt.solvers.predictor import Prediction
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.transcription import Transcription
@@ -28,7 +29,8 @@ __all__ = ["moved_solution"]
 Array = NDArray[np.float64]
 _FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
-_BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near as that
+# where the solver goes on from a first-order plan, and how far it moves it inside its bounds: it is as near
+_BARRIER, _PUSH = 1e-7, 1e-6
 
 
 def moved_solution(
@@ -47,12 +49,12 @@ def moved_solution(
     """
     problem = moved_problem(solution.problem, **changes)
     bent = bent_of(solution)
-    system, own = bent.steady
+    _ = bent.predictor  # what all that is moved shares
     began = time.perf_counter()
-    t = bent.program_for(problem)
+    t = bent.program_for(problem, anew=polish)
     built = time.perf_counter()
     budget = Budget(solver="sqp", options=options, time_limit=time_limit, callback=callback).started()
-    first = _first_order(solution, t, system, own)
+    first = _first_order(solution, t, bent)
     if not polish:
         return _solution(solution, t, first, (built - began, time.perf_counter() - built))
     margins = Margins(problem) if problem.keeps_apart else None
@@ -60,7 +62,8 @@ def moved_solution(
     old = solution.result
     # a first-order plan that is far off its rows is a worse start than the plan itself
     if near := first.status.usable:
-        result = budget.run(t.program, first, _BARRIER)
+        near_by = replace(budget, options={"push": _PUSH, **(options or {})})
+        result = near_by.run(t.program, first, _BARRIER)
     else:
         result = budget.run(t.program, old)
     stopped = result.status is Status.INTERRUPTED
@@ -77,13 +80,24 @@ def moved_solution(
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))
 
 
-def _first_order(solution: Solution, t: Transcription, system: ActiveSystem, own: Offset) -> SolverResult:
+def _first_order(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
+    """By QPs; where those are not solved, by steps with the active set of the solution."""
+    began = time.perf_counter()
+    found = bent.predictor.predict(t.program)
+    if found is None:
+        return _by_active_set(solution, t, bent)
+    words = f"By {found.steps} QPs of first order: rows are off by {found.violation:.1g} at most."
+    return _result(solution, t, found, words, began)
+
+
+def _by_active_set(solution: Solution, t: Transcription, bent: Bent) -> SolverResult:
     """Newton steps on the changed program's KKT conditions with the solution's own matrix and active set,
     clipped to bounds: the first is the plan of first order, more of them while rows are off and they help.
 
     What the solver had left at the solution is not made up for.
     """
     program, began = t.program, time.perf_counter()
+    system, own = bent.steady
     at, best, worst = Change(x=system.x, y=system.y, z=system.z), None, np.inf
     for taken in range(1 + _CORRECTIONS):
         off = system.offset(program, at)
@@ -102,19 +116,26 @@ def _first_order(solution: Solution, t: Transcription, system: ActiveSystem, own
     turned = int(gone_y.sum() + gone_z.sum())
     words = f"By {steps} steps of first order: rows are off by {worst:.1g} at most"
     words += f"; {turned} of those that held should not any more." if turned else "."
+    y, z = np.where(gone_y, 0.0, best.y), np.where(gone_z, 0.0, best.z)
+    return _result(solution, t, Prediction(x=best.x, y=y, z=z, violation=worst, steps=steps), words, began)
+
+
+def _result(
+    solution: Solution, t: Transcription, found: Prediction, words: str, began: float
+) -> SolverResult:
     seconds = time.perf_counter() - began
     return replace(
         solution.result,
-        x=best.x,
-        multipliers=np.where(gone_y, 0.0, best.y),
-        bound_multipliers=np.where(gone_z, 0.0, best.z),
-        objective=program.objective(best.x),
-        status=Status.ACCEPTABLE if worst <= _FIRST_ORDER else Status.ITERATION_LIMIT,
-        iterations=steps,
+        x=found.x,
+        multipliers=found.y,
+        bound_multipliers=found.z,
+        objective=t.program.objective(found.x),
+        status=Status.ACCEPTABLE if found.violation <= _FIRST_ORDER else Status.ITERATION_LIMIT,
+        iterations=found.steps,
         seconds=seconds,
         seconds_functions=0.0,
         seconds_qp=seconds,
-        max_violation=worst,
+        max_violation=found.violation,
         kkt=float("nan"),
         message=words,
         history=(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from typing import Any
 
@@ -9,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impactopt.contact.fields import snake_case
-from impactopt.errors import InputError, check_number, did_you_mean
+from impactopt.errors import InputError, check_array, check_number, did_you_mean
+from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
 
@@ -19,11 +21,24 @@ _KEPT = ("coordinates", "start_posture")  # of a problem on the same robot, stan
 
 
 def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
-    """`dataclasses.replace`, without computing anew what stays: robot, stance and start are the same."""
-    new = dataclasses.replace(problem, **fields)
-    for name in _KEPT:
-        if name in problem.__dict__:
-            new.__dict__[name] = problem.__dict__[name]
+    """`dataclasses.replace`, without computing anew what stays: robot, stance and start are the same, and the
+    posture at contact is looked for from the one known.
+    """
+    new = object.__new__(type(problem))
+    new.__dict__.update({f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)} | fields)
+    # before the checks, which need them too
+    new.__dict__.update({name: problem.__dict__[name] for name in _KEPT if name in problem.__dict__})
+    if "contact_posture" in problem.__dict__:
+        near, point = problem.contact_posture, fields.get("point", problem.point)
+        with contextlib.suppress(InputError):  # the checks look for one from the start
+            new.__dict__["contact_posture"] = (
+                near
+                if np.array_equal(point, problem.point)
+                else inverse_kinematics(
+                    problem.coordinates, problem.striker, check_array("point [m]", point, (3,)), near
+                )
+            )
+    new.__post_init__()
     return new
 
 

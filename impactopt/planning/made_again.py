@@ -11,7 +11,7 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import MoreNodes
-from impactopt.transcription.rattle import rattle
+from impactopt.transcription.rattle import held_blow
 from impactopt.transcription.transcription import Transcription, block_functions
 
 __all__ = ["planned_by", "program_of", "program_on"]
@@ -45,5 +45,5 @@ def planned_by(t: Transcription, result: SolverResult) -> dict[str, Any]:
         "shares": t.hit.shares,
         "apart": t.apart_rows,
         "model_error": model_error(t, result.x) if usable else None,
-        "rattle": rattle(t, result.x) if usable else None,
+        "held_blow": held_blow(t, result.x) if usable else None,
     }

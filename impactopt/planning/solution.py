@@ -29,7 +29,7 @@ from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 from impactopt.transcription.planned_loads import motion_loads
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.rattle import Rattle
+from impactopt.transcription.rattle import HeldBlow, Rattle
 
 Array = NDArray[np.float64]
 _REPLAYED = 0.1  # beyond what gears may bear: replays of a plan that keeps to it stay within this
@@ -66,8 +66,7 @@ class Solved:
     elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
         they are finer than the problem asks for; and the share of each phase in the contact's time, where
         something is frozen during contact. Else ().
-    rattle : error of a plan in which a nail and a striker that rattle stay together; None if they do not
-        rattle.
+    held_blow : the blow of a plan in which a nail and a striker stay together; None if they need not.
     """
 
     problem: ImpactProblem
@@ -78,7 +77,7 @@ class Solved:
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
-    rattle: Rattle | None = None
+    held_blow: HeldBlow | None = None
     model_error: ModelError | None = None
     apart: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
@@ -91,6 +90,11 @@ class Solved:
             f"<{type(self).__name__} of {self.problem.name or self.problem.robot.name!r}: "
             f"{self.status.value}, {impulse:.2f} N s, {self.result.iterations} iterations>"
         )
+
+    @property
+    def rattle(self) -> Rattle | None:
+        """Error of a plan in which a nail and a striker that rattle stay together; None if they do not."""
+        return None if self.held_blow is None else self.held_blow.rattle
 
     @property
     def status(self) -> Status:
@@ -197,7 +201,7 @@ class Solution(Solved):
         """The plan bent for another ``point`` [m], ``normal``, ``mass`` of the target [kg], ``stiffness`` or
         ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
 
-        First come Newton steps with the KKT system of this plan and its active set, factored once; then the
+        First come quadratic programs about this plan, which find rows that begin and cease to hold; then the
         solver goes on from there, with this plan's mesh. ``polish=False``: the first alone. They are quick
         and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
         ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and

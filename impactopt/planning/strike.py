@@ -36,7 +36,7 @@ from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.rattle import rattle
+from impactopt.transcription.rattle import held_blow
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
@@ -168,14 +168,14 @@ def optimize_strike(
         work = partial(_bounded_strike, work, report)
     t, fields = solve_from(t, _starts(t, given, starts, seed), budget, began, work)
     result = fields["result"] = with_reason(t, fields["result"])
-    held = rattle(t, result.x) if result.status.usable else None
+    held = held_blow(t, result.x) if result.status.usable else None
     problem = fields["problem"]
     if method == "shooting":  # it is what the result is to be told as: it knows of no accelerations
         terms = (*(term for term in problem.terms if not isinstance(term, GearLoad)), GearLoad(enabled=False))
         fields["problem"] = problem = replace(problem, collision="sdc", terms=terms)
     return StrikeSolution(
         strike=t.decode(result.x),
-        rattle=held,
+        held_blow=held,
         model_error=model_error(t, result.x, problem) if result.status.usable else None,
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,

@@ -7,11 +7,13 @@ from typing import Any
 
 from impactopt.files.output import Record, plain, record_of, record_of_strike, summary_of
 from impactopt.files.problem_file import ProblemFile, problem_file_from_data
+from impactopt.files.solved import SolvedFolder
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import StrikeSolution, optimize_strike
 from impactopt.problem.problem import ImpactProblem
 from impactopt.sweeps.collisions import Collisions
+from impactopt.sweeps.progress import START
 from impactopt.sweeps.units import Columns, Unit, Work
 from impactopt.sweeps.watchdog import Watchdog
 
@@ -20,6 +22,7 @@ __all__ = ["CASE_KINDS"]
 Rows = tuple[Columns, Mapping[int, Record]]
 
 _PLAIN = (
+    START,
     "impulse_Ns",
     "peak_force_N",
     "contact_ms",
@@ -45,18 +48,24 @@ def _plan(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:
         **_arguments(file, work),
     }
     solution: Solution | StrikeSolution
+    started: dict[str, str] = {}
     if work.case_kind == "strike":
         solution = optimize_strike(problem, **options)
+    elif work.solved is not None:
+        folder = SolvedFolder(work.solved)
+        solution, near = folder.solve(problem, file, **options)
+        folder.keep(solution, file, f"{unit.first:06d}")
+        started = {START: near.path.name if near is not None else ""}
     else:
         solution = solve(problem, start=work.start, **options)
     if not work.trajectories:
-        return _row(summary_of(solution), problem), {}
+        return _row({**summary_of(solution), **started}, problem), {}
     from_file: Any = {"problem": file.text, "problem_path": file.path}
     if isinstance(solution, StrikeSolution):
         record = record_of_strike(solution, **from_file)
     else:
         record = record_of(solution, **from_file)
-    return _row(record.summary, problem), {unit.first: record}
+    return _row({**record.summary, **started}, problem), {unit.first: record}
 
 
 def _collide(work: Work, unit: Unit, watchdog: Watchdog) -> Rows:

@@ -8,6 +8,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impactopt.sweeps.table import merge_kinds
 from impactopt.sweeps.units import Columns
@@ -15,6 +16,7 @@ from impactopt.sweeps.units import Columns
 __all__ = ["ProgressCounter", "SweepProgress"]
 
 BEST = "impulse_Ns"
+START = "started_from"  # a case; "": none
 OF_LATE = 30.0  # [s]
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 
@@ -52,6 +54,7 @@ class ProgressCounter:
         self.best_case: int | None = None
         self.kinds: dict[str, str] = {}
         self.reasons: Counter[str] = Counter()
+        self._iterations: dict[str, list[int]] = {}
         self._began = time.perf_counter()
         self._recent = deque([(self._began, 0)])
 
@@ -73,11 +76,24 @@ class ProgressCounter:
         self.reasons.update(_NUMBER.sub("...", reason) for reason in columns["reason"] if reason)
         self.peak_mb = max(self.peak_mb, peak_mb)
         merge_kinds(self.kinds, columns)
+        if START in columns and "iterations" in columns:
+            self._count_iterations(columns, good)
         found = np.array([np.nan if x is None else x for x in columns.get(BEST, ())], dtype=float)
         if found.size and np.isfinite(found[good]).any():
             at = int(np.nanargmax(np.where(good, found, np.nan)))
             if self.best is None or found[at] > self.best:
                 self.best, self.best_case = float(found[at]), first + at
+
+    def _count_iterations(self, columns: Columns, good: NDArray[np.bool_]) -> None:
+        for start, iterations, usable in zip(columns[START], columns["iterations"], good, strict=True):
+            if usable:
+                name = "neighbour" if start else "reach"
+                self._iterations.setdefault(name, []).append(int(iterations))
+
+    @property
+    def iterations(self) -> dict[str, float]:
+        """Mean of usable rows that say what they started from, by that."""
+        return {name: float(np.mean(found)) for name, found in sorted(self._iterations.items())}
 
     def progress(self) -> SweepProgress:
         """How it stands now."""

@@ -41,6 +41,8 @@ class SweepResult:
     peak_worker_mb : the most memory that a worker had, in any run [MB].  table : the Parquet file.
     best, best_case : the largest impulse [N s] of usable rows, and where; None if there is none.
     reasons : why rows have no usable result, and how often, most often first; numbers in them are left out.
+    iterations : mean of usable rows, by what they started from: "neighbour" and "reach", of a sweep whose
+        cases start from their neighbours.
     """
 
     cases: int
@@ -54,11 +56,13 @@ class SweepResult:
     best: float | None = None
     best_case: int | None = None
     reasons: Mapping[str, int] = field(default_factory=dict)
+    iterations: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """As `impactopt sweep --json` prints it."""
         names = ("cases", "done", "failed", "resumed", "seconds", "rate_per_second", "peak_worker_mb")
-        return {**{name: getattr(self, name) for name in names}, "table": str(self.table)}
+        out = {**{name: getattr(self, name) for name in names}, "table": str(self.table)}
+        return {**out, "iterations": dict(self.iterations)} if self.iterations else out
 
 
 def sweep(
@@ -139,7 +143,7 @@ def _run(
     counter.begin()
     if counter.resumed:
         tell(f"{counter.resumed} of {counter.cases} cases are there from before")
-    work = _work(chosen)
+    work = _work(chosen, store)
     if counter.done < counter.cases:
         _compile(chosen, problem, work, tell)
     left = _units(chosen, together, finished)
@@ -167,6 +171,7 @@ def _run(
         best=counter.best,
         best_case=counter.best_case,
         reasons=dict(counter.reasons.most_common()),
+        iterations=counter.iterations,
     )
 
 
@@ -185,7 +190,7 @@ def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, tell: Callable[[
         block_functions(problem, problem.coordinates, tell)
 
 
-def _work(chosen: Sweep) -> Work:
+def _work(chosen: Sweep, store: Store) -> Work:
     return Work(
         data=chosen.problem.data,
         path=chosen.problem.path.resolve(),
@@ -198,6 +203,7 @@ def _work(chosen: Sweep) -> Work:
         at_contact=chosen.at_contact,
         outputs=chosen.outputs,
         folder=chosen.path.parent.resolve(),
+        solved=store.solved.resolve() if chosen.start == "neighbour" else None,
     )
 
 

@@ -27,8 +27,10 @@ class SweepSection(Section):
         default="solve", description="a whole motion, the blow alone, or one collision"
     )
     seed: Seed = Field(default=0, description="seed of what is drawn, and of solves from several starts")
-    start: Literal["reach", "strike"] = Field(
-        default="reach", description="what a solve starts from: a plain reach, or the strike alone"
+    start: Literal["reach", "strike", "neighbour"] = Field(
+        default="reach",
+        description="what a solve starts from: a plain reach, the strike alone, or the nearest case solved "
+        "so far (a plain reach where there is none)",
     )
     starts: AtLeastOne = Field(
         default=1, description="starts of each solve or strike, of which the best is kept"
@@ -89,6 +91,12 @@ def of_other_kinds(content: SweepFile) -> list[Mistake]:
         if not collisions and name == "outputs":
             text = "of collisions only; all numbers of a solve are kept"
             found.append(Mistake(place=("sweep", key), sections=1, text=text))
+    if given.start == "neighbour" and given.case_kind == "strike":
+        text = '"neighbour" is of case_kind = "solve" only'
+        found.append(Mistake(place=("sweep", "start"), sections=1, text=text))
+    if given.start == "neighbour" and given.starts > 1:
+        text = 'a case starts from one neighbour: leave it out, or give start = "reach"'
+        found.append(Mistake(place=("sweep", "starts"), sections=1, text=text))
     if content.at_contact and not collisions:
         found.append(Mistake(place=("at_contact",), sections=1, text='of case_kind = "collision" only'))
     return found

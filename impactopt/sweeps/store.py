@@ -3,6 +3,7 @@
 * sweep.json      which sweep this is: its file's and its problem's data, and the versions that make its rows
 * sweep.toml      the sweep's file as it was
 * units.sqlite    every finished unit (`impactopt.sweeps.journal`)
+* solved/N/       a plan that others start from, where cases start from their neighbours
 * cases/N/        the whole result of case N, as of `impactopt solve`, where trajectories are kept
 * table.parquet   the rows of all finished cases; made from the journal at the end of every run
 """
@@ -54,6 +55,10 @@ class Store:
     @property
     def table(self) -> Path:
         return self.path / "table.parquet"
+
+    @property
+    def solved(self) -> Path:
+        return self.path / "solved"
 
     def keep(self, unit: int, found: Found) -> None:
         """Put a unit on disk: whole results first, then the rows that say that they are there."""

@@ -27,6 +27,7 @@ class Work:
     data, path : of the problem's file with the sweep's [set].  folder : of the sweep's file.
     case_kind, seed, start, starts, time_limit [s], trajectories, at_contact, outputs : as of `Sweep`.
     grace [s] : after the time limit, until the worker is killed.
+    solved : where cases are kept that others start from; None: none do.
     version : of impactopt, which workers have to have too.
     """
 
@@ -41,6 +42,7 @@ class Work:
     at_contact: Mapping[str, Any] = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
     folder: Path = Path()
+    solved: Path | None = None
     grace: float = GRACE
     version: str = __version__
 

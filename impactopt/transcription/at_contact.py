@@ -12,6 +12,7 @@ import numpy as np
 
 from impactopt.problem.objectives import Objective
 from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
 from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, move_apart
@@ -171,8 +172,12 @@ class ContactProgram(ABC):
         hit: Any = self.expected
         if isinstance(hit, Shot):
             return hit.target_energy()
-        numbers = np.array(list(self.problem.target.parameters.values()))
-        at = self.add_block("energy", [[self.expected.target_state]], numbers)
+
+        def numbers(problem: ImpactProblem) -> Array:
+            return np.array(list(problem.target.parameters.values()))
+
+        at = self.add_block("energy", [[self.expected.target_state]], numbers(self.problem))
+        self.builder.follow(lambda b: b.block("energy").take_parameters(numbers(b.problem)))
         return self.lift("target energy", np.array([at]))[0]
 
     def peak_force(self) -> Affine:
@@ -223,28 +228,28 @@ class ContactProgram(ABC):
         add_apart_rows(other.builder, [*self.swing_spots(), *self.follow_spots()], other.apart_rows)
         return other
 
-    def take_program(self, other: ContactProgram) -> None:
-        """Have the program of another one, which differs in numbers only, and its rows between bodies.
+    def move_to(self, problem: ImpactProblem, *, anew: bool = True) -> None:
+        """Take the numbers of a problem with another point, law or target, and leave the rest as it is built.
 
-        One of its own would take longer to build. The other has none from then on.
+        anew : the least durations of a contact's phases too, which else are kept where numbers are alike.
 
-        Raises
-        ------
-        ValueError : it differs in more.
+        What follows the problem then is what parts have told `Builder.follow`; whether that is all,
+        `StructuredProgram.same_numbers` finds.
         """
-        program = other.program
-        del other.__dict__["program"]
-        first = list(program.blocks[: len(self.blocks)])
-        if program.n != self.layout.n or [(b.name, b.count) for b in first] != [
-            (b.name, b.count) for b in self.blocks
-        ]:
-            raise ValueError("the other program has other variables or blocks")
+        self.problem = problem
+        builders = [self._bare] if self._bare is self.builder else [self._bare, self.builder]
+        for b in builders:
+            b.problem = problem
+        self.hit.renew(anew=anew)
+        for b in builders:
+            for take in b.followers:
+                take(b)
+        own = len(self._bare.blocks)
+        move_apart(problem, self.blocks[own:], self.apart_rows)
         objective, quadratic, linear = self._worth
-        program.take_numbers(
+        self.program.take_numbers(
             self.layout, self.blocks, self.rows, objective=objective, quadratic=quadratic, linear=linear
         )
-        move_apart(self.problem, program.blocks[len(self.blocks) :], other.apart_rows)
-        self.__dict__["program"], self.apart_rows = program, other.apart_rows
 
     def with_lifted(self, x: Array) -> Array:
         """The variables (n,) with lifted ones made equal to what they stand for."""

@@ -105,7 +105,8 @@ class Block:
         return self.value.inputs[1][: self.count]
 
     def take_parameters(self, parameters: Array) -> None:
-        """Others (count, n_p) from now on."""
+        """Others (count, n_p), or (n_p,) of all, from now on."""
+        parameters = np.broadcast_to(parameters, self.parameters.shape)
         for function in (self.value, self.jacobian, self.hessian):
             function.take_parameters(parameters)
 

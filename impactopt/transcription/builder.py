@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ class Builder:
     y0 (ny,), legs0 (nl,) : the start posture.
     layout, rows, blocks : variables, rows and functions so far.
     lifted : variables of :meth:`lift`, with the numbers of the outputs that they equal.
+    followers : what :meth:`follow` was given.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class Builder:
         self.layout, self.rows = Layout(), Rows()
         self.blocks: list[Block] = []
         self.lifted: list[tuple[Group, Index]] = []
+        self.followers: list[Callable[[Builder], None]] = []
 
     def copy(self) -> Builder:
         """The same program so far, to which other blocks and rows can be added; no variables."""
@@ -48,9 +50,19 @@ class Builder:
         other.blocks, other.rows = [block.copy() for block in self.blocks], self.rows.copy()
         return other
 
+    def follow(self, take: Callable[[Builder], None]) -> None:
+        """Have numbers follow the problem: ``take`` writes them to the blocks, rows or bounds of a builder,
+        this one or a copy, that has another problem.
+        """
+        self.followers.append(take)
+
     def duration(self, name: str, bounds: tuple[float, float], scale: float) -> Group:
         """A variable: how long [s] something lasts."""
         return self.layout.add(name, 1, 1, lower=bounds[0], upper=bounds[1], scale=scale, labels=["T"])
+
+    def block(self, name: str) -> Block:
+        """The first block of a name."""
+        return next(block for block in self.blocks if block.name == name)
 
     def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
         """Append a block; the index of its first output."""

@@ -19,18 +19,19 @@ from impactopt.transcription.builder import Builder
 from impactopt.transcription.collocated import Collocated
 from impactopt.transcription.contact import Contact
 from impactopt.transcription.contact_blocks import FORCE_SCALE, typical_state
+from impactopt.transcription.contact_numbers import ContactNumbers
 from impactopt.transcription.elimination import Turn, determined
-from impactopt.transcription.guess import blow, coasted, effective_mass, natural_durations
+from impactopt.transcription.guess import blow, coasted, effective_mass
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.nodes import add_cone_rows
-from impactopt.transcription.phases import pulls_apart, shortest_phases, switches
+from impactopt.transcription.phases import pulls_apart, switches
 from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
 from impactopt.transcription.rows import Measure, Place, along, by_leg, percent, rates
 
 
-class Collision(Collocated):
+class Collision(ContactNumbers, Collocated):
     """Variables and rows of the contact with one target.
 
     contact : what all start from.  stages : collocation points of its phases.
@@ -60,9 +61,8 @@ class Collision(Collocated):
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in phases]
         self._named = named = f"{scenario.name}: " if scenario is not None else ""
         self.suffix = f", if {scenario.name}" if scenario is not None else ""
-        self.law, self.target = p.law.parameters, p.target.parameters
-        if scenario is not None:
-            self.law, self.target = scenario.numbers(p.law, p.target)
+        self.mass = mass
+        self.renew()
         self.torque_fraction = scenario.torque if scenario else limits.torque.collision
         self.cone_margin = scenario.cone_margin if scenario else limits.cone.collision_margin
         n, self._switches = len(stages), switches(p.law)
@@ -70,10 +70,7 @@ class Collision(Collocated):
         def add(name: str, size: int, **options: Any) -> Group:
             return b.layout.add(named + name, n, size, **options)
 
-        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(law, target, mass)[-1])
-        self.shortest, longest = shortest_phases(p, self.natural), p.contact_duration[1]
+        longest = p.contact_duration[1]
         self.T = [
             b.duration(f"{named}{name} duration", (least, longest), 0.01)
             for name, least in zip(p.target.phases, self.shortest, strict=True)
@@ -122,23 +119,18 @@ class Collision(Collocated):
         """Slots and parameters of each block's instances, one a stage."""
         b, p = self._b, self._b.problem
         none, still = Affine.zeros(1), Affine.zeros(p.target.n_states)
-        phases = np.column_stack([np.eye(len(self.end)), self.shortest])
-        within = phases if p.target.guards else phases[:, :0]
-        collision, force, force_p = [], [], []
+        collision, force = [], []
         for i, s in enumerate(self.stages):
             state = self._slots(self.state, i, still)
             travelled = self._slots(self.xt, i, none, anew=True)
             given, x1 = self._slots(self.p, i, none)[1], self._before(s.phase)[2]
             collision.append(self._dynamics(i))
             force.append([*self._of_hand(i), self.f[i], *state, *travelled, x1, given])
-            branch = [float(self._restitution(i)), *within[s.phase]]
-            numbers = [*self.law.values(), *self.target.values()]
-            force_p.append([*p.point, *p.normal, *branch, *numbers])
         gains = np.concatenate([*self._gains(), b.robot.torque_limit, b.limits.units])
         collision_p = [np.concatenate([p.normal, [s.place, s.phase > 0], gains]) for s in self.stages]
         out: dict[str, tuple[list[list[Affine]], list[Any]]] = {
             "collision": (collision, collision_p),
-            "force": (force, force_p),
+            "force": (force, self.force_numbers()),
             **self._reference(),
         }
         if p.target.guards:

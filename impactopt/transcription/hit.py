@@ -85,6 +85,8 @@ class Hit(Contacts):
                 slots.setdefault(name, []).extend(instances)
                 parameters.setdefault(name, []).extend(numbers)
         self._at = {name: b.add_block(name, slots[name], np.array(parameters[name])) for name in slots}
+        if "force" in slots:
+            b.follow(self._follow_force)
         sizes = {block.name: block.n_out for block in b.blocks}
         for collision, index in zip(self.collisions, first, strict=True):
             collision.add_rows(
@@ -94,15 +96,34 @@ class Hit(Contacts):
         if self.first:
             slots_of, numbers = zip(*(first.instance() for first in self.first), strict=True)
             at = b.add_block("first", list(slots_of), np.array(numbers))
+            b.follow(self._follow_first)
             for k, each in enumerate(self.first):
                 each.add_rows(at + k * b.blocks[-1].n_out)
+
+    def renew(self, *, anew: bool) -> None:
+        """As of :meth:`impactopt.transcription.collision.Collision.renew`."""
+        self.__dict__.pop("mass", None)
+        lasting = [c for c in self.collisions if isinstance(c, Collision)]
+        for collision in lasting:
+            collision.renew(self.mass, anew=anew)
+        for first, collision in zip(self.first, lasting, strict=False):
+            first.law = collision.law
+
+    def _follow_force(self, b: Builder) -> None:
+        numbers = [numbers for c in self.collisions for numbers in c.force_numbers()]
+        b.block("force").take_parameters(np.array(numbers))
+        for collision in self.collisions:
+            collision.follow()
+
+    def _follow_first(self, b: Builder) -> None:
+        b.block("first").take_parameters(np.array([first.instance()[1] for first in self.first]))
 
     def output(self, collision: int, stage: int, part: str) -> Index:
         """Numbers of outputs of the block ``force``, whose ``part`` they are: at a stage of a collision.
 
         Once rows are there, and of collisions that last.
         """
-        size = next(block.n_out for block in self._b.blocks if block.name == "force")
+        size = self._b.block("force").n_out
         at = self._at["force"] + (collision * len(self.stages) + stage) * size
         return np.asarray(at + self._b.parts("force")[part])
 

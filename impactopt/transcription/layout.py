@@ -187,6 +187,13 @@ class Layout:
         scale = float(group.scale[0])
         return float(self.lower[group.offset]) * scale, float(self.upper[group.offset]) * scale
 
+    def bound(self, group: Group, lower: ArrayLike, upper: ArrayLike) -> None:
+        """Other bounds, as of :meth:`add`."""
+        k = list(self.groups).index(group.name)
+        for store, bound in ((self._lower, lower), (self._upper, upper)):
+            shape = group.count, group.size
+            store[k] = (np.broadcast_to(np.asarray(bound, dtype=float), shape) / group.scale).ravel()
+
     def name(self, j: int) -> str:
         for g in self.groups.values():
             k = j - g.offset

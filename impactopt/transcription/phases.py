@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from impactopt.contact.laws import ContactLaw
 from impactopt.problem.problem import ImpactProblem
+from impactopt.transcription.layout import Array
 
 # of the shortest compression that each of the two may last which an event makes of it, and the first of them
 # where that may come at once: tiny, as nothing has happened until then, but accelerations are over it
 SHARE, AT_ONCE = 0.1, 0.05
 # of a phase without a shortest time: share of the natural one, [s] at most, and share of the longest time
 OF_NATURAL, LEAST, HALF = 0.15, 2e-3, 0.5
+ALIKE = 3.0  # factor between numbers that are
 
 
 def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
@@ -21,6 +25,12 @@ def shortest_phases(problem: ImpactProblem, natural: float) -> list[float]:
     if target.at_once:
         shares[0] = AT_ONCE
     return [share * shortest for share in shares]
+
+
+def alike(numbers: Array, others: Array) -> bool:
+    """Whether least durations of problems with these numbers (k,) are, as blows take about as long."""
+    sizes = np.sort(np.abs([numbers, others]), axis=0)
+    return bool(np.all(sizes[1] <= ALIKE * sizes[0]))
 
 
 def switches(law: ContactLaw) -> bool:

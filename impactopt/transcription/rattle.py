@@ -9,6 +9,7 @@ that leaves out, by point masses of the same speed: the law with its gaps, and t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -47,14 +48,30 @@ class Rattle:
         )
 
 
-def rattle(t: ContactProgram, x: Array) -> Rattle | None:
-    """Of the expected target of solver variables (n,); None where nothing parts, or may."""
+@dataclass(frozen=True, kw_only=True)
+class HeldBlow:
+    """A planned blow in which striker and target stay together: masses [kg], speed [m/s], duration [s]."""
+
+    law: ContactLaw
+    target: Target
+    mass: float
+    speed: float
+    duration: float
+
+    @cached_property
+    def rattle(self) -> Rattle | None:
+        """What its plan leaves out; None where nothing parts."""
+        return rattle_of(self.law, self.target, self.mass, self.speed, self.duration)
+
+
+def held_blow(t: ContactProgram, x: Array) -> HeldBlow | None:
+    """With the expected target of solver variables (n,); None where nothing is held together."""
     hit, c, p = t.hit.expected, t.coordinates, t.problem
     if not isinstance(hit, Collision) or not hit.holds:
         return None
     y, legs, rates = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x), t.u0.read(x)[0]
     mass, speed = effective_mass(c, p.striker, p.normal, y, legs, rates)
-    return rattle_of(p.law, p.target, mass, speed, sum(hit.durations(x)))
+    return HeldBlow(law=p.law, target=p.target, mass=mass, speed=speed, duration=sum(hit.durations(x)))
 
 
 def rattle_of(law: ContactLaw, target: Target, mass: float, speed: float, duration: float) -> Rattle | None:

@@ -92,6 +92,11 @@ class Rows:
         """The same rows, to which others can be added."""
         return Rows(*(list(getattr(self, f.name)) for f in fields(self)))
 
+    def bound(self, k: int, lower: ArrayLike, upper: ArrayLike) -> None:
+        """Other bounds for what call number ``k`` of :meth:`add` added, none of which it dropped."""
+        for sides, given in ((self.lower, lower), (self.upper, upper)):
+            sides[k] = np.broadcast_to(np.asarray(given, dtype=float), sides[k].shape)
+
     def add_each(self, origins: Sequence[Row], *, outputs: Index, lower: float) -> None:
         """Append rows of these origins:  lower <= out[outputs]."""
         n = len(origins)

@@ -99,6 +99,23 @@ class StructuredProgram:
         self._c += linear
         self._c0, self._Q = float(linked.const.sum()), sp.csc_array(quadratic)
 
+    def same_numbers(self, other: StructuredProgram) -> bool:
+        """Whether bounds, constants, weights and parameters are those of another program, to rounding."""
+        mine, its = self._numbers(), other._numbers()
+        return len(mine) == len(its) and all(
+            a.shape == b.shape and np.allclose(a, b, rtol=1e-12, atol=1e-12)
+            for a, b in zip(mine, its, strict=True)
+        )
+
+    def _numbers(self) -> list[Array]:
+        matrices = self._lift, self._rows_matrix, self._Q
+        return [
+            *(self.x_lower, self.x_upper, self.g_lower, self.g_upper),
+            *(self._lift_const, self._rows_const, self._c, np.array([self._c0])),
+            *(part for matrix in matrices for part in (matrix.data, matrix.indices, matrix.indptr)),
+            *(b.parameters for b in self.blocks),
+        ]
+
     # ------------------------------------------------------------------ evaluation
     def _lifted(self, x: Array) -> list[Array]:
         if self._at is not None and np.array_equal(self._at[0], x):

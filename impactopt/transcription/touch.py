@@ -17,6 +17,11 @@ def rotation_rows(normal: Array) -> Array:
     return np.vstack([normal, across(normal)])
 
 
+def _slowest(b: Builder) -> float:
+    """Approach speed [m/s]."""
+    return 0.05 + float(b.problem.target.speed_before())
+
+
 def add_touch_rows(b: Builder, state: ContactState) -> None:
     """Hit point, approach speed and incidence, but for what a term of the problem takes the place of."""
     p, incidence = b.problem, b.limits.incidence
@@ -31,14 +36,18 @@ def add_touch_rows(b: Builder, state: ContactState) -> None:
             upper=p.point,
             measure=millimetres("away"),
         )
+        place = len(b.rows.lower) - 1
+        b.follow(lambda b: b.rows.bound(place, b.problem.point, b.problem.point))
     b.rows.add(
         term="approach speed",
         place="contact",
         components=["normal"],
         outputs=np.array([at + 3]),
-        lower=0.05 + float(p.target.speed_before()),
+        lower=_slowest(b),
         measure=Measure("m/s", 1.0, "too slow"),
     )
+    approach = len(b.rows.lower) - 1
+    b.follow(lambda b: b.rows.bound(approach, _slowest(b), np.inf))
     if p.extra(HitCone) is None:
         b.rows.add(
             term=incidence.name,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +60,7 @@ class Blow:
     """Rows and bounds of the contact with the expected target, or with a scenario's.
 
     elements : of its phases.  shortest [s] : how long each lasts at least.  start : y at contact.
+    lifted : names of torques that are variables.
     """
 
     def __init__(
@@ -71,9 +72,10 @@ class Blow:
         shortest: Sequence[float],
         start: Callable[[Variables], Array],
         scenario: Scenario | None = None,
+        lifted: Collection[str] = (),
     ) -> None:
         self.problem, self.robot, self.limits, self.scenario = problem, robot, limits, scenario
-        self._start = start
+        self._start, self.lifted = start, frozenset(lifted)
         self.stages, self.shortest = stages_of(elements, problem.collision_stages), list(shortest)
         self.prefix = "" if scenario is None else f"{scenario.name}: "
         self.suffix = "" if scenario is None else f", if {scenario.name}"
@@ -109,11 +111,14 @@ class Blow:
             least = np.where([0 < s.phase < self.phases - 1 for s in self.stages], -np.inf, 0.0)
         most = np.where(last, 0.0, np.inf)
         longest = p.contact_duration[1]
+        most_torque = np.array([self.fraction])
+        torques = {self.torque(i) for i in range(n)} & self.lifted
         out = {
             f"{self.prefix}contact force": (least[:, None], most[:, None]),
             f"{self.prefix}collision legs": self.limits.legs,
         }
         times = zip(self.durations, self.shortest, strict=True)
+        out |= dict.fromkeys(torques, (-most_torque, most_torque))
         return out | {name: (np.array([least]), np.array([longest])) for name, least in times}
 
     def place(self, i: int) -> str:
@@ -196,30 +201,47 @@ class Blow:
             out[robot.independent], out[dependent] = independent[robot.base :], legs
             return out
 
+        # a spring's rest does not move
+        driven = np.concatenate([np.ones(robot.base), np.where(r.passive, 0.0, 1.0)[robot.independent]])
+        lifted = self.torque(i) if self.torque(i) in self.lifted else None
+
         def value(v: Variables) -> Array:
             y0, u0, ff = self._start(v), v.get("rate at contact"), v.get("feed-forward at contact")
-            y, time, T, _ = self.moved(v, i, y0)
+            y, time, _, _ = self.moved(v, i, y0)
             u, legs = self.get(v, "collision rate", i), self.get(v, "collision legs", i)
             w, f = self.get(v, "collision sole wrench", i), float(self.get(v, "contact force", i)[0])
-            q, qd, qdd = robot.motion(y, legs, u, self.slope(v, "collision rate", i, u0) / T)
+            q, qd, qdd = self.motion(v, i)
             tau = robot.torque(q, qd, qdd, w, f)
             lag = self.get(v, "coasting legs", i) - legs
             slower = self.get(v, "coasting leg rates", i) - qd[robot.base + dependent]
-            ahead, faster = joints(y0 + u0 * time - y, lag), joints(u0 - u, slower)
+            ahead, faster = joints(y0 + driven * u0 * time - y, lag), joints(u0 - u, slower)
             servo = ff + (r.kp * ahead + r.kd * faster) / r.torque_limit
             found = [robot.closure(q), tau[: robot.base] / robot.base_scale]
-            return np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, servo, inside(w)])
+            bounded = servo if lifted is None else servo - v.get(lifted)
+            return np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
 
         closure = [f"{sole.name} sole {d}" for sole, *_ in robot.soles for d in DIRECTIONS]
         inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, self.least)
         if self.margin is None:
             inside, cone = (lambda w: np.zeros(0)), []
+        most = self.fraction if lifted is None else 0.0
         rows: list[Any] = [
             ("closed legs", place, closure, 0.0, 0.0),
             ("collision dynamics", place, [*DIRECTIONS[: robot.base], *r.joint_names], 0.0, 0.0),
-            (f"{limits.torque.name} in collision", place, r.joint_names, -self.fraction, self.fraction),
+            (f"{limits.torque.name} in collision", place, r.joint_names, -most, most),
         ]
         return Piece.of(value, [*rows, *cone])
+
+    def torque(self, i: int) -> str:
+        """Name of the servos' torques over limit at stage i, where they are variables."""
+        return f"torque in collision, {self.place(i)}"
+
+    def motion(self, v: Variables, i: int) -> tuple[Array, Array, Array]:
+        """q, v, a at stage i."""
+        y, _, T, _ = self.moved(v, i, self._start(v))
+        slope = self.slope(v, "collision rate", i, v.get("rate at contact")) / T
+        legs = self.get(v, "collision legs", i)
+        return self.robot.motion(y, legs, self.get(v, "collision rate", i), slope)
 
     def contact(self, v: Variables, i: int) -> tuple[float, float, float, float, Array]:
         """At stage i: penetration [m] and its rate [m/s], force [N], duration [s] of its phase, the target's

@@ -140,10 +140,12 @@ def node_piece(
     *,
     closed: bool = True,
     feedforward: bool = False,
+    lifted: str | None = None,
 ) -> Piece:
     """Rows of a node.  state : y, y', y'', legs, sole wrenches, T.
 
     closed : whether its legs have rows of their own.  feedforward : whether its torque is that variable.
+    lifted : variables that are its torque over limit; None: there are none.
     """
     problem_limits, n = robot.robot, robot.n
     names, fraction = problem_limits.joint_names, limits.torque.fraction
@@ -158,6 +160,8 @@ def node_piece(
         demand = tau[robot.base :] / problem_limits.torque_limit
         if feedforward:
             demand = demand - v.get("feed-forward at contact")
+        elif lifted is not None:
+            demand = demand - v.get(lifted)
         parts = [robot.closure(q)] if closed else []
         parts += [qd[robot.base + robot.dependent] / rates, tau[: robot.base] / robot.base_scale]
         return np.concatenate([*parts, robot.extension(q), inside(w), demand])
@@ -178,7 +182,8 @@ def node_piece(
     if feedforward:
         rows.append(("feed-forward that makes the robot coast", "contact", names, 0.0, 0.0))
     else:
-        rows.append((limits.torque.name, place, names, -np.full(n, fraction), np.full(n, fraction)))
+        most = np.full(n, 0.0 if lifted is not None else fraction)
+        rows.append((limits.torque.name, place, names, -most, most))
     return Piece.of(value, rows)
 
 

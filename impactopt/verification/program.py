@@ -12,11 +12,19 @@ from numpy.typing import NDArray
 
 from impactopt.kinematics.support import support_polygon
 from impactopt.kinematics.wrench_cone import inward_edges
-from impactopt.problem.objectives import AngularMomentum, Impulse, PeakForce, Penetration, TargetEnergy
+from impactopt.problem.objectives import (
+    AngularMomentum,
+    Effort,
+    Impulse,
+    PeakForce,
+    Penetration,
+    TargetEnergy,
+)
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import DEFAULT_TERMS, Balance, HandOrientation, Incidence, TargetSpeed
+from impactopt.problem.terms import DEFAULT_TERMS, Balance, GearLoad, HandOrientation, Incidence, TargetSpeed
 from impactopt.verification.apart import apart_pieces
 from impactopt.verification.blow import Blow
+from impactopt.verification.drives import COASTED, Drives, node_torque
 from impactopt.verification.motions import Limits, Way, node_piece, rate_pieces
 from impactopt.verification.robot_motion import GRAVITY, RobotMotion
 from impactopt.verification.variables import Piece, Variables
@@ -26,8 +34,8 @@ __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
 CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
-_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), HandOrientation, TargetSpeed)
-_KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum)
+_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), HandOrientation, TargetSpeed, GearLoad)
+_KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum, Effort)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +71,7 @@ class Program:
     def __init__(self, problem: ImpactProblem, claims: Claims) -> None:
         self.problem, self.robot = problem, RobotMotion(problem)
         self.limits = Limits(problem, self.robot)
+        self._names = {name for name, _, _ in claims.groups}
         self.missing = unknown(problem)
         self.rows: list[Piece] = []
         self.worth: list[Piece] = []
@@ -81,6 +90,7 @@ class Program:
             "feed-forward at contact": (np.array([-fraction]), np.array([fraction]))
         }
         self.blows: list[Blow] = []
+        self._coasting: Callable[[Variables], Any] | None = None
         if problem.lasts and problem.frozen is None:
             self._blows(claims)
         self._ways()
@@ -93,7 +103,13 @@ class Program:
         if self.blows:
             self._links()
             self._balance()
-            rows, self.worth = worth_pieces(problem, self.blows[0])
+            drives = Drives(self, self._names, self._coasting)
+            self.rows += drives.rows
+            self.worth += drives.worth
+            self.scales |= drives.scales
+            self.missing += drives.missing
+            rows, worth = worth_pieces(problem, self.blows[0])
+            self.worth += worth
             self.rows += [*rows, *speed_pieces(problem, self.blows[0])]
             self.worth += price_pieces(problem, self.robot, self.ways, self.blows)
 
@@ -102,7 +118,7 @@ class Program:
         scenarios = [None, *(s for s in self.problem.scenarios if not s.missing)]
         for scenario, shortest in zip(scenarios, claims.shortest, strict=True):
             common = self.problem, self.robot, self.limits, claims.elements
-            blow = Blow(*common, shortest, self.at_contact, scenario)
+            blow = Blow(*common, shortest, self.at_contact, scenario, self._names)
             self.blows.append(blow)
             self.scales |= blow.scales()
             self.bounds |= blow.bounds(claims.guarded)
@@ -128,8 +144,9 @@ class Program:
             }
             for k, s in enumerate(way.nodes):
                 last = way.swings and k == len(way.nodes) - 1
-                node = self._node(way, float(s), k)
-                self.rows.append(node_piece(self.robot, limits, way.place(float(s)), node, feedforward=last))
+                node, place = self.node(way, float(s), k), way.place(float(s))
+                lifted = None if last else self._lifted(place)
+                self.rows.append(node_piece(self.robot, limits, place, node, feedforward=last, lifted=lifted))
             self.rows += rate_pieces(self.robot, limits, way)
         base, names = self.robot.base, self.robot.labels[self.robot.base :]
         lower, upper = (bound[base:] for bound in limits.y)
@@ -146,10 +163,20 @@ class Program:
                 y, y1, _ = begin(v)
                 return y, y1, 0 * y, v.get("abort legs"), v.get("coasting sole wrench"), v.one(abort.T)
 
-            place = "end of coasting, if nothing is hit"
-            self.rows.append(node_piece(self.robot, limits, place, coasting, closed=False))
+            lifted = self._lifted(COASTED)
+            self.rows.append(node_piece(self.robot, limits, COASTED, coasting, closed=False, lifted=lifted))
+            self._coasting = coasting
 
-    def _node(self, way: Way, s: float, k: int) -> Callable[[Variables], Any]:
+    def _lifted(self, place: str) -> str | None:
+        """The torque over limit at a node, with its bounds, if that is a variable."""
+        name, fraction = node_torque(place), np.array([self.limits.torque.fraction])
+        if name not in self._names:
+            return None
+        self.bounds[name] = -fraction, fraction
+        return name
+
+    def node(self, way: Way, s: float, k: int) -> Callable[[Variables], Any]:
+        """y, y', y'', legs, sole wrenches and T at node k of a motion, at its fraction s."""
         at = way.at(s)
 
         def state(v: Variables) -> tuple[Array, Array, Array, Array, Array, float]:
@@ -161,7 +188,7 @@ class Program:
     def nodes(self) -> dict[str, Callable[[Variables], Any]]:
         """y, y', y'', legs, sole wrenches and T at each node, by its place."""
         return {
-            way.place(float(s)): self._node(way, float(s), k)
+            way.place(float(s)): self.node(way, float(s), k)
             for way in self.ways
             for k, s in enumerate(way.nodes)
         }

@@ -186,6 +186,21 @@ class RobotMotion:
             tau += jac[:3].T @ self.normal * force
         return tau
 
+    def resting(self) -> Array:
+        """Torques (n,) [N m] at rest in the start posture, on the least sole wrenches that carry it.
+
+        A moment of 1 N m counts as 10 N.
+        """
+        q, still = self.posture(self.y0, self.legs0), np.zeros(self.model.nv)
+        tau = self.torque(q, still, still, np.zeros(6 * len(self.soles)))
+        if self.soles:
+            self.look(q)
+            whole = np.vstack([jac[:, :6] for jac in self._jacobians])
+            cost = np.tile([1.0, 1, 1, 10, 10, 10], len(self.soles))
+            w = np.linalg.lstsq(whole.T / cost, tau[:6], rcond=None)[0] / cost
+            self.relieve(tau, q, w)
+        return np.asarray(tau[self.base :])
+
     def wrenches(self, q: Array, lacking: Array) -> Array:
         """(6 a sole) in the soles' frames, of legs whose torques lack so much (nv,)."""
         self.look(q)

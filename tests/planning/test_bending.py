@@ -12,9 +12,13 @@ import pytest
 from impactopt.errors import InputError
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.bent_program import bent_of
-from impactopt.planning.changes import parameter_of
+from impactopt.planning.changes import changed, parameter_of
+from impactopt.planning.made_again import program_on
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.problem.objectives import Impulse
+from impactopt.problem.scenario import Scenario
+from impactopt.problem.terms import GearLoad, HitRegion, Slide, TargetSpeed
 from impactopt.solvers.program import Status
 
 TIGHT: dict[str, Any] = {"kkt_tolerance": 1e-8, "complementarity_tolerance": 1e-8}
@@ -80,6 +84,7 @@ def test_a_bent_plan_is_that_of_the_changed_problem(arm: Solution, changes: dict
     first = arm.moved(**changes, polish=False)
     assert abs(first.impulse - bent.impulse) < abs(arm.impulse - bent.impulse) + 1e-6
     assert abs(first.impulse / bent.impulse - 1) < 1e-3
+    assert first.status is Status.ACCEPTABLE and first.result.max_violation <= 1e-3
     assert first.result.iterations <= 5 and "first order" in first.result.message
 
 
@@ -92,10 +97,9 @@ def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> N
         target=dataclasses.replace(arm.problem.target, mass=0.07, depth=0.004),
         law=dataclasses.replace(arm.problem.law, stiffness=3e5),
     )
-    quick = bent.program_for(problem).program
-    spare, bent._spare = bent._spare, None  # from here on everything is built
-    whole = bent.program_for(problem).program
-    bent._spare = spare
+    quick, moving = bent.program_for(problem).program, bent._moving
+    assert moving is not None and quick is moving.program
+    whole = bent._built(problem).program
     x, y = arm.result.x, arm.result.multipliers
     for name in ("x_lower", "x_upper", "g_lower", "g_upper"):
         assert np.array_equal(getattr(quick, name), getattr(whole, name)), name
@@ -103,6 +107,51 @@ def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> N
     assert quick.objective(x) == whole.objective(x)
     assert np.array_equal(quick.jacobian(x).toarray(), whole.jacobian(x).toarray())
     assert np.array_equal(quick.hessian(x, 1.0, y).toarray(), whole.hessian(x, 1.0, y).toarray())
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"terms": (Slide(most=0.05), TargetSpeed(least=0.0, most=100.0))},
+        {"terms": (HitRegion(radius=0.01),), "objectives": (Impulse(),)},
+        {"terms": (GearLoad(limit=5.0),)},
+        {"scenarios": (Scenario(name="heavy", mass=2.0),)},
+    ],
+    ids=["slide and speed", "region", "gears", "scenario"],
+)
+def test_programs_follow_their_problem(arm: Solution, more: dict[str, Any]) -> None:
+    """Terms and scenarios take the numbers of another problem, as if built for it."""
+    terms = tuple(t for t in arm.problem.terms if type(t) not in {type(m) for m in more.get("terms", ())})
+    problem = changed(arm.problem, **{**more, "terms": (*terms, *more.get("terms", ()))})
+    other = changed(
+        problem,
+        point=problem.point + np.array([0.01, 0.0, 0.02]),
+        target=dataclasses.replace(problem.target, mass=0.07),
+        law=dataclasses.replace(problem.law, stiffness=3e5),
+    )
+    moving, whole = program_on(problem, arm.nodes, (), ()), program_on(other, arm.nodes, (), ())
+    assert not moving.program.same_numbers(whole.program)
+    moving.move_to(other)
+    assert moving.program.same_numbers(whole.program)
+
+
+class _OwnTerm(Slide):
+    """One that reads the point and does not say so."""
+
+    def add_rows(self, program: Any) -> None:
+        place = float(program.problem.point[2])
+        program.rows.add(term="own", components=["x"], affine=program.swing_T[0], lower=place - 10.0)
+
+
+def test_a_program_that_does_not_follow_is_built_anew(arm: Solution) -> None:
+    problem = changed(arm.problem, terms=(*arm.problem.terms, _OwnTerm()))
+    solution = solve(problem, start=arm, refine=False)
+    bent = bent_of(solution)
+    assert bent._moving is None
+    moved = solution.moved(point=problem.point + np.array([0.01, 0.0, 0.01]), polish=False)
+    own = [i for i, row in enumerate(bent.program.rows.origins) if row.term == "own"]
+    lower = bent.program_for(moved.problem).program.g_lower[own]
+    assert lower == pytest.approx([moved.problem.point[2] - 10.0])
 
 
 def test_what_cannot_be_bent_is_said(arm: Solution) -> None:

@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 
 from impactopt.solvers.active import ActiveSystem, Offset
+from impactopt.solvers.predictor import Predictor
 from impactopt.solvers.program import Vector
 
 
@@ -77,3 +78,32 @@ def test_a_bound_that_hardly_holds_lets_go() -> None:
     system = ActiveSystem(p, x, y, np.array([1e-6, 0.0]))
     step = system.step(Offset(dual=np.array([-0.1, 0.1]), rows=np.zeros(1), variables=np.zeros(2)))
     assert step.x == pytest.approx([0.1, -0.1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [(2.0, 1.0, 1.5, 0.9), (2.0, 1.0, 1.5, 1.4), (2.4, 1.0, 1.6, 1.3), (1.0, 1.0, 1.5, 1.3)],
+    ids=["held", "let go", "held elsewhere", "free"],
+)
+@pytest.mark.parametrize("u", [1.2, 1.3], ids=["was held", "was free"])
+def test_a_prediction_finds_the_changed_active_set(u: float, numbers: tuple[float, ...]) -> None:
+    """From a bound that holds to one that does not, and back; but for the proximal hundredth of a step."""
+    old, new = Nearest(2.0, 1.0, 1.5, u), Nearest(*numbers)
+    found = Predictor(old, *solved(old)).predict(new)
+    assert found is not None and found.violation < 1e-5
+    x, y, z = solved(new)
+    far = 0.02 * np.linalg.norm(x - solved(old)[0])
+    assert found.x == pytest.approx(x, abs=far + 1e-5)
+    assert found.y == pytest.approx(y, abs=far + 1e-5)
+    assert found.z == pytest.approx(z, abs=far + 1e-5)
+    assert (found.z[0] > 1e-6) == (z[0] > 0)
+
+
+def test_numbers_that_do_not_change_predict_the_solution() -> None:
+    """Slack at a bound that holds and a small multiplier of one that does not are an interior point's."""
+    p = Nearest(2.0, 1.0, 1.5, 1.0)
+    x = np.array([1.0 - 1e-3, 0.5 + 1e-3])
+    y = p.aim[1] - x[1]
+    z = np.array([p.aim[0] - x[0] - y, 0.0])
+    found = Predictor(p, x, np.array([y]), z).predict(p)
+    assert found is not None and found.x == pytest.approx(x, abs=1e-9)

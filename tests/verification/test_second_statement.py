@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ from support.small_plans import arm_problem, transcribed
 
 from impactopt.contact import FreeMass
 from impactopt.files.problem_file import load_problem
+from impactopt.problem.objectives import Effort
+from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import TargetSpeed
+from impactopt.problem.terms import GearLoad, TargetSpeed
+from impactopt.robots.parts import SoftGrip
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.transcription import Transcription, block_functions
@@ -110,3 +114,32 @@ def test_slopes_are_those_of_the_program(arm_transcription: Transcription) -> No
     wanted = t.program.gradient(x) + t.program.jacobian(x).T @ y
     assert found == pytest.approx(wanted, rel=1e-7, abs=1e-6)
     assert np.abs(found - wanted).max() <= 10 * doubt.max() + 1e-7 * np.abs(wanted).max()
+
+
+def _drawn(problem: ImpactProblem) -> Transcription:
+    return Transcription(problem, problem.coordinates, block_functions(problem, problem.coordinates))
+
+
+@pytest.mark.parametrize("limit", [None, 1.5, {"elbow": 2.0}], ids=["default", "one", "by joint"])
+def test_of_gears_in_a_damped_contact(limit: Any) -> None:
+    """With the first instant, at which a damper has its force already, and in scenarios too."""
+    p = load_problem(PROBLEMS / "arm_planar.toml")
+    others = (
+        Scenario(name="heavy", mass=2.0, torque=0.9),
+        Scenario(name="nothing", missing=True, abort_after=0.02),
+    )
+    terms = (*(t for t in p.terms if not isinstance(t, GearLoad)), GearLoad(limit=limit))
+    check_rows(_drawn(dataclasses.replace(p, terms=terms, scenarios=others)))
+
+
+def test_of_a_tool_in_a_soft_grip() -> None:
+    """Its joint bears what spring and damper do, and no more; with gears beside it."""
+    p = load_problem(PROBLEMS / "arm_planar.toml")
+    grip = SoftGrip(axis=[0, 1, 0], stiffness=20.0, damping=0.5, point=[0.0, 0.0, 0.05])
+    robot = p.robot.with_grip(p.robot.tools[-1].name, grip)
+    check_rows(_drawn(dataclasses.replace(p, robot=robot, terms=(*p.terms, GearLoad()))))
+
+
+def test_of_effort() -> None:
+    p = load_problem(PROBLEMS / "arm_planar.toml")
+    check_rows(_drawn(dataclasses.replace(p, objectives=(*p.objectives, Effort(weight=0.02)))))

@@ -26,6 +26,33 @@ def record() -> Record:
     return record_of(solve(load_problem(ARM)), problem=ARM.read_text("utf-8"), problem_path=ARM)
 
 
+# The hammer in a soft grip, gears' loads, and a price on effort.
+SOFT = """
+[terms.gear_load]
+limit = 2.5
+
+[objectives.effort]
+weight = 0.02
+
+[robot]
+preset = "planar_arm"
+
+[robot.grips.hammer]
+axis = [0.0, 1.0, 0.0]
+point_m = [0.0, 0.0, 0.05]
+stiffness_N_m_rad = 200.0
+damping_N_m_s_rad = 2.0
+"""
+
+
+@pytest.fixture(scope="module")
+def soft_record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    text = ARM.read_text("utf-8").replace('robot = "planar_arm"\n', "") + SOFT
+    path = tmp_path_factory.mktemp("soft") / "soft.toml"
+    path.write_text(text, "utf-8")
+    return record_of(solve(load_problem(path), refine=False), problem=text, problem_path=path)
+
+
 def verified(directory: Path, *, code: int) -> dict[str, Any]:
     result = runner.invoke(app, ["verify", str(directory), "--json"])
     assert result.exit_code == code, result.output
@@ -49,6 +76,41 @@ def test_a_result_is_verified(record: Record, tmp_path: Path) -> None:
     }
     assert terms <= found["rows"].keys()
     assert set(found["rows"]["contact law"]) == {"violation", "where"}
+
+
+def test_drives_and_grips_are_verified(soft_record: Record, tmp_path: Path) -> None:
+    save_record(soft_record, tmp_path)
+    found = verified(tmp_path, code=0)
+    assert found["ok"] is True and found["kkt"] < 1e-5
+    assert {"gear load", "spring of a joint", "effort of a node"} <= found["rows"].keys()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("limit = 2.5", "limit = 0.7", "gear load"),
+        ("stiffness_N_m_rad = 200.0", "stiffness_N_m_rad = 190.0", "spring of a joint"),
+        ("damping_N_m_s_rad = 2.0", "damping_N_m_s_rad = 1.5", "spring of a joint"),
+        ("weight = 0.02", "weight = 0.021", "objective"),
+    ],
+)
+def test_a_plan_of_other_drives_is_not(
+    soft_record: Record, tmp_path: Path, old: str, new: str, word: str
+) -> None:
+    """The plan is called that of a problem with tighter gears, a stiffer grip, dearer effort."""
+    assert old in soft_record.problem
+    save_record(dataclasses.replace(soft_record, problem=soft_record.problem.replace(old, new)), tmp_path)
+    assert verified(tmp_path, code=1)["rows"][word]["violation"] > 1e-5
+
+
+@pytest.mark.parametrize("group", ["torque, follow-through, 40 %", "first force", "effort of a node"])
+def test_variables_of_drives_are_not_believed(soft_record: Record, tmp_path: Path, group: str) -> None:
+    arrays = {name: np.array(array) for name, array in soft_record.arrays.items()}
+    groups = json.loads(str(arrays["program_statement"]))["groups"]
+    at = [name for name, _, _ in groups].index(group)
+    arrays["solver_x"][sum(count * size for _, count, size in groups[:at])] += 1e-3
+    save_record(dataclasses.replace(soft_record, arrays=arrays), tmp_path)
+    assert verified(tmp_path, code=1)["ok"] is False
 
 
 def turned(name: str, by: float) -> Callable[[dict[str, Any]], None]:

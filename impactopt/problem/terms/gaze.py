@@ -54,8 +54,12 @@ class Gaze(Term):
 
     def add_rows(self, program: Any) -> None:
         nodes = program.swing_spots(self.since)
-        numbers = np.array([*self.axis, *program.problem.point, np.sin(self.angle)])
-        at = program.add_block("gaze", [slots for _, slots in nodes], numbers)
+
+        def numbers(point: Any) -> Any:
+            return np.array([*self.axis, *point, np.sin(self.angle)])
+
+        at = program.add_block("gaze", [slots for _, slots in nodes], numbers(program.problem.point))
+        program.builder.follow(lambda b: b.block("gaze").take_parameters(numbers(b.problem.point)))
         for i, (place, _) in enumerate(nodes):
             program.rows.add(
                 term=self.name,

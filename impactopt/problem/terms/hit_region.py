@@ -59,9 +59,13 @@ class HitRegion(Term):
 
     def add_rows(self, program: Any) -> None:
         """In the place of those of the hit point."""
-        numbers = [*program.problem.point, *face_axes(program.problem.normal).ravel()]
-        numbers += [] if self.radius is None else [self.radius]
-        at = program.add_block("hit_region", [[program.contact_state[0]]], np.array(numbers))
+
+        def numbers(problem: Any) -> Any:
+            size = [] if self.radius is None else [self.radius]
+            return np.array([*problem.point, *face_axes(problem.normal).ravel(), *size])
+
+        at = program.add_block("hit_region", [[program.contact_state[0]]], numbers(program.problem))
+        program.builder.follow(lambda b: b.block("hit_region").take_parameters(numbers(b.problem)))
         away = millimetres("away")
         program.equal("hit point", Place("contact", ""), ["along the normal"], np.array([at]), away)
         names = ["disc"] if self.size is None else ["across", "up"]

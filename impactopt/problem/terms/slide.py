@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,6 +35,8 @@ class Slide(Term):
         after = program.follow_spots()[0][1][0]
         for k, tangent in enumerate(across(problem.normal), start=1):
             place = float(tangent @ problem.point)
+            row = len(program.rows.lower)
+            program.builder.follow(partial(self._follow, row=row, tangent=tangent))
             program.rows.add(
                 term=self.name,
                 place="after contact",
@@ -43,3 +46,7 @@ class Slide(Term):
                 upper=place + self.most,
                 measure=millimetres("too far"),
             )
+
+    def _follow(self, b: Any, row: int, tangent: Any) -> None:
+        place = float(tangent @ b.problem.point)
+        b.rows.bound(row, place - self.most, place + self.most)

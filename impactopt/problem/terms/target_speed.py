@@ -37,9 +37,14 @@ class TargetSpeed(Term):
         return {"target_speed": BlockRecipe(lambda: speed(problem.target), problem.target.formula())}
 
     def add_rows(self, program: Any) -> None:
-        target = program.problem.target
-        numbers = np.array(list(target.parameters.values()))
-        at = program.add_block("target_speed", [[program.expected.target_state]], numbers)
+
+        def numbers(target: Target) -> Any:
+            return np.array(list(target.parameters.values()))
+
+        at = program.add_block(
+            "target_speed", [[program.expected.target_state]], numbers(program.problem.target)
+        )
+        program.builder.follow(lambda b: b.block("target_speed").take_parameters(numbers(b.problem.target)))
         program.rows.add(
             term=self.name,
             place="separation",

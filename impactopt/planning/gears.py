@@ -79,8 +79,8 @@ def within_gears(
         again = solve(cold, carried_over(cold, origin, x0, *none)[0])
         found, new = again[0], one_after_the_other(new, again[1])
     if not new.status.usable and new.status is not Status.INTERRUPTED:
-        told = f"{new.message} Without a bound of its gears there is a plan, but {beyond} ([terms.gear_load])."
-        new = replace(new, message=told)
+        free = f"Without a bound of its gears there is a plan, but {beyond} ([terms.gear_load])."
+        new = replace(new, message=f"{new.message} {free}")
     return found, one_after_the_other(result, new)
 
 

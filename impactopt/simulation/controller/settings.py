@@ -63,7 +63,7 @@ class ControllerSettings(Described):
         default=0.5, metadata=about("of the recovery; 1: the plan's", above=0, most=1)
     )
     recovery_margin: float = field(
-        default=0.06,
+        default=0.1,
         metadata=about(
             "of the centre of mass to the soles' edges after it, or the most they have",
             unit="m",
@@ -74,7 +74,7 @@ class ControllerSettings(Described):
     draw_back: float = field(
         default=0.03,
         metadata=about(
-            "of the hand after the blow, from where the plan has it: it does not touch again",
+            "of a hand with a tool in a soft grip after the blow: the tool swings on, and would touch again",
             unit="m",
             least=0,
             most=1,

@@ -75,9 +75,14 @@ class Target:
             self.free = t
 
     @property
-    def clear(self) -> bool:
-        """Whether the hand has felt nothing yet, or is free again."""
-        return bool(np.isnan(self.felt) or np.isfinite(self.free))
+    def before(self) -> bool:
+        """Whether the hand has felt nothing yet."""
+        return bool(np.isnan(self.felt))
+
+    @property
+    def bounced(self) -> bool:
+        """Whether the hand was in contact, and is free again."""
+        return bool(np.isfinite(self.free))
 
     @property
     def struck(self) -> bool:

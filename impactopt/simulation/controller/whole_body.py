@@ -120,15 +120,12 @@ class WholeBodyController:
         task(posture, A, held.a0, aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag)
         w, hand, swing = s.hand_bandwidth, held.hand * self.steered, held.hand * (1.0 - self.steered)
         away = aim.hand[0] - held.hand_place - swing @ off
-        if np.isfinite(self.target.free):
-            away = away - s.draw_back * self.scene.normal
+        weight = s.hand if self.target.before else 0.0
+        if self.target.bounced and self.robot.passive.any() and not recovers:
+            # a tool swings on in a soft grip, and would touch again
+            weight, away = s.hand, away - s.draw_back * self.scene.normal
         wanted = aim.hand[2] - swing @ aim.a + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)
-        task(
-            0.0 if recovers or not self.target.clear else s.hand,
-            hand @ A,
-            hand @ held.a0 + held.hand_drift,
-            wanted,
-        )
+        task(weight, hand @ A, hand @ held.a0 + held.hand_drift, wanted)
         rate, lift = np.zeros(6), np.zeros((6, 0))
         if self.robot.floating and self.cones:
             rate, lift = self._momentum(q, v, lag, aim, B, task, recovers)

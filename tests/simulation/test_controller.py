@@ -181,7 +181,7 @@ def test_the_motion_before_the_blow_coasts_on_until_the_hand_is_free() -> None:
 def bowed(robot: Robot, where: Scene, ref: Any) -> Any:
     """A reference that ends with its centre of mass 6 cm ahead."""
     q0 = np.asarray(ref.q[0])
-    ahead = replace(where, polygon=where.polygon + [0.06, 0.0])
+    ahead = replace(where, polygon=where.polygon + np.array([0.06, 0.0]))
     recovery = Recovery(robot, ref, ahead, replace(QUIET, recovery_margin=1.0))
     q = np.array([pin.integrate(robot.model, q0, part * recovery.shift) for part in (0.0, 0.5, 1.0)])
     v = np.zeros((3, robot.nv))

@@ -71,7 +71,8 @@ class WholeBodyController:
         self.felt = 0.0  # [N] at the hand, filtered
         self.springs = Servo(robot, reference).springs
         # what motors steer: springs are not followed, nor where a tool swings on them
-        self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - robot.passive)
+        self.passive = robot.passive
+        self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
     def miss(self, reference: Any) -> None:
         """What it tracks from now on, as it has hit nothing."""
@@ -89,9 +90,9 @@ class WholeBodyController:
         self.target.feel(t, measured.force > TOUCH)
         aim = self.target.at(t + ahead)
         self.held.look(q, rates, self.felt, s.sole_bandwidth)
-        if self.robot.passive.any():
+        if self.passive.any():
             angles = self.robot.joint_positions(q)
-            self.held.pulled(self.robot.passive, self.springs(angles, rates[-self.robot.n :]))
+            self.held.pulled(self.passive, self.springs(angles, rates[-self.robot.n :]))
         x = self._solve(t, q, rates, aim)
         torque = self.limit * x[:-1]
         self._remember(torque)
@@ -121,7 +122,7 @@ class WholeBodyController:
         w, hand, swing = s.hand_bandwidth, held.hand * self.steered, held.hand * (1.0 - self.steered)
         away = aim.hand[0] - held.hand_place - swing @ off
         weight = s.hand if self.target.before else 0.0
-        if self.target.bounced and self.robot.passive.any() and not recovers:
+        if self.target.bounced and self.passive.any() and not recovers:
             # a tool swings on in a soft grip, and would touch again
             weight, away = s.hand, away - s.draw_back * self.scene.normal
         wanted = aim.hand[2] - swing @ aim.a + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)

@@ -187,16 +187,13 @@ class _Replay(MujocoRobot):
         contacts = self.data.contact
         if not self.data.ncon:
             return out
-        for geoms, frame, place, address in zip(
-            contacts.geom, contacts.frame, contacts.pos, contacts.efc_address, strict=True
-        ):
-            sole = max(self.geom_sole[geoms[0]], self.geom_sole[geoms[1]])
-            if address < 0 or sole < 0:
-                continue
-            # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
-            force = frame.reshape(3, 3).T @ self.data.efc_force[address : address + 3]
-            out[sole, :3] += force
-            out[sole, 3:] += np.cross(place, force)
+        sole = self.geom_sole[contacts.geom].max(axis=1)
+        on = (contacts.efc_address >= 0) & (sole >= 0)
+        axes, place = contacts.frame[on].reshape(-1, 3, 3), contacts.pos[on]
+        # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
+        parts = self.data.efc_force[contacts.efc_address[on][:, None] + np.arange(3)]
+        force = np.einsum("kji,kj->ki", axes, parts)
+        np.add.at(out, sole[on], np.hstack([force, np.cross(place, force)]))
         return out
 
     def fallen(self, q_planned: Array) -> str:

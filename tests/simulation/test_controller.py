@@ -22,6 +22,7 @@ from impactopt.simulation.controller import WholeBodyController, controller_of
 from impactopt.simulation.controller.estimate import StateEstimate
 from impactopt.simulation.controller.held import HeldDynamics
 from impactopt.simulation.controller.quadratic import TorqueQP
+from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
 from impactopt.simulation.controller.target import Target
 
@@ -175,6 +176,67 @@ def test_the_motion_before_the_blow_coasts_on_until_the_hand_is_free() -> None:
     target.feel(0.66, False)
     np.testing.assert_allclose(target.at(0.66).v, 0.0)
     assert target.clock(0.70)[0] == pytest.approx(0.64)
+
+
+def bowed(robot: Robot, where: Scene, ref: Any) -> Any:
+    """A reference that ends with its centre of mass 6 cm ahead."""
+    q0 = np.asarray(ref.q[0])
+    ahead = replace(where, polygon=where.polygon + np.array([0.06, 0.0]))
+    recovery = Recovery(robot, ref, ahead, replace(QUIET, recovery_margin=1.0))
+    q = np.array([pin.integrate(robot.model, q0, part * recovery.shift) for part in (0.0, 0.5, 1.0)])
+    v = np.zeros((3, robot.nv))
+    torque = np.zeros((3, robot.n))
+    return SimpleNamespace(
+        time=np.array([0.0, 0.5, 1.0]), q=q, v=v, a=v, torque=torque, contact_start=0.2, contact_end=0.3
+    )
+
+
+@pytest.mark.parametrize("margin", [0.0, 1.0])
+def test_a_recovery_ends_inside_the_soles_which_stay(margin: float) -> None:
+    robot = biped()
+    still_ref, where = still(robot)
+    ref = bowed(robot, where, still_ref)
+    recovery = Recovery(robot, ref, where, replace(QUIET, recovery_margin=margin))
+    q = pin.integrate(robot.model, ref.q[-1], recovery.shift)
+    model, data = robot.model, robot.model.createData()
+    before, com = model.createData(), pin.centerOfMass(model, data, q)
+    middle = (where.polygon.min(axis=0) + where.polygon.max(axis=0)) / 2
+    ended = pin.centerOfMass(model, before, ref.q[-1])[:2]
+    np.testing.assert_allclose(com[:2], middle if margin else ended, atol=1e-6)
+    pin.framesForwardKinematics(model, data, q)
+    pin.framesForwardKinematics(model, before, ref.q[0])
+    for name in where.soles:
+        i = model.getFrameId(name)
+        np.testing.assert_allclose(data.oMf[i].homogeneous, before.oMf[i].homogeneous, atol=1e-6)
+
+
+def test_a_recovery_slows_the_plan_down_without_a_jump() -> None:
+    robot = biped()
+    ref, where = still(robot)
+    recovery = Recovery(robot, ref, where, replace(QUIET, recovery_pace=0.4))
+    small = 1e-6
+    for since in (0.01, 0.1, 0.3, 1.0):
+        gone, rate, gain = recovery.clock(since)
+        later = recovery.clock(since + small)
+        assert (later[0] - gone) / small == pytest.approx(rate, rel=1e-4)
+        assert (later[1] - rate) / small == pytest.approx(gain, abs=1e-6)
+    assert recovery.clock(0.0)[:2] == (0.0, 1.0)
+    assert recovery.clock(1.0)[1] == pytest.approx(0.4)
+
+
+def test_the_recovery_begins_after_the_blow_and_goes_on_from_where_the_plan_is() -> None:
+    robot = biped()
+    still_ref, where = still(robot)
+    ref = bowed(robot, where, still_ref)
+    settings = replace(QUIET, recovery_start=0.1, recovery_margin=0.0)
+    recovery = Recovery(robot, ref, where, settings)
+    target = Target(robot, ref, where.striker, spread=True, recovery=recovery)
+    assert not target.recovers(5.0)  # nothing was hit
+    target.feel(0.2, True)
+    target.feel(0.4, False)  # 0.1 s later than planned
+    assert not target.recovers(0.49)
+    assert target.recovers(0.51)
+    np.testing.assert_allclose(target.at(0.5 - 1e-9).q, target.at(0.5 + 1e-9).q, atol=1e-6)
 
 
 # ---- what it does

@@ -3,7 +3,9 @@
 * settings.py   its numbers
 * sensors.py    what encoders, an inertial unit and the striking hand's force sensor tell it
 * estimate.py   from there to the state of the robot
+* aim.py        what it tracks at one instant
 * target.py     what it tracks, by what it has felt of the blow
+* recovery.py   how it comes to rest after the blow
 * held.py       accelerations and sole wrenches as functions of the torques
 * quadratic.py  its QP in OSQP, in place
 * whole_body.py the controller

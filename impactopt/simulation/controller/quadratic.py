@@ -12,7 +12,7 @@ import numpy as np
 import osqp
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 __all__ = ["TorqueQP"]
 
@@ -30,7 +30,7 @@ class TorqueQP:
 
     def __init__(self, n: int, m: int, *, iterations: int) -> None:
         self.n, self.m = n, m
-        self._rows, self._unit = np.ones((m + n, n)), np.eye(n)
+        self._rows = np.ones((m + n, n))
         self._upper = np.full(m, ENDLESS)
         self._solver: Any = osqp.OSQP()
         self._solver.setup(
@@ -51,15 +51,18 @@ class TorqueQP:
 
     def solve(self, P: Array, q: Array, C: Array, c: Array, low: Array, high: Array) -> Array:
         """x (n,), inside its bounds."""
-        back = solve_triangular(np.linalg.cholesky(P), self._unit, lower=True, check_finite=False).T
-        self._rows[: self.m], self._rows[self.m :] = C @ back, back
-        scale = 1.0 / np.maximum(np.linalg.norm(self._rows, axis=1), LEAST)
-        self._rows *= scale[:, None]
-        self._solver.update(Ax=self._rows.ravel(order="F"))
+        root, _ = dpotrf(P, lower=1, clean=1)
+        inverse, _ = dtrtri(root, lower=1)
+        back, rows, m = inverse.T, self._rows, self.m
+        np.matmul(C, back, out=rows[:m])
+        rows[m:] = back
+        scale = 1.0 / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), LEAST)
+        rows *= scale[:, None]
         self._solver.update(
-            q=back.T @ q,
+            Ax=rows.ravel(order="F"),
+            q=inverse @ q,
             l=np.concatenate([c, low]) * scale,
-            u=np.concatenate([self._upper, high * scale[self.m :]]),
+            u=np.concatenate([self._upper, high * scale[m:]]),
         )
         x = back @ np.array(self._solver.solve(raise_error=False).x)
         return np.clip(x, low, high)

@@ -13,6 +13,7 @@ __all__ = ["CONTROLLERS", "ControllerSettings", "controller_of"]
 CONTROLLERS = ("servo", "wbc")
 
 IMPACTS = ("planned", "none", "project", "spread", "both")
+FOLLOWS = ("recover", "plan")
 
 
 def _weight(what: str) -> Any:
@@ -47,6 +48,38 @@ class ControllerSettings(Described):
             choices=IMPACTS,
         ),
     )
+    follow: str = field(
+        default="recover",
+        metadata=about(
+            "after the blow: the plan's follow-through (plan), or soon the same at a slower pace, with the "
+            "centre of mass farther from the soles' edges (recover)",
+            choices=FOLLOWS,
+        ),
+    )
+    recovery_start: float = field(
+        default=0.2, metadata=about("of the recovery, after the blow", unit="s", least=0, most=1000)
+    )
+    recovery_pace: float = field(
+        default=0.5, metadata=about("of the recovery; 1: the plan's", above=0, most=1)
+    )
+    recovery_margin: float = field(
+        default=0.1,
+        metadata=about(
+            "of the centre of mass to the soles' edges after it, or the most they have",
+            unit="m",
+            least=0,
+            most=1,
+        ),
+    )
+    draw_back: float = field(
+        default=0.03,
+        metadata=about(
+            "of a hand with a tool in a soft grip after the blow: the tool swings on, and would touch again",
+            unit="m",
+            least=0,
+            most=1,
+        ),
+    )
     com: float = field(default=10.0, metadata=_weight("the centre of mass"))
     angular_momentum: float = field(default=1.0, metadata=_weight("the angular momentum"))
     hand: float = field(default=1.0, metadata=_weight("the hand"))
@@ -71,6 +104,9 @@ class ControllerSettings(Described):
     )
     posture_bandwidth: float = field(
         default=15.0, metadata=about("of the posture's feedback", unit="rad/s", least=0, most=1000)
+    )
+    recovery_bandwidth: float = field(
+        default=12.0, metadata=about("of the same in the recovery", unit="rad/s", least=0, most=1000)
     )
     friction: float = field(
         default=0.6, metadata=about("coefficient between soles and floor that it counts on", above=0, most=10)

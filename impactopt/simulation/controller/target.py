@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,26 +9,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
+from impactopt.simulation.controller.aim import Aim
+from impactopt.simulation.controller.recovery import Recovery
 
-__all__ = ["Aim", "Target"]
+__all__ = ["Target"]
 
 Array = NDArray[np.float64]
 PATIENCE = 0.02  # [s] beyond twice the planned contact; then the motion after it begins in any case
-
-
-@dataclass(frozen=True)
-class Aim:
-    """q (nq,), v, a (nv,), torque (n,); com, its rate and acceleration (3,) each, momentum: angular about it,
-    and its rate; hand: place, rate and acceleration (3,) of the striking point.
-    """
-
-    q: Array
-    v: Array
-    a: Array
-    torque: Array
-    com: Array
-    momentum: Array
-    hand: Array
 
 
 class Target:
@@ -38,10 +24,13 @@ class Target:
     reference : time (k,), q, v, a, torque, contact_start, contact_end, as of
         :class:`impactopt.transcription.plan.Trajectory`.
     spread : the motion before the blow goes on until the hand is free again, and then that after it begins.
+    recovery : what becomes of the follow-through; None: it stays as planned.
     """
 
-    def __init__(self, robot: Robot, reference: Any, striker: str, *, spread: bool) -> None:
-        self.robot, self.model, self.spread = robot, robot.model, spread
+    def __init__(
+        self, robot: Robot, reference: Any, striker: str, *, spread: bool, recovery: Recovery | None = None
+    ) -> None:
+        self.robot, self.model, self.spread, self.recovery = robot, robot.model, spread, recovery
         self.time = np.asarray(reference.time)
         self.q, self.v = np.asarray(reference.q), np.asarray(reference.v)
         self.contact = float(reference.contact_start), float(reference.contact_end)
@@ -91,6 +80,11 @@ class Target:
         return bool(np.isnan(self.felt))
 
     @property
+    def bounced(self) -> bool:
+        """Whether the hand was in contact, and is free again."""
+        return bool(np.isfinite(self.free))
+
+    @property
     def struck(self) -> bool:
         """Whether the hand is in contact, for the first time."""
         return bool(np.isfinite(self.felt) and np.isnan(self.free))
@@ -101,22 +95,35 @@ class Target:
             return bool(np.isnan(self.free) or t < self.free + window)
         return bool(self.contact[0] - window <= t <= self.contact[1] + window)
 
+    @property
+    def over(self) -> float:
+        """[s] when the blow is over, at the latest; nan: the hand has felt nothing yet."""
+        start, end = self.contact
+        return self.free if np.isfinite(self.free) else self.felt + 2 * (end - start) + PATIENCE
+
+    def recovers(self, t: float) -> bool:
+        """Whether the robot recovers from the blow."""
+        return self.recovery is not None and bool(t >= self.over + self.recovery.start)
+
     def clock(self, t: float) -> tuple[float, int]:
         """Time [s] in the reference, and the last row that it may take."""
-        start, end = self.contact
-        final = len(self.time) - 1
+        end, final = self.contact[1], len(self.time) - 1
         if not self.spread:
             return t, final
-        if np.isfinite(self.free):
-            return end + t - self.free, final
         if np.isfinite(self.felt):
-            late = self.felt + 2 * (end - start) + PATIENCE
-            return (t, self.last) if t < late else (end + t - late, final)
+            return (t, self.last) if t < self.over else (end + t - self.over, final)
         return (t, self.last) if t < end + PATIENCE else (t, final)
 
     def at(self, t: float) -> Aim:
         """What to track at a time [s]."""
-        now, last = self.clock(t)
+        if self.recovery is None or not self.recovers(t):
+            return self._planned(*self.clock(t))
+        begun = self.over + self.recovery.start
+        gone, rate, gain = self.recovery.clock(t - begun)
+        now, last = self.clock(begun)
+        return self.recovery.of(self._planned(now + gone, last), rate, gain)
+
+    def _planned(self, now: float, last: int) -> Aim:
         i = int(np.searchsorted(self.time[: last + 1], now, side="right")) - 1
         i = min(max(i, 0), last - 1)
         span = self.time[i + 1] - self.time[i]

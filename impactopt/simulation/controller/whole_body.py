@@ -10,12 +10,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
+from impactopt.simulation.controller.aim import Aim
 from impactopt.simulation.controller.estimate import StateEstimate
 from impactopt.simulation.controller.held import HeldDynamics
 from impactopt.simulation.controller.quadratic import TorqueQP
+from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
 from impactopt.simulation.controller.settings import ControllerSettings
-from impactopt.simulation.controller.target import Aim, Target
+from impactopt.simulation.controller.target import Target
 from impactopt.simulation.result import Scene
 from impactopt.simulation.servo import Servo
 
@@ -26,6 +28,7 @@ WINDOW = 0.01  # [s] about the blow in which velocity errors are projected
 FILTER = 3e-3  # [s] of the hand's force
 TOUCH = 20.0  # [N] that the hand feels as a touch
 LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
+EFFORT = 1e-3  # weight of torques over their limits in the recovery, which has no feed-forward
 PRICE, SQUARE = 1e3, 1e3  # of leaving the cones, over the robot's weight: linear, and of its square
 
 
@@ -59,14 +62,17 @@ class WholeBodyController:
         rows = sum(len(c) for c in self.cones)
         self.qp = TorqueQP(robot.n + 1, rows, iterations=settings.iterations)
         self.seconds: list[float] = []
-        self.target = Target(robot, reference, scene.striker, spread=settings.spreads)
+        stands = robot.floating and bool(scene.soles) and settings.follow == "recover"
+        recovery = Recovery(robot, reference, scene, settings) if stands else None
+        self.target = Target(robot, reference, scene.striker, spread=settings.spreads, recovery=recovery)
         self.estimate = StateEstimate(robot, scene.soles, np.asarray(reference.q[0]))
         self.loads, self.points = np.ones(len(scene.soles)), np.zeros((len(scene.soles), 3))
         self.acceleration = np.zeros(robot.nv)
         self.felt = 0.0  # [N] at the hand, filtered
         self.springs = Servo(robot, reference).springs
         # what motors steer: springs are not followed, nor where a tool swings on them
-        self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - robot.passive)
+        self.passive = robot.passive
+        self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
     def miss(self, reference: Any) -> None:
         """What it tracks from now on, as it has hit nothing."""
@@ -84,21 +90,22 @@ class WholeBodyController:
         self.target.feel(t, measured.force > TOUCH)
         aim = self.target.at(t + ahead)
         self.held.look(q, rates, self.felt, s.sole_bandwidth)
-        if self.robot.passive.any():
+        if self.passive.any():
             angles = self.robot.joint_positions(q)
-            self.held.pulled(self.robot.passive, self.springs(angles, rates[-self.robot.n :]))
-        struck = self.settings.impact == "planned" and self.target.struck
-        x = self._solve(q, rates, aim, self.settings.projects and self.target.near_blow(t, WINDOW), struck)
+            self.held.pulled(self.passive, self.springs(angles, rates[-self.robot.n :]))
+        x = self._solve(t, q, rates, aim)
         torque = self.limit * x[:-1]
         self._remember(torque)
         return torque
 
-    def _solve(self, q: Array, v: Array, aim: Aim, project: bool, struck: bool) -> Array:
+    def _solve(self, t: float, q: Array, v: Array, aim: Aim) -> Array:
         held, s, n = self.held, self.settings, self.robot.n
+        recovers = self.target.recovers(t + s.delay)
+        struck = s.impact == "planned" and self.target.struck and not recovers
         off = pin.difference(self.robot.model, q, aim.q)
         lag = aim.v - v
         rate_error = lag[-n:]
-        if project:
+        if s.projects and self.target.near_blow(t, WINDOW):
             row = self.scene.normal @ held.hand
             lag = lag - held.recoil * (row @ lag) / (row @ held.recoil)
         A, B = held.A * self.limit, held.B * self.limit  # of torques over their limits
@@ -109,22 +116,32 @@ class WholeBodyController:
             P[:n, :n] += rows.T @ weighted
             g[:n] += weighted.T @ (now - wanted)
 
-        w = s.posture_bandwidth
+        w = s.recovery_bandwidth if recovers else s.posture_bandwidth
         posture = (0.0 if struck else s.posture) * self.steered
         task(posture, A, held.a0, aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag)
         w, hand, swing = s.hand_bandwidth, held.hand * self.steered, held.hand * (1.0 - self.steered)
         away = aim.hand[0] - held.hand_place - swing @ off
+        weight = s.hand if self.target.before else 0.0
+        if self.target.bounced and self.passive.any() and not recovers:
+            # a tool swings on in a soft grip, and would touch again
+            weight, away = s.hand, away - s.draw_back * self.scene.normal
         wanted = aim.hand[2] - swing @ aim.a + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)
-        task(s.hand if self.target.before else 0.0, hand @ A, hand @ held.a0 + held.hand_drift, wanted)
+        task(weight, hand @ A, hand @ held.a0 + held.hand_drift, wanted)
+        rate, lift = np.zeros(6), np.zeros((6, 0))
         if self.robot.floating and self.cones:
-            self._momentum(q, v, lag, aim, B, task)
+            rate, lift = self._momentum(q, v, lag, aim, B, task, recovers)
         feed = aim.torque
         if struck:  # what the plan counts on in contact
             feed = feed + self.kp * self.robot.kp * off[-n:] + self.kd * self.robot.kd * rate_error
-        task(s.blow if struck else s.torque, np.eye(n), np.zeros(n), feed / self.limit)
+        weight = s.blow if struck else (EFFORT if recovers else s.torque)
+        task(weight, np.eye(n), np.zeros(n), feed / self.limit)
         if self.cones:
-            share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), len(self.cones))[:, None] / self.weight
-            task(s.wrench, share * B, share[:, 0] * held.back, share[:, 0] * (B @ (feed / self.limit)))
+            share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), len(self.cones)) / self.weight
+            now, goal = held.back, B @ (feed / self.limit)
+            if recovers:  # what makes the momentum's rate with the least wrenches
+                spread = lift / share**2
+                now, goal = held.b0, spread.T @ np.linalg.solve(spread @ lift.T, rate)
+            task(s.wrench, share[:, None] * B, share * now, share * goal)
         P[n, n], g[n] = SQUARE, PRICE
         C, c = self._rows(B)
         low, high = -np.ones(n + 1), np.ones(n + 1)
@@ -134,8 +151,13 @@ class WholeBodyController:
         self.seconds.append(time.process_time() - begun)
         return x
 
-    def _momentum(self, q: Array, v: Array, lag: Array, aim: Aim, B: Array, task: Any) -> None:
-        """Rows of the centre of mass and of the angular momentum, whose rates are the soles' wrenches."""
+    def _momentum(
+        self, q: Array, v: Array, lag: Array, aim: Aim, B: Array, task: Any, recovers: bool
+    ) -> tuple[Array, Array]:
+        """Rows of the centre of mass and of the angular momentum, whose rates are the soles' wrenches.
+
+        What all wrenches are to make (6,), over the mass, and rows (6, 6 a sole) from wrenches to that.
+        """
         held, s, model, data = self.held, self.settings, self.robot.model, self.data
         Ag = pin.ccrba(model, data, q, v)
         mass, com = self.mass, data.com[0]
@@ -150,6 +172,8 @@ class WholeBodyController:
         # the divergent component of motion: com + rate / omega
         gain, omega = s.capture_gain, np.sqrt(9.81 / max(com[2], 0.1))
         error = Ag @ lag
+        if recovers:  # the centre of mass has an aim of its own, the joints' motion does not bring it there
+            error[:3] = mass * aim.com[1] - data.hg.linear
         wanted = np.zeros(6)
         wanted[:3] = (
             aim.com[2]
@@ -159,6 +183,8 @@ class WholeBodyController:
         wanted[3:] = (aim.momentum[1] + s.momentum_gain * error[3:]) / mass
         weight = np.repeat([s.com, s.angular_momentum], 3)
         task(weight, rows, now, wanted)
+        wanted[:3] -= model.gravity.linear
+        return wanted, lift
 
     def _cone(self, corners: Array) -> Array:
         """Rows (k, 6) that are >= 0 of a wrench that a sole can have, in its frame.

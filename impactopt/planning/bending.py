@@ -73,8 +73,12 @@ def moved_solution(
         t, result, _ = refining.rounds(t, result, old.x)
     t, result = refining.judged(t, result)
 
+    # new rows are farther off than what a tolerance for small moves makes up for
+    given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
+    exact = replace(budget, options=given)
+
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
-        return refining.judged(other, budget.run(other.program, start))
+        return refining.judged(other, exact.run(other.program, start))
 
     t, result = kept_on_demand(t, result, (t, old), solve, lambda *_: ())
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))

@@ -16,6 +16,7 @@ from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 __all__ = ["gear_share", "motion_loads", "plan_loads", "strike_loads"]
 
 Array = NDArray[np.float64]
+STEP = 5e-3  # [s] of motions, whose loads change from one node to the next: a completed millisecond is dear
 
 
 def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveLoads:
@@ -27,11 +28,14 @@ def motion_loads(robot: Robot, way: Trajectory, hit: PlannedCollision) -> DriveL
 
 
 def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> list[DriveLoads]:
-    """Of a plan's motions, the one that meets nothing included, and of these collisions with its targets."""
+    """Of a plan's motions every `STEP`, the one that meets nothing included, and of these collisions with its
+    targets.
+    """
     expected, *others = hits
-    out = [motion_loads(robot, plan.trajectory(), expected)]
-    if plan.abort is not None:
-        out.append(motion_loads(robot, plan.trajectory(missed=True), expected))
+    ways = [
+        plan.trajectory(step=STEP, hold=STEP, missed=m) for m in (False, True)[: 1 + (plan.abort is not None)]
+    ]
+    out = [motion_loads(robot, way, expected) for way in ways]
     still = np.zeros(robot.nv)
     return out + [strike_loads(robot, still, still, hit) for hit in others]
 

@@ -62,7 +62,7 @@ def inverse_kinematics(
             pin.updateFramePlacements(model, data)
             errors, jacs = [], []
             for leg in coordinates.legs:
-                f = model.getFrameId(leg.sole.frame)
+                f = model.getFrameId(leg.frame)
                 errors.append(pin.log6(data.oMf[f].actInv(leg.placement)).vector)
                 jacs.append(pin.getFrameJacobian(model, data, f, pin.LOCAL))
             gap = point - data.oMf[fid].translation

@@ -16,7 +16,8 @@ from impactopt.errors import MOST, InputError, check_number, check_whole, did_yo
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.problem.terms import Term
+from impactopt.problem.terms import Grip, Term
+from impactopt.robots.checks import LEG
 from impactopt.robots.robot import Robot
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "check_apart",
     "check_at_rest",
     "check_collision",
+    "check_hands",
     "check_moves",
     "check_names",
 ]
@@ -65,11 +67,38 @@ def check_at_rest(
         )
 
 
+def check_hands(problem: Any) -> None:
+    """InputError for a hand that holds on where it cannot, or by a grip of no known strength."""
+    p, robot, grip = problem, problem.robot, problem.extra(Grip)
+    hands = p.stance.held_hands(robot)
+    if not hands:
+        if grip is not None:
+            raise InputError(
+                "Grip is about hands that hold on, and none does: name them in the stance (hands=), or leave "
+                "it out"
+            )
+        return
+    if grip is None:
+        raise InputError(
+            f"the hand {hands[0].name!r} holds on: say what its grip bears, by the term Grip(force=, moment=)"
+        )
+    if p.collision != "full":
+        raise InputError(f'a plan whose hand holds on needs collision="full", not {p.collision!r}')
+    strikes = set(robot.limb(robot.striker(p.striker).model_frame))
+    for hand in hands:
+        both = strikes & set(robot.limb(hand.model_frame)[-LEG:])
+        if both:
+            raise InputError(
+                f"the hand {hand.name!r} holds on, so it cannot carry the striker {p.striker!r} (both move by "
+                f"{', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
+            )
+
+
 def check_moves(problem: Any) -> None:
     """InputError if no joint moves the striking point along the normal where it meets the target."""
     c, n = problem.coordinates, problem.normal
     striker = problem.robot.striker(problem.striker).model_frame
-    mobility = Held.at(c.model, problem.contact_posture, [s.frame for s in c.soles], striker).inverse_mass()
+    mobility = Held.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
     if n @ mobility @ n <= STUCK * np.linalg.norm(mobility):
         raise InputError(
             f"no joint of {problem.robot.name!r} moves {problem.striker!r} along the normal "

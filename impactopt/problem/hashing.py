@@ -28,7 +28,7 @@ def problem_hash(problem: Any) -> str:
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
     own = {type(term): term for term in (*DEFAULT_TERMS, *problem.terms)}
     shape |= {
-        "robot": _robot(problem.robot, problem.striker) | _drives(problem),
+        "robot": _robot(problem.robot, problem.striker) | _drives(problem) | _hands(problem),
         "law": _contact(problem.law),
         "target": _contact(problem.target),
         "start": problem.start_posture,
@@ -53,6 +53,12 @@ def _robot(robot: Robot, striker: str) -> dict[str, Any]:
 def _drives(problem: Any) -> dict[str, Any]:
     """Motors and gears, where something of the problem depends on them."""
     return {"actuators": problem.robot.actuators} if problem.of_drives else {}
+
+
+def _hands(problem: Any) -> dict[str, Any]:
+    """The hands that hold on, where one does."""
+    held = problem.stance.held_hands(problem.robot)
+    return {"hands": [(hand.frame, hand.point) for hand in held]} if held else {}
 
 
 def _contact(thing: Any) -> tuple[Any, ...]:

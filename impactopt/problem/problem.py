@@ -36,6 +36,7 @@ from impactopt.problem.checks import (
     check_apart,
     check_at_rest,
     check_collision,
+    check_hands,
     check_moves,
     check_names,
 )
@@ -54,6 +55,7 @@ from impactopt.problem.terms import (
     check_known,
     kind_of,
 )
+from impactopt.robots.checks import check_arms
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -77,7 +79,7 @@ class ImpactProblem:
     normal (3,) : unit vector in the world frame, along which the target is pushed.
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
         once and stands again before the striker leaves it.
-    stance : which soles are held.
+    stance : which soles are held, and which hands hold on: to where they are in the start posture.
     start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
@@ -160,6 +162,8 @@ class ImpactProblem:
             for term in self.terms:
                 found.attempt(partial(check_names, self.robot, term))
         found.attempt(self._check_objectives)
+        if hits and stands and termed:
+            found.attempt(partial(check_hands, self))
         if hits and aimed and stands and termed and found.attempt(lambda: self.contact_posture):
             found.attempt(partial(check_moves, self))
         found.raise_if_any("the problem")
@@ -231,11 +235,9 @@ class ImpactProblem:
                 f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
                 "(base_mass, base_inertia), which is for collision models"
             )
-        if self.stance.hand_frames(self.robot):
-            raise InputError(
-                f"a plan stands on soles only: give {type(self.stance).__name__} without hands, which are "
-                "for collision models"
-            )
+        soles, hands = self.stance.soles(self.robot), self.stance.held_hands(self.robot)
+        named = [(hand.name, hand.model_frame) for hand in hands]
+        check_arms(self.robot, [sole.frame for sole in soles], named)
 
     def _check_terms(self) -> None:
         listed = isinstance(self.terms, (list, tuple))
@@ -313,8 +315,9 @@ class ImpactProblem:
 
     @cached_property
     def coordinates(self) -> StanceCoordinates:
-        """Independent coordinates of the stance at the start posture."""
-        return StanceCoordinates(self.robot, self.stance.soles(self.robot), self.start_posture)
+        """Independent coordinates of the stance at the start posture, in which hands hold on, too."""
+        stance, robot = self.stance, self.robot
+        return StanceCoordinates(robot, stance.soles(robot), self.start_posture, stance.held_hands(robot))
 
     @cached_property
     def contact_posture(self) -> Array:
@@ -392,6 +395,8 @@ class ImpactProblem:
             frozen = f", {self.freezes} freezes" if self.freezes else ""
             more = {"rigid": f", restitution {self.coefficient_of_restitution:g}", "sdc": frozen}
             out["collision"] = self.collision + more.get(self.collision, "")
+        if hands := self.stance.held_hands(self.robot):
+            out["holds_on_with"] = [hand.name for hand in hands]
         if self.robot.source and self.robot.source.repairs:
             out["inertias"] = [f"repaired: {text}" for text in self.robot.source.repairs]
         out |= {"scenarios": [str(s) for s in self.scenarios]} if self.scenarios else {}

@@ -1,4 +1,4 @@
-"""Replay in MuJoCo with nothing held: the robot is free on its soles.
+"""Replay in MuJoCo with nothing held, but by its own hands: the robot is free on its soles.
 
 Unilateral contact with friction at the soles' corners, the servo with its limits, the target moved by the
 contact law's force. Shares no code with the planner: it reads a reference (times, positions, velocities,
@@ -22,6 +22,7 @@ from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.mujoco_robot import MujocoRobot
+from impactopt.simulation.mujoco_welds import Welds
 from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
@@ -56,6 +57,7 @@ class _Replay(MujocoRobot):
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
         super().__init__(robot, build_world(robot, self.scene, perturbation, solver, near), "striker")
+        self.grips = Welds(self.world, scene.hands)
         self.besides = Besides(self.world, solids)
         self.follow(reference)
         self.struck = Struck(self.scene)
@@ -103,6 +105,8 @@ class _Replay(MujocoRobot):
 
     def start(self, q: Array) -> None:
         self.put(q)
+        self.mujoco.mj_kinematics(self.world, self.data)
+        self.grips.put(self.data)
         self.mujoco.mj_forward(self.world, self.data)
         self.start_corners = self.corner_places()
 
@@ -199,6 +203,14 @@ class _Replay(MujocoRobot):
             out[sole, 3:] += np.cross(place, force)
         return out
 
+    def ground(self) -> Array:
+        """(soles and hands, 6) wrench of the world on what stands on it and holds on to it, about its origin;
+        after the step's forces are known.
+        """
+        found, places = self.grips.wrenches(self.data)
+        found[:, 3:] += np.cross(places, found[:, :3])
+        return np.vstack([self.sole_ground(), found])
+
     def fallen(self, q_planned: Array) -> str:
         """Whether the base is far from where the reference (nq,) has it: a plan may bow deeply itself."""
         if not self.floating:
@@ -268,6 +280,8 @@ def simulate_mujoco(
     """
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    if controller is not None and scene.hands:
+        raise InputError("the whole-body controller has no hand that holds on: take controller='servo'")
     world = perturbation if perturbation is not None else Perturbation()
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller)
@@ -280,7 +294,7 @@ def simulate_mujoco(
     lag = round(wait / step)
     told = np.zeros((2, robot.n))  # what the servo tells the motors: demand, and what saturation leaves of it
     force = 0.0
-    ground = np.zeros((len(scene.soles), 6))
+    ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
@@ -328,7 +342,7 @@ def simulate_mujoco(
             replay.besides.look(data, t)
             replay.look_at(gears, torque, force, push.peak)
             if kept:
-                ground = replay.sole_ground()
+                ground = replay.ground()
                 assert state is not None and moves is not None
                 rows.append(
                     (t, *state, force, target_speed, speed, demand, torque, ground, *moves, gears.taken())
@@ -350,7 +364,7 @@ def simulate_mujoco(
         saturated=saturated,
         cuts=cuts.told() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
-        fall=fall or replay.not_standing(ground, weight_of(robot)),
+        fall=fall or replay.not_standing(ground[: len(scene.soles)], weight_of(robot)),
         touched=replay.besides.touched(),
         missed=world.missing,
     )

@@ -18,6 +18,8 @@ from impactopt.simulation.result import Scene
 from impactopt.simulation.solids import FLOOR
 
 Array = NDArray[np.float64]
+# of a weld, MuJoCo's own limits: impedance, and time constant in steps
+_IMPEDANCE, _TIME_CONSTANT = 0.9999, 2.0
 FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
 
 
@@ -64,10 +66,11 @@ def build_world(
     the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
     anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid
     <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
-    The contact law between target and striker is the engine's business.
+    The contact law between target and striker is the engine's business. Hands that hold on are welded.
     """
     spec, bodies = robot_on_floor(robot, scene.striker, perturbation, solver)
     _solids(mujoco_module(), spec, bodies, scene, near)
+    add_welds(spec, bodies, robot, scene.hands, solver.step)
     return spec.compile()
 
 
@@ -198,6 +201,27 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
             armature=float(model.armature[model.joints[j].idx_v]),
         )
     return bodies
+
+
+def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[str], step: float) -> None:
+    """Sites at these frames of the robot, welded as hard as MuJoCo lets them be in steps [s] of this length.
+
+    bodies : of :func:`robot_bodies`.
+    """
+    mujoco = mujoco_module()
+    for name in frames:
+        frame = robot.model.frames[robot.model.getFrameId(name)]
+        bodies[frame.parentJoint].add_site(
+            name=name, pos=frame.placement.translation, quat=quaternion(frame.placement.rotation)
+        )
+        spec.worldbody.add_site(name=f"ground {name}")
+        weld = spec.add_equality()
+        weld.type, weld.objtype = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_SITE
+        weld.name1, weld.name2 = name, f"ground {name}"
+        weld.solref = [_TIME_CONSTANT * step, 1.0]
+        weld.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
+    if frames:
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # their rows are read
 
 
 def _surface(geom: Any, perturbation: Perturbation, *, sole: bool) -> None:

@@ -56,7 +56,7 @@ class _World:
     def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
         self.robot, self.scene = robot, scene
         self.model, self.base = robot.model, robot.model.nv - robot.n
-        self.body = PinocchioBody(robot, scene.soles, np.zeros(6), scene.striker, scene.normal)
+        self.body = PinocchioBody(robot, (*scene.soles, *scene.hands), np.zeros(6), scene.striker, scene.normal)
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
 
@@ -103,7 +103,7 @@ class _World:
         )
 
     def ground(self) -> Array:
-        """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
+        """(soles and hands, 6) wrench of the world on what it holds, about its origin, of the last call of
         ``rates``.
         """
         out = self.body.wrenches()
@@ -114,7 +114,7 @@ class _World:
         """World places (k, 3) of each held sole's corners."""
         return [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
-            for m, c in zip(self.body.placements(), self.scene.corners, strict=True)
+            for m, c in zip(self.body.placements(), self.scene.corners, strict=False)  # then hands
         ]
 
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:

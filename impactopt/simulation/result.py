@@ -50,6 +50,7 @@ REPORT = (
     "hand_speed_m_s",
     "sole_cop_margin_m",
     "target",
+    "grip_force_N",
     "clearance_mm",
     "nearest",
     "contacts_besides",
@@ -70,7 +71,7 @@ class Scene:
     target: the contact's force and the target's motion; striker: frame of the model that hits; soles: frames
     of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
     counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
-    else can touch.
+    else can touch. hands: frames of the model that hold on to where the reference has them at first.
     """
 
     point: Array
@@ -82,6 +83,7 @@ class Scene:
     corners: tuple[Array, ...]
     polygon: Array
     solids: Solids = field(default_factory=Solids)
+    hands: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +108,7 @@ class Simulation:
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
-    before.  loads: what gears and motors bear at most.  cuts: joints whose demand the line of their motor
+    before.  loads: what gears and motors bear at most.  grip_force (k, hands) [N]: on each hand that holds on.  cuts: joints whose demand the line of their motor
     has cut, the longest first; None where no motor's line is known.
     """
 
@@ -141,6 +143,7 @@ class Simulation:
     gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     loads: DriveLoads | None = field(default=None, repr=False)
     cuts: tuple[MotorCut, ...] | None = None
+    grip_force: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
     @property
     def ground(self) -> Array:
@@ -223,6 +226,8 @@ class Simulation:
                 for n, m in zip(self.soles, self.cop_margin.T, strict=True)
                 if np.isfinite(m).any()
             }
+            if self.grip_force.size:
+                out["grip_force_N"] = float(self.grip_force.max())
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())
             out["sole_lift_mm"] = 1e3 * float(self.lift.max())
             collision = self.lift[phase == 1]

@@ -19,7 +19,8 @@ def scene_of(problem: ImpactProblem) -> Scene:
         law=p.law,
         target=p.target,
         striker=p.robot.striker(p.striker).model_frame,
-        soles=p.stance.constraint_frames(p.robot),
+        soles=p.stance.sole_frames(p.robot),
+        hands=p.stance.hand_frames(p.robot),
         corners=tuple(sole.polygon for sole in p.stance.soles(p.robot)),
         polygon=support_polygon(p.robot, p.coordinates),
     )

@@ -87,7 +87,7 @@ def node(c: StanceCoordinates) -> BlockExpression:
     u, udot = ca.SX.sym("u", ny), ca.SX.sym("udot", ny)
     v, a = c.motion(y, legs, u, udot)
     rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
-    tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(legs, w)
+    tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(y, legs, w)
     out = {
         "closure": c.closure(y, legs),
         "base": tau[: c.base] / base_scale(c, weight, lever),

@@ -251,7 +251,7 @@ class Collision(Collocated):
 
     def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         b, c, joints = self._b, self._b.coordinates, self._b.robot.joint_names
-        closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
+        closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
         if "coasting" in first:
             names = [*closure, *[f"{n} rate" for n in closure]]
             measures = [*along(closure, "off"), *rates(closure)]

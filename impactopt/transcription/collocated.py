@@ -111,6 +111,10 @@ class Collocated:
         pairs = zip(self.stages, self.torques, strict=True)
         return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
 
+    def wrenches(self) -> list[tuple[Place, Affine]]:
+        """Of each stage, on soles and held hands."""
+        return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
+
     def _motion(self, i: int) -> list[Affine]:
         """Slots of a `impactopt.problem.joint_motion.joint_motion` at a stage."""
         rates = self._slots(self.u, i, self.contact.u0[0])

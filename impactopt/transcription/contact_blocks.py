@@ -120,7 +120,7 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
     q = c.configuration(at[0], at[2])
     row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{striker}")[:3, :])])(q)
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
-    tau += ca.mtimes(row.T, normal) * f - c.sole_wrench_map(at[2], w - carried)
+    tau += ca.mtimes(row.T, normal) * f - c.sole_wrench_map(at[0], at[2], w - carried)
     # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
     if frozen is None:
         lag, slower = lag - legs, slower - leg_part(c, v)
@@ -249,7 +249,7 @@ def carried(c: StanceCoordinates) -> BlockExpression:
     w, weight, lever = ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("weight"), ca.SX.sym("lever")
     v = c.velocity(y, legs, u)
     force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv)) - c.sole_wrench_map(
-        legs, w
+        y, legs, w
     )
     out = {"base": force[: c.base] / base_scale(c, weight, lever)}
     return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
@@ -278,7 +278,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
     q, push = _pushed(c, striker, y, legs, normal)
     change = c.velocity(y, legs, du)
-    balance = _inertia(c)(q, change) + push * blow - c.sole_wrench_map(legs, w)
+    balance = _inertia(c)(q, change) + push * blow - c.sole_wrench_map(y, legs, w)
     lost = -ca.dot(
         push, change
     )  # speed that the impulse takes from the hand; I over it is the effective mass
@@ -312,7 +312,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     weight, lever, before = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("before")
     q, push = _pushed(c, striker, y, legs, normal)
     jump = c.velocity(y, legs, change)
-    balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(legs, w)
+    balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(y, legs, w)
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {

@@ -56,8 +56,7 @@ def effective_mass(
     c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array, rates: Array
 ) -> tuple[float, float]:
     """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s]."""
-    frames = [sole.frame for sole in c.soles]
-    body = Held.at(c.model, c.join(y, legs), frames, c.robot.striker(striker).model_frame)
+    body = Held.at(c.model, c.join(y, legs), c.frames, c.robot.striker(striker).model_frame)
     v = c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
     mass = 1 / float(normal @ body.inverse_mass() @ normal)
     return mass, max(float(normal @ body.hand @ v), 0.1)

@@ -375,7 +375,7 @@ def complete_reference(
             miss = tau[:6] - jac[:, :6].T @ wrench[k]
             w = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / scale
             tau = tau - jac.T @ w
-            ground[k] = _about_origin(place, w)
+            ground[k] = _about_origin(place[: len(c.soles)], w)
         torque[k] = tau[c.base :]
     return q, v, a, torque, ground
 
@@ -393,7 +393,7 @@ def _about_origin(placements: list[pin.SE3], wrenches: Array) -> Array:
 def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
     """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
 
-    The soles are where they are held.
+    The soles are where they are held. What hands hold on to is not the ground.
     """
-    placements = [leg.placement for leg in coordinates.legs]
+    placements = [leg.placement for leg in coordinates.legs if leg.sole is not None]
     return np.array([_about_origin(placements, w) for w in wrenches])

@@ -61,9 +61,10 @@ def block_functions(
     recipe = (
         model_hash(robot.model),
         tuple(
-            (leg.sole.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)))
+            (leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)))
             for leg in coordinates.legs
         ),
+        tuple(np.round(coordinates.start, 12)) if coordinates.hands else (),
         tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
         problem.striker,
         edges,
@@ -263,6 +264,10 @@ class Transcription(ContactProgram):
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         slots, places = self._slots
         return list(zip(places, self.torques, slots, strict=True))
+
+    def _node_slots(self) -> list[tuple[Place, list[Affine]]]:
+        slots, places = self._slots
+        return list(zip(places, slots, strict=True))
 
     def _spring_points(self) -> list[SpringPoint]:
         if not self.robot.passive.any():

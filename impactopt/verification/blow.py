@@ -182,7 +182,7 @@ class Blow:
             rates = self.get(v, "coasting leg rates", i)
             return robot.coasting(y, self.get(v, "coasting legs", i), u0, rates)
 
-        closure = [f"{sole.name} sole {d}" for sole, *_ in robot.soles for d in DIRECTIONS]
+        closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
         names = [*closure, *[f"{name} rate" for name in closure]]
         return Piece.of(value, [("legs of the coasting reference", self.place(i), names, 0.0, 0.0)])
 
@@ -210,10 +210,8 @@ class Blow:
             found = [robot.closure(q), tau[: robot.base] / robot.base_scale]
             return np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, servo, inside(w)])
 
-        closure = [f"{sole.name} sole {d}" for sole, *_ in robot.soles for d in DIRECTIONS]
-        inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, self.least)
-        if self.margin is None:
-            inside, cone = (lambda w: np.zeros(0)), []
+        closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
+        inside, cone = limits.cone_rows(robot, place, self.margin, self.least)
         rows: list[Any] = [
             ("closed legs", place, closure, 0.0, 0.0),
             ("collision dynamics", place, [*DIRECTIONS[: robot.base], *r.joint_names], 0.0, 0.0),

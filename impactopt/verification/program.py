@@ -14,7 +14,7 @@ from impactopt.kinematics.support import support_polygon
 from impactopt.kinematics.wrench_cone import inward_edges
 from impactopt.problem.objectives import AngularMomentum, Impulse, PeakForce, Penetration, TargetEnergy
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import DEFAULT_TERMS, Balance, HandOrientation, Incidence, TargetSpeed
+from impactopt.problem.terms import DEFAULT_TERMS, Balance, Grip, HandOrientation, Incidence, TargetSpeed
 from impactopt.verification.apart import apart_pieces
 from impactopt.verification.blow import Blow
 from impactopt.verification.motions import Limits, Way, node_piece, rate_pieces
@@ -26,7 +26,7 @@ __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
 CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
-_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), HandOrientation, TargetSpeed)
+_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), Grip, HandOrientation, TargetSpeed)
 _KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum)
 
 

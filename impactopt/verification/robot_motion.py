@@ -25,6 +25,7 @@ class RobotMotion:
     ----------
     ny, nl, n, base : numbers of coordinates, leg joints, joints, and the base's coordinates (6 or 0).
     y0 (ny,), legs0 (nl,) : the start posture.  weight : of the robot [N].
+    soles : what is held, each with its leg, frame, joints in v, and placement: soles first, then hands.
     wrench_scale (6 a sole), base_scale (base,) : weight, and weight x lever for moments [N, N m].
     """
 
@@ -34,7 +35,7 @@ class RobotMotion:
         self.data: Any = robot.model.createData()
         self.base, self.n = held.base, robot.n
         self.soles = [
-            (leg.sole, self.model.getFrameId(leg.sole.frame), self.base + leg.joints, leg.placement)
+            (leg, self.model.getFrameId(leg.frame), self.base + leg.joints, leg.placement)
             for leg in held.legs
         ]
         joints = [joint for joint in self.model.joints if joint.nv == 1]
@@ -43,6 +44,8 @@ class RobotMotion:
         plain = [at for at, joint in zip(where, joints, strict=True) if joint.nq == 1]
         self._plain = np.array(plain, dtype=np.intp).reshape(-1, 2).T
         self._endless = [at for at, joint in zip(where, joints, strict=True) if joint.nq == 2]
+        # those that stand; the others are hands that hold on
+        self.standing = len(held.soles)
         self.independent, self.dependent = held.independent, held.dependent
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         self.labels, self.leg_labels = held.labels, held.leg_labels
@@ -203,7 +206,7 @@ class RobotMotion:
     def ground(self, wrenches: Array) -> Array:
         """(6,) [N, N m] about the world's origin, of wrenches (6 a sole) on the held soles."""
         total = np.zeros(6)
-        for k, (_, _, _, place) in enumerate(self.soles):
+        for k, (_, _, _, place) in enumerate(self.soles[: self.standing]):
             total += place.act(pin.Force(wrenches[6 * k : 6 * k + 6])).vector
         return total
 
@@ -229,7 +232,7 @@ class RobotMotion:
         joints = np.zeros(self.n)
         joints[self.independent], joints[self.dependent] = y[self.base :], legs
         self._write(q, joints)
-        v[self.base + self.dependent], v[self.base + self.independent] = rates, 0.0
+        v[self.base + self.dependent] = rates
         return np.concatenate([self.closure(q), self.twists(q, v)])
 
     def momentum(self, q: Array, v: Array) -> tuple[Array, Array, Array]:

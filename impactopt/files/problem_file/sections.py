@@ -74,9 +74,13 @@ class ProblemSection(Section):
 
 
 class StanceSection(Section):
-    """The soles that are held."""
+    """The soles that are held, and the hands that hold on."""
 
     soles: str = Field(default="both", description='"both", or the name of the sole that is held')
+    hands: list[str] = Field(
+        default_factory=list,
+        description="strikers that hold on, each to where it is in the start posture; see [terms.grip]",
+    )
 
 
 class PhaseSection(Section):
@@ -190,12 +194,13 @@ class File(Section):
     def make_stance(self, robot: Robot) -> Stance:
         """What [stance] says of a robot; InputError for what it cannot stand on."""
         soles = self.stance.soles if self.stance else "both"
-        stance: Stance = BothSoles() if soles == "both" else OneSole(soles)
+        hands = tuple(self.stance.hands) if self.stance else ()
+        stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
         if not robot.floating:
             if self.stance:
                 raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
             stance = FixedBase()
-        stance.soles(robot)
+        stance.constraint_frames(robot)
         return stance
 
     def make_start(self, robot: Robot) -> NDArray[np.float64]:

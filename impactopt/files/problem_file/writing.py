@@ -88,8 +88,10 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
         "target": _of_kind("target", problem.target, TARGETS, "kind"),
         "contact": _of_kind("law", problem.law, LAWS, "law"),
     }
-    if isinstance(problem.stance, OneSole):
-        data["stance"] = {"soles": problem.stance.name}
+    stance = problem.stance
+    hands = {"hands": [hand.name for hand in held]} if (held := stance.held_hands(problem.robot)) else {}
+    if isinstance(stance, OneSole) or hands:
+        data["stance"] = ({"soles": stance.name} if isinstance(stance, OneSole) else {}) | hands
     for name, section, phase in (
         ("swing", SwingSection, problem.swing),
         ("follow", FollowSection, problem.follow),

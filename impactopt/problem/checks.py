@@ -17,7 +17,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.terms import Grip, Term
-from impactopt.robots.checks import LEG
+from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.robot import Robot
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "check_hands",
     "check_moves",
     "check_names",
+    "check_stance",
 ]
 
 # models of the collision, cheapest first; those of no duration; "auto": the cheapest that is good enough
@@ -65,6 +66,18 @@ def check_at_rest(
             f"outside the support polygon of {', '.join(soles)}; start from a posture with its weight on "
             "what is held, or hold more"
         )
+
+
+def check_stance(problem: Any) -> None:
+    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own."""
+    robot, stance = problem.robot, problem.stance
+    if np.any(stance.compliance > 0):
+        raise InputError(
+            f"a plan holds its soles exactly: give {type(stance).__name__} without the virtual base "
+            "(base_mass, base_inertia), which is for collision models"
+        )
+    hands = [(hand.name, hand.model_frame) for hand in stance.held_hands(robot)]
+    check_arms(robot, stance.sole_frames(robot), hands)
 
 
 def check_hands(problem: Any) -> None:

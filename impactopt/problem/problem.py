@@ -39,6 +39,7 @@ from impactopt.problem.checks import (
     check_hands,
     check_moves,
     check_names,
+    check_stance,
 )
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
@@ -55,7 +56,6 @@ from impactopt.problem.terms import (
     check_known,
     kind_of,
 )
-from impactopt.robots.checks import check_arms
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -150,7 +150,7 @@ class ImpactProblem:
         found.attempt(lambda: check_name("the problem", self.name, empty=True))
         hits = found.attempt(lambda: self.robot.striker(self.striker))
         aimed = found.attempt(self._check_aim)
-        stands = found.attempt(self._check_stance) and found.attempt(self._check_start)
+        stands = found.attempt(partial(check_stance, self)) and found.attempt(self._check_start)
         for check in (self._check_elements, self._check_prices, partial(check_collision, self)):
             found.attempt(check)
         if found.attempt(self._check_scenarios):
@@ -228,16 +228,6 @@ class ImpactProblem:
             raise InputError(f"obstacles must be a tuple of Obstacle, not {self.obstacles!r}")
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
         check_apart("obstacle", [o.name for o in self.obstacles])
-
-    def _check_stance(self) -> None:
-        if np.any(self.stance.compliance > 0):
-            raise InputError(
-                f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
-                "(base_mass, base_inertia), which is for collision models"
-            )
-        soles, hands = self.stance.soles(self.robot), self.stance.held_hands(self.robot)
-        named = [(hand.name, hand.model_frame) for hand in hands]
-        check_arms(self.robot, [sole.frame for sole in soles], named)
 
     def _check_terms(self) -> None:
         listed = isinstance(self.terms, (list, tuple))

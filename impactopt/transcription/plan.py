@@ -67,7 +67,7 @@ class PlannedCollision:
     its surface; outcome: what the blow has brought the target, by name and unit (``speed_m_s`` of a free
     mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n) [N m], servo and feed-forward;
     ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each
-    sole's frame. velocity, acceleration (m + 1, n) [rad/s, rad/s^2] of the joints, the first at once after
+    sole's frame, then those of hands that hold on, in theirs. velocity, acceleration (m + 1, n) [rad/s, rad/s^2] of the joints, the first at once after
     contact, when a damped contact has a force already; (0, 0) where a model does not know them.
     """
 

@@ -89,6 +89,12 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
     check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
 
 
+def test_of_a_hand_that_holds_on() -> None:
+    problem = load_problem(PROBLEMS / "strike_holding_on.toml")
+    functions = block_functions(problem, problem.coordinates)
+    check_rows(Transcription(problem, problem.coordinates, functions))
+
+
 @pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])
 def test_of_targets_with_events(name: str) -> None:
     problem = load_problem(PROBLEMS / f"{name}.toml")

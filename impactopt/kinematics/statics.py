@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
-    """Sole wrenches (6 a sole) of least norm that carry the robot at rest; hands that hold on bear nothing."""
+    """Sole wrenches (6 a sole) of least norm that carry the robot at rest. Hands bear nothing."""
     if not c.legs:
         return np.zeros(0)
     model, data = c.model, c.model.createData()

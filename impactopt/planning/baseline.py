@@ -102,7 +102,7 @@ def _phases(
     c = problem.coordinates
     y0, _ = c.split(problem.start_posture)
     hit, legs = c.split(problem.contact_posture)
-    rates = strike_rates(c, problem.striker, hit, legs, speed * problem.normal, base=0.02)  # by the arm
+    rates = strike_rates(c, problem.strikers, hit, legs, speed * problem.normal, base=0.02)  # by the arm
     zero = np.zeros(c.ny)
     back = float(np.mean(problem.follow.duration))
     return [(there, (y0, zero, hit, rates)), (back, (hit, rates, y0, zero))]

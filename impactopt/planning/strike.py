@@ -127,8 +127,8 @@ def optimize_strike(
             f"unknown method {method!r}{did_you_mean(method, METHODS)}: give {' or '.join(METHODS)}"
         )
     if method == "shooting":
-        if problem.coordinates.hands:
-            raise InputError('by shooting no hand holds on: take method="collocation"')
+        if problem.coordinates.hands or problem.second is not None:
+            raise InputError('by shooting one hand strikes, and none holds on: take method="collocation"')
         options = _of_shooting(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=start is not None)

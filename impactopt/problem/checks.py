@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
-from impactopt.errors import MOST, InputError, check_number, check_whole, did_you_mean
+from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
 from impactopt.kinematics.support import margin, support_polygon
@@ -26,6 +26,7 @@ __all__ = [
     "check_apart",
     "check_at_rest",
     "check_collision",
+    "check_elements",
     "check_hands",
     "check_moves",
     "check_names",
@@ -36,6 +37,8 @@ __all__ = [
 INSTANT = ("rigid", "virtual-mass")
 COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
 MOST_FREEZES = 64
+LONGEST_CONTACT = 100.0  # [s]
+MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
 MANY = 100  # scenarios or obstacles
 STUCK = 1e-12  # mobility along the normal over the largest in any direction, that is none
 
@@ -102,8 +105,8 @@ def check_hands(problem: Any) -> None:
         both = strikes & set(robot.limb(hand.model_frame)[-LEG:])
         if both:
             raise InputError(
-                f"the hand {hand.name!r} holds on, so it cannot carry the striker {p.striker!r} (both move by "
-                f"{', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
+                f"the hand {hand.name!r} holds on, so it cannot carry the striker {p.striker!r} (both move "
+                f"by {', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
             )
 
 
@@ -165,6 +168,32 @@ def check_collision(problem: Any) -> None:
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
                 "approach and part several times in a blow"
             )
+
+
+def check_elements(problem: Any) -> None:
+    """InputError for elements and durations of the contact that are none."""
+    given: Any = problem.collision_elements
+    given = given.tolist() if isinstance(given, np.ndarray) else given
+    if not isinstance(given, (list, tuple)) or len(given) != 2:
+        raise InputError(
+            "collision_elements are those of compression and those of restitution, two tuples, not "
+            f"{shortened(str(given))}"
+        )
+    elements = tuple(tuple(check_array("collision_elements", x, (None,)).tolist()) for x in given)
+    object.__setattr__(problem, "collision_elements", elements)
+    stages = check_whole("collision_stages", problem.collision_stages, least=2, most=3)
+    object.__setattr__(problem, "collision_stages", stages)
+    for lengths in elements:
+        if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
+            raise InputError(
+                f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
+                f"{shortened(str(lengths))}"
+            )
+    lo, hi = check_array("contact_duration [s]", problem.contact_duration, (2,), most=LONGEST_CONTACT)
+    if not (0 <= lo <= hi and hi > 0):
+        raise InputError(
+            f"contact_duration must be (shortest, longest) in seconds, not {problem.contact_duration}"
+        )
 
 
 def check_freezes(problem: Any) -> None:

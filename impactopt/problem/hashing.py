@@ -26,6 +26,10 @@ def problem_hash(problem: Any) -> str:
     from, and whether a default was given or left out make no difference. Numbers count to the last digit.
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
+    second = shape.pop("second")
+    if second is not None:
+        other = problem.robot.striker(second.striker)
+        shape["second"] = (other.frame, other.point, second.point)
     own = {type(term): term for term in (*DEFAULT_TERMS, *problem.terms)}
     shape |= {
         "robot": _robot(problem.robot, problem.striker) | _drives(problem) | _hands(problem),

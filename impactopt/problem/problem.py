@@ -24,8 +24,6 @@ from impactopt.errors import (
     check_array,
     check_name,
     check_number,
-    check_whole,
-    shortened,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
@@ -36,6 +34,7 @@ from impactopt.problem.checks import (
     check_apart,
     check_at_rest,
     check_collision,
+    check_elements,
     check_hands,
     check_moves,
     check_names,
@@ -45,6 +44,7 @@ from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.second import SecondStriker, check_second
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     HandOrientation,
@@ -63,9 +63,6 @@ __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)
 
-LONGEST_CONTACT = 100.0  # [s]
-MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
-
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ImpactProblem:
@@ -77,6 +74,7 @@ class ImpactProblem:
     point (3,) [m] : where the striking point meets the target, in the world frame. The ground is z = 0. The
         soles of the start posture are centred on the origin.
     normal (3,) : unit vector in the world frame, along which the target is pushed.
+    second : another striker that hits the same target at the same time, at a point of its own.
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
         once and stands again before the striker leaves it.
     stance : which soles are held, and which hands hold on: to where they are in the start posture.
@@ -119,6 +117,7 @@ class ImpactProblem:
     normal: Array
     law: ContactLaw
     target: Target
+    second: SecondStriker | None = None
     stance: Stance = field(default_factory=BothSoles)
     start: str | Array = "half_sitting"
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
@@ -151,7 +150,7 @@ class ImpactProblem:
         hits = found.attempt(lambda: self.robot.striker(self.striker))
         aimed = found.attempt(self._check_aim)
         stands = found.attempt(partial(check_stance, self)) and found.attempt(self._check_start)
-        for check in (self._check_elements, self._check_prices, partial(check_collision, self)):
+        for check in (partial(check_elements, self), self._check_prices, partial(check_collision, self)):
             found.attempt(check)
         if found.attempt(self._check_scenarios):
             for scenario in self.scenarios:
@@ -164,6 +163,7 @@ class ImpactProblem:
         found.attempt(self._check_objectives)
         if hits and stands and termed:
             found.attempt(partial(check_hands, self))
+            found.attempt(partial(check_second, self))
         if hits and aimed and stands and termed and found.attempt(lambda: self.contact_posture):
             found.attempt(partial(check_moves, self))
         found.raise_if_any("the problem")
@@ -176,30 +176,6 @@ class ImpactProblem:
             unit = f": did you mean {np.round(normal / length, 6).tolist()}?" if length > 0 else ""
             raise InputError(f"normal must be a unit vector, its length is {length:.6g}{unit}")
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
-
-    def _check_elements(self) -> None:
-        given: Any = self.collision_elements
-        given = given.tolist() if isinstance(given, np.ndarray) else given
-        if not isinstance(given, (list, tuple)) or len(given) != 2:
-            raise InputError(
-                "collision_elements are those of compression and those of restitution, two tuples, not "
-                f"{shortened(str(given))}"
-            )
-        elements = tuple(tuple(check_array("collision_elements", x, (None,)).tolist()) for x in given)
-        object.__setattr__(self, "collision_elements", elements)
-        stages = check_whole("collision_stages", self.collision_stages, least=2, most=3)
-        object.__setattr__(self, "collision_stages", stages)
-        for lengths in elements:
-            if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
-                raise InputError(
-                    f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
-                    f"{shortened(str(lengths))}"
-                )
-        lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,), most=LONGEST_CONTACT)
-        if not (0 <= lo <= hi and hi > 0):
-            raise InputError(
-                f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
-            )
 
     def _check_prices(self) -> None:
         for name in ("smoothness", "wrench_price", "return_price"):
@@ -318,11 +294,12 @@ class ImpactProblem:
         Raises InputError if none is found: the point is out of reach.
         """
         given = self.coordinates, self.striker, self.point, self.start_posture
+        also = [] if self.second is None else [(self.second.striker, self.second.point)]
         if (hand := self.extra(HandOrientation)) is not None:
             direction = self.normal if hand.direction is None else np.array(hand.direction)
             with suppress(InputError):
-                return inverse_kinematics(*given, facing=(np.array(hand.axis), direction))
-        return inverse_kinematics(*given)
+                return inverse_kinematics(*given, also=also, facing=(np.array(hand.axis), direction))
+        return inverse_kinematics(*given, also=also)
 
     @property
     def self_collision(self) -> SelfCollision:
@@ -339,12 +316,22 @@ class ImpactProblem:
         """Whether any two bodies are not to touch."""
         return self.self_collision.enabled or self.keep_out.enabled
 
+    @property
+    def middle(self) -> Array:
+        """(3,) [m] of the target's face: the point, or what is between the two."""
+        return self.point if self.second is None else (self.point + self.second.point) / 2
+
+    @property
+    def strikers(self) -> tuple[str, ...]:
+        """Names of all that hit."""
+        return (self.striker,) if self.second is None else (self.striker, self.second.striker)
+
     @cached_property
     def world(self) -> tuple[WorldBody, ...]:
         """The bodies that are not the robot's: the ground, the target and what holds it, the obstacles."""
         return (
             ground(),
-            *target_bodies(self.body, self.target, self.point, self.normal),
+            *target_bodies(self.body, self.target, self.middle, self.normal),
             *obstacle_bodies(self.obstacles),
         )
 
@@ -357,16 +344,17 @@ class ImpactProblem:
         InputError : the start posture is in the target, in what holds it, or in an obstacle.
         """
         robot, model = self.robot, self.robot.model
-        frames = [robot.striker(self.striker).model_frame, *(s.frame for s in self.stance.soles(robot))]
-        strikes, *stands = (int(model.frames[model.getFrameId(name)].parentJoint) for name in frames)
+        hits = [robot.striker(name).model_frame for name in self.strikers]
+        frames = [*hits, *(s.frame for s in self.stance.soles(robot))]
+        joints = [int(model.frames[model.getFrameId(name)].parentJoint) for name in frames]
         return Bodies(
             self.robot,
             self.world,
             self.start_posture,
             normal=self.normal,
-            striking=strikes,
+            striking=tuple(joints[: len(hits)]),
             strict=self.keep_out.enabled,
-            standing=tuple(stands),
+            standing=tuple(joints[len(hits) :]),
         )
 
     def describe(self) -> dict[str, Any]:
@@ -385,6 +373,8 @@ class ImpactProblem:
             frozen = f", {self.freezes} freezes" if self.freezes else ""
             more = {"rigid": f", restitution {self.coefficient_of_restitution:g}", "sdc": frozen}
             out["collision"] = self.collision + more.get(self.collision, "")
+        if self.second is not None:
+            out["second"] = {"striker": self.second.striker, "point_m": self.second.point.tolist()}
         if hands := self.stance.held_hands(self.robot):
             out["holds_on_with"] = [hand.name for hand in hands]
         if self.robot.source and self.robot.source.repairs:

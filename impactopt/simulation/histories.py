@@ -45,8 +45,8 @@ def simulation_of(
     robot: Robot, scene: Scene, rows: list[tuple[Any, ...]], touches: Touches, **rest: Any
 ) -> Simulation:
     """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
-    wrench of each sole and each hand that holds on, slip and lift of each, torque through the gears since the row before; ``rest``: the
-    other fields.
+    wrench of each sole and each hand that holds on, slip and lift of each sole, torque through the gears
+    since the row before; ``rest``: the other fields.
     """
     if not rows:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")

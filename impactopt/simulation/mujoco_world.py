@@ -62,25 +62,25 @@ def build_world(
 ) -> Any:
     """The compiled mujoco.MjModel.
 
-    Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
-    the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
+    Joints have the model's names; striking points are the sites ``striker`` and ``striker 2``; each sole of
+    the robot, held by the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
     anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid
     <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
     The contact law between target and striker is the engine's business. Hands that hold on are welded.
     """
-    spec, bodies = robot_on_floor(robot, scene.striker, perturbation, solver)
+    spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver)
     _solids(mujoco_module(), spec, bodies, scene, near)
     add_welds(spec, bodies, robot, scene.hands, solver.step)
     return spec.compile()
 
 
 def robot_on_floor(
-    robot: Robot, striker: str, perturbation: Perturbation, solver: MujocoOptions
+    robot: Robot, strikers: Sequence[str], perturbation: Perturbation, solver: MujocoOptions
 ) -> tuple[Any, list[Any]]:
     """The world of :func:`build_world` before it is compiled, without target and solids; and its bodies, as
     of :func:`robot_bodies`.
 
-    striker : frame of the model that hits.
+    strikers : frames of the model that hit.
     """
     mujoco = mujoco_module()
     spec = spec_of(robot, solver)
@@ -89,7 +89,7 @@ def robot_on_floor(
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
     _surface(floor, perturbation, sole=False)
-    return spec, _robot_bodies(mujoco, spec, robot, striker, perturbation)
+    return spec, _robot_bodies(mujoco, spec, robot, strikers, perturbation)
 
 
 def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
@@ -148,8 +148,13 @@ def primitive(mujoco: Any, solid: Any) -> dict[str, Any]:
     return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0.0, 0.0], **place}
 
 
+def site_name(number: int) -> str:
+    """Of a striker, the first of which is 1."""
+    return "striker" if number == 1 else f"striker {number}"
+
+
 def _robot_bodies(
-    mujoco: Any, spec: Any, robot: Robot, striker: str, perturbation: Perturbation
+    mujoco: Any, spec: Any, robot: Robot, strikers: Sequence[str], perturbation: Perturbation
 ) -> list[Any]:
     model = robot.model
     bodies = robot_bodies(mujoco, spec, robot)
@@ -165,9 +170,10 @@ def _robot_bodies(
                 mass=0.0,
             )
             _surface(sphere, perturbation, sole=True)
-    frame = model.frames[model.getFrameId(striker)]
-    hand = bodies[frame.parentJoint]
-    hand.add_site(name="striker", pos=frame.placement.translation)
+    for k, striker in reversed(list(enumerate(strikers, start=1))):  # the first one carries the payload
+        frame = model.frames[model.getFrameId(striker)]
+        hand = bodies[frame.parentJoint]
+        hand.add_site(name=site_name(k), pos=frame.placement.translation)
     if perturbation.payload > 0:
         load = hand.add_body(name="payload", pos=frame.placement.translation)
         _inertial(load, perturbation.payload, np.zeros(3), 1e-4 * perturbation.payload * np.eye(3))

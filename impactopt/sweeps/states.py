@@ -169,8 +169,8 @@ class ContactStates:
         for hand in self.stance.held_hands(self.robot):
             if k in self.robot.limb(hand.model_frame):
                 raise InputError(
-                    f"[at_contact] joints_rad: {name} would move the hand {hand.name!r}, which holds on; move "
-                    "other joints, or [problem] point_m"
+                    f"[at_contact] joints_rad: {name} would move the hand {hand.name!r}, which holds on; "
+                    "move other joints, or [problem] point_m"
                 )
 
     def rows(

@@ -360,4 +360,4 @@ class FrozenCollision(Collision):
     def _speed(self, y: Array, rates: Array, legs: Array) -> float:
         """Of the hand along the normal [m/s]."""
         p = self._b.problem
-        return effective_mass(self._b.coordinates, p.striker, p.normal, y, legs, rates)[1]
+        return effective_mass(self._b.coordinates, p.strikers, p.normal, y, legs, rates)[1]

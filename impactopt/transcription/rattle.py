@@ -53,7 +53,7 @@ def rattle(t: ContactProgram, x: Array) -> Rattle | None:
     if not isinstance(hit, Collision) or not hit.holds:
         return None
     y, legs, rates = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x), t.u0.read(x)[0]
-    mass, speed = effective_mass(c, p.striker, p.normal, y, legs, rates)
+    mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
     return rattle_of(p.law, p.target, mass, speed, sum(hit.durations(x)))
 
 

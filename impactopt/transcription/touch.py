@@ -19,23 +19,32 @@ def rotation_rows(normal: Array) -> Array:
 
 
 def add_touch_rows(b: Builder, state: ContactState) -> None:
-    """Hit point, approach speed and incidence, but for what a term of the problem takes the place of."""
+    """Hit point, approach speed and incidence, but for what a term of the problem takes the place of; of a
+    second striker too.
+    """
+    _add_rows(b, state, "contact", b.problem.point, "")
+    if b.problem.second is not None:
+        _add_rows(b, state, "second_contact", b.problem.second.point, f"{b.problem.second.striker} ")
+
+
+def _add_rows(b: Builder, state: ContactState, block: str, point: Array, named: str) -> None:
+    """``named`` : before the components' names."""
     p, incidence = b.problem, b.limits.incidence
-    at = b.add_block("contact", [[state.y, state.y1, state.T]], rotation_rows(p.normal).ravel())
+    at = b.add_block(block, [[state.y, state.y1, state.T]], rotation_rows(p.normal).ravel())
     if p.extra(HitRegion) is None:
         b.rows.add(
             term="hit point",
             place=Place("contact", ""),
-            components=["x", "y", "z"],
+            components=[f"{named}{axis}" for axis in "xyz"],
             outputs=at + np.arange(3),
-            lower=p.point,
-            upper=p.point,
+            lower=point,
+            upper=point,
             measure=millimetres("away"),
         )
     b.rows.add(
         term="approach speed",
         place="contact",
-        components=["normal"],
+        components=[f"{named}normal"],
         outputs=np.array([at + 3]),
         lower=0.05 + float(p.target.speed_before()),
         measure=Measure("m/s", 1.0, "too slow"),
@@ -44,7 +53,7 @@ def add_touch_rows(b: Builder, state: ContactState) -> None:
         b.rows.add(
             term=incidence.name,
             place="contact",
-            components=["tangent 1", "tangent 2"],
+            components=[f"{named}tangent 1", f"{named}tangent 2"],
             outputs=at + np.array([4, 5]),
             lower=-incidence.speed,
             upper=incidence.speed,

@@ -76,7 +76,7 @@ def write(export: Export, directory: Path) -> None:
 def _write_scene(export: Export, directory: Path) -> None:
     p, mujoco, step = export.problem, mujoco_module(), _step(export)
     striker = p.robot.striker(p.striker).model_frame
-    spec, bodies = robot_on_floor(p.robot, striker, Perturbation(), MujocoOptions(step=step))
+    spec, bodies = robot_on_floor(p.robot, (striker,), Perturbation(), MujocoOptions(step=step))
     spec.modelname, spec.meshdir = p.name or p.robot.name, MESHES
     _draw_robot(mujoco, spec, bodies, export, directory / MESHES)
     _add_target(mujoco, spec, p, step)

@@ -41,6 +41,7 @@ from impactopt.files.problem_file.values import (
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.second import SecondStriker
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 
@@ -71,6 +72,14 @@ class ProblemSection(Section):
     @classmethod
     def defaults(cls) -> dict[str, Any]:
         return _of_problem(cls)
+
+
+class SecondSection(Section):
+    """Another striker that hits the same target at the same time."""
+
+    kind = SecondStriker
+    striker: str = required("name of the robot's other striker")
+    point: Vector = required("where its striking point meets the target [m]", "point_m")
 
 
 class StanceSection(Section):
@@ -155,6 +164,7 @@ class File(Section):
     robot: RobotSection = optional("")
     target: Target
     contact: Contact
+    second: SecondSection = optional("")
     stance: StanceSection = optional("")
     swing: SwingSection = optional("")
     follow: FollowSection = optional("")
@@ -214,7 +224,9 @@ class File(Section):
         """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""
         out = {name: value for name, value in self.problem.given().items() if name != "robot"}
         out |= {"law": self.contact.build(), "target": self.target.build()}
-        out |= {name: getattr(self, name).build() for name in ("swing", "follow") if getattr(self, name)}
+        out |= {
+            name: getattr(self, name).build() for name in ("second", "swing", "follow") if getattr(self, name)
+        }
         out |= self.objective.given() if self.objective else {}
         if self.collision is not None:
             given = self.collision.given()

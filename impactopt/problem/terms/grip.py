@@ -27,7 +27,9 @@ class Grip(Term):
 
     def add_rows(self, program: Any) -> None:
         most = np.repeat([self.force, self.moment], 3)
-        measure = [Measure(unit, m, "too much") for unit, m in zip(["N"] * 3 + ["N m"] * 3, most, strict=True)]
+        measure = [
+            Measure(unit, m, "too much") for unit, m in zip(["N"] * 3 + ["N m"] * 3, most, strict=True)
+        ]
         for place, wrench in program.wrenches():
             for k, leg in enumerate(program.coordinates.legs):
                 if leg.sole is not None:

@@ -145,15 +145,15 @@ def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles
     k = 0
     while True:
         world.mujoco.mj_step1(world.world, data)
-        speed = world.speed_along(normal)
+        speed = float(world.speeds_along(normal)[0])
         if k == 0:
-            start = float(normal @ data.site_xpos[world.site])
+            start = float(normal @ world.places()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
         rate = speed - target_speed
-        depth = float(normal @ data.site_xpos[world.site]) - start - travel
+        depth = float(normal @ world.places()[0]) - start - travel
         demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0

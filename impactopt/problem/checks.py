@@ -100,12 +100,13 @@ def check_hands(problem: Any) -> None:
         )
     if p.collision != "full":
         raise InputError(f'a plan whose hand holds on needs collision="full", not {p.collision!r}')
-    strikes = set(robot.limb(robot.striker(p.striker).model_frame))
     for hand in hands:
-        both = strikes & set(robot.limb(hand.model_frame)[-LEG:])
-        if both:
+        arm = set(robot.limb(hand.model_frame)[-LEG:])
+        for name in p.strikers:
+            if not (both := arm & set(robot.limb(robot.striker(name).model_frame))):
+                continue
             raise InputError(
-                f"the hand {hand.name!r} holds on, so it cannot carry the striker {p.striker!r} (both move "
+                f"the hand {hand.name!r} holds on, so it cannot carry the striker {name!r} (both move "
                 f"by {', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
             )
 

@@ -161,10 +161,10 @@ class ImpactProblem:
             for term in self.terms:
                 found.attempt(partial(check_names, self.robot, term))
         found.attempt(self._check_objectives)
-        if hits and stands and termed:
+        sound = hits and stands and termed and found.attempt(partial(check_second, self))
+        if sound:
             found.attempt(partial(check_hands, self))
-            found.attempt(partial(check_second, self))
-        if hits and aimed and stands and termed and found.attempt(lambda: self.contact_posture):
+        if sound and aimed and found.attempt(lambda: self.contact_posture):
             found.attempt(partial(check_moves, self))
         found.raise_if_any("the problem")
 

@@ -63,10 +63,11 @@ def build_world(
     """The compiled mujoco.MjModel.
 
     Joints have the model's names; striking points are the sites ``striker`` and ``striker 2``; each sole of
-    the robot, held by the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
-    anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid
-    <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
-    The contact law between target and striker is the engine's business. Hands that hold on are welded.
+    the robot, held by the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing
+    else touches anything, but the pairs of solids (`near`), which push each other back: hulls of links, named
+    ``solid <number>``, and bodies of the world; those that move with the target are on the mocap body
+    ``target``. The contact law between target and striker is the engine's business. Hands that hold on are
+    welded.
     """
     spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver)
     _solids(mujoco_module(), spec, bodies, scene, near)

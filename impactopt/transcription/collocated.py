@@ -39,6 +39,7 @@ class Collocated:
     joined_x: Group
     suffix: str
     legs: Group
+    w: Group
     contact: Contact
     torques: list[Affine]
 

@@ -65,10 +65,10 @@ class PlannedCollision:
 
     time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N], forces (m + 1, strikers) of each;
     target_speed (m + 1,) [m/s] of its surface; outcome: what the blow has brought the target, by name and
-    unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n) [N m],
-    servo and feed-forward; ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench
-    (m, 6 a sole, 6 a hand that holds on) in each one's frame. velocity, acceleration (m + 1, n) of the joints,
-    the first at once after contact, when a damped contact has a force already; (0, 0): not known.
+    unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n)
+    [N m], servo and feed-forward; ground (m, 6) wrench about the world's origin [N, N m]; sole_wrench (m, 6 a
+    sole, 6 a hand that holds on), in own frames. velocity, acceleration (m + 1, n) of the joints, the first
+    at once after contact, when a damped contact has a force already; (0, 0): not known.
     """
 
     time: Array = field(repr=False)

@@ -213,6 +213,13 @@ class File(Section):
         stance.constraint_frames(robot)
         return stance
 
+    def check_one_striker(self) -> None:
+        """InputError if there are two, which models of a collision alone have not."""
+        if self.second is not None:
+            raise InputError(
+                "[second]: a collision model has one striker: leave the section out, or solve the problem"
+            )
+
     def make_start(self, robot: Robot) -> NDArray[np.float64]:
         """The posture (nq,) to start from; InputError for one that the robot cannot have."""
         start = self.problem.start

@@ -169,7 +169,7 @@ def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
     durations = [v.one(name) for name in blow.durations]
     own = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in blow.stages]
     if len(time) == len(own) + 1:
-        forces = np.array([blow.get(v, "contact force", i)[0] for i in range(len(own))])
+        forces = np.array([blow.get(v, "contact force", i).sum() for i in range(len(own))])
         yield Off("blow", _gap(time[1:], own), "collision_time")
         yield Off("blow", _gap(force[1:], forces, 100.0), "collision_force")
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class RobotMotion:
         six = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER])
         self.wrench_scale = np.tile(six, len(self.soles))
         self.base_scale = six[: self.base]
-        self.hand = self.model.getFrameId(f"striker:{problem.striker}")
+        self.hands = [self.model.getFrameId(f"striker:{name}") for name in problem.strikers]
         self.normal = np.asarray(problem.normal, dtype=float)
         self._seen: Array | None = None
         self._places: list[Any] = []
@@ -175,17 +176,17 @@ class RobotMotion:
         found = [np.linalg.det(jac[:, columns]) for (_, _, columns, _), jac in legs]
         return np.array(found) / self._determinants if found else np.zeros(0)
 
-    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, force: float = 0.0) -> Array:
+    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, forces: Sequence[float] = ()) -> Array:
         """Generalized force (nv,) that this motion needs, under wrenches (6 a sole) in the soles' frames and
-        the contact's force [N] against the normal at the hand.
+        the contact's forces [N] against the normal at the hands.
         """
         model, data = self.model, self.data
         tau: Array = np.array(pin.rnea(model, data, q, v, a))
         if self.soles:
             self.relieve(tau, q, wrenches)
-        if force:
+        for hand, force in zip(self.hands, forces, strict=False):
             self._seen = None
-            jac = np.reshape(pin.computeFrameJacobian(model, data, q, self.hand, _AXES), (6, model.nv))
+            jac = np.reshape(pin.computeFrameJacobian(model, data, q, hand, _AXES), (6, model.nv))
             tau += jac[:3].T @ self.normal * force
         return tau
 
@@ -210,12 +211,12 @@ class RobotMotion:
             total += place.act(pin.Force(wrenches[6 * k : 6 * k + 6])).vector
         return total
 
-    def striking(self, y: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Place (3) [m], velocity (3) [m/s] and axes (3, 3) of the striker, which no held leg carries."""
+    def striking(self, y: Array, u: Array, k: int = 0) -> tuple[Array, Array, Array]:
+        """Place (3) [m], velocity (3) [m/s] and axes (3, 3) of striker k, which no held leg carries."""
         q, v, _ = self._upper(y, u)
         pin.forwardKinematics(self.model, self.data, q, v)
-        at = pin.updateFramePlacement(self.model, self.data, self.hand)
-        fast = pin.getFrameVelocity(self.model, self.data, self.hand, _AXES)
+        at = pin.updateFramePlacement(self.model, self.data, self.hands[k])
+        fast = pin.getFrameVelocity(self.model, self.data, self.hands[k], _AXES)
         return np.array(at.translation), np.array(fast.linear), np.array(at.rotation)
 
     def _upper(self, y: Array, u: Array) -> tuple[Array, Array, Array]:

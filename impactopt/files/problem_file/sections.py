@@ -30,6 +30,7 @@ from impactopt.files.problem_file.values import (
     Duration,
     Fractions,
     Freezes,
+    HandNames,
     NotNegative,
     Positive,
     Posture,
@@ -86,8 +87,8 @@ class StanceSection(Section):
     """The soles that are held, and the hands that hold on."""
 
     soles: str = Field(default="both", description='"both", or the name of the sole that is held')
-    hands: list[str] = Field(
-        default_factory=list,
+    hands: HandNames = Field(
+        default=[],
         description="strikers that hold on, each to where it is in the start posture; see [terms.grip]",
     )
 

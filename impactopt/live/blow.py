@@ -55,7 +55,8 @@ class LiveBlow:
 
     Raises
     ------
-    InputError : viser is missing; a problem with two strikers, or a hand that holds on; host or port cannot be had.
+    InputError : viser is missing; a problem with two strikers, or a hand that holds on; host or port cannot
+        be had.
     """
 
     def __init__(self, problem: ImpactProblem, *, host: str = LOCAL, port: int = 0) -> None:

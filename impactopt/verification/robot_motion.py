@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -176,7 +176,7 @@ class RobotMotion:
         found = [np.linalg.det(jac[:, columns]) for (_, _, columns, _), jac in legs]
         return np.array(found) / self._determinants if found else np.zeros(0)
 
-    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, forces: Sequence[float] = ()) -> Array:
+    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, forces: Iterable[float] = ()) -> Array:
         """Generalized force (nv,) that this motion needs, under wrenches (6 a sole) in the soles' frames and
         the contact's forces [N] against the normal at the hands.
         """

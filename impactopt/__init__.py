@@ -32,6 +32,7 @@ _EXPORTS = {
     "Robustness": "simulation.robustness",
     "SDC": "collision",
     "Scenario": "problem.scenario",
+    "SecondStriker": "problem.second",
     "Sole": "robots.robot",
     "Solution": "planning.solution",
     "PerturbationRanges": "simulation.robustness",

@@ -129,14 +129,14 @@ class Bodies:
         start: Array,
         *,
         normal: Array,
-        striking: int,
+        striking: tuple[int, ...],
         standing: tuple[int, ...],
         strict: bool,
     ) -> None:
         """start (nq,) : the posture in which what touches may touch for good.  normal (3,) : the blow's.
 
-        strict : whether a start in a body of the world is refused.  striking, standing : joints of the link
-        that strikes, and of the soles that are held.
+        strict : whether a start in a body of the world is refused.  striking, standing : joints of the links
+        that strike, and of the soles that are held.
         """
         self.robot, self.world, self.normal, self.striking = robot, world, normal, striking
         self.start, self.standing = start, standing
@@ -149,7 +149,7 @@ class Bodies:
             for j in self.links.joints:
                 rooted = j in standing or (not robot.floating and robot.model.parents[j] == 0)
                 on_ground = body.name == "ground" and rooted
-                mine = j == striking
+                mine = j in striking
                 if on_ground or (mine and body.strikable) or (body.core and not mine):
                     continue
                 if strict and w and self.exact(at, 0, (j, -1 - w)) < 0:

@@ -169,6 +169,8 @@ def _scene_arrays(problem: ImpactProblem) -> dict[str, Any]:
         "polygon": support_polygon(robot, c),
     }
     for leg in c.legs:
+        if leg.sole is None:
+            continue
         corners = np.column_stack([leg.sole.polygon, np.zeros(len(leg.sole.polygon))])
         world = corners @ leg.placement.rotation.T + leg.placement.translation
         out[f"sole_{leg.sole.name}"] = world[:, :2]

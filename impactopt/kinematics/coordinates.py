@@ -6,8 +6,11 @@ the sole's constraint
 
     J_leg qdot_leg = -V,      J_leg qddot_leg = -(A + Jdot qdot),
 
-with V and A the twist and the acceleration that the base alone would give the sole.  Both sides are written
-in the base's own frame, where J_leg depends on the leg's joints only.
+with V and A the twist and the acceleration that the coordinates alone would give the sole.  Both sides are
+written in the base's own frame, where J_leg depends on the joints between base and sole only.
+
+A hand that holds on is one more sole: the last six joints of its arm are its leg, and those between base and
+arm, such as the waist's, are coordinates as before.
 """
 
 from __future__ import annotations
@@ -22,21 +25,37 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
-from impactopt.robots.checks import check_legs
+from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.rigid_body import RigidBody
-from impactopt.robots.robot import Robot, Sole
+from impactopt.robots.robot import Robot, Sole, Striker
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Leg:
-    """One held sole with the joints between it and the base."""
+    """One held sole with the joints between it and the base; or a held hand, with the last six of its arm.
 
-    sole: Sole
-    joints: Index  # (6,) into the robot's joints
+    sole : None of a hand.  frame : that is held.  joints : (6,) into the robot's joints.  placement : pin.SE3
+    of the frame in the world.
+    """
+
+    name: str
+    sole: Sole | None
+    frame: str
+    joints: Index
     order: tuple[Index, Index]
-    placement: Any  # pin.SE3 of the sole in the world
+    placement: Any
+
+    @property
+    def end(self) -> str:
+        """What rows and variables call what is held."""
+        return f"{self.name} {'grip' if self.sole is None else 'sole'}"
+
+    @property
+    def limb(self) -> str:
+        """What rows call what holds it."""
+        return f"{self.name} {'arm' if self.sole is None else 'leg'}"
 
 
 class StanceCoordinates:
@@ -44,13 +63,19 @@ class StanceCoordinates:
 
     Attributes
     ----------
-    ny, nl : number of independent coordinates, and of dependent leg joints (6 a held sole).
+    ny, nl : number of independent coordinates, and of dependent leg joints (6 a held sole or hand).
+    soles, legs, hands : held soles; legs of soles and, after them, of hands; the legs of hands alone.
     independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
     labels : names of the independent coordinates.
+    start : (ny,) those of the posture.
     """
 
-    def __init__(self, robot: Robot, soles: tuple[Sole, ...], posture: Array) -> None:
-        """``posture`` (nq,): pin configuration with the soles in place; it fixes where the soles are held."""
+    def __init__(
+        self, robot: Robot, soles: tuple[Sole, ...], posture: Array, hands: tuple[Striker, ...] = ()
+    ) -> None:
+        """``posture`` (nq,): pin configuration with the soles in place; it fixes where soles and hands are
+        held.
+        """
         self.robot, self.soles = robot, soles
         self.model, self.data = robot.model, robot.model.createData()
         self.base = 6 if robot.floating else 0
@@ -60,13 +85,19 @@ class StanceCoordinates:
                 "floating=False)"
             )
         check_legs(self.model, [(sole.name, sole.frame) for sole in soles])
+        check_arms(robot, [sole.frame for sole in soles], [(hand.name, hand.model_frame) for hand in hands])
         pin.framesForwardKinematics(self.model, self.data, posture)
         self.legs: list[Leg] = []
-        for sole in soles:
-            joints = np.array(robot.limb(sole.frame), dtype=np.intp)
-            placement = self.data.oMf[self.model.getFrameId(sole.frame)].copy()
-            order = elimination_order(self._leg_samples(sole.frame, joints, posture))
-            self.legs.append(Leg(sole, joints, order, placement))
+        for name, sole, frame in (
+            *((sole.name, sole, sole.frame) for sole in soles),
+            *((hand.name, None, hand.model_frame) for hand in hands),
+        ):
+            chain = robot.limb(frame)
+            joints = np.array(chain[-LEG:], dtype=np.intp)
+            placement = self.data.oMf[self.model.getFrameId(frame)].copy()
+            order = elimination_order(self._leg_samples(frame, np.array(chain, dtype=np.intp), posture))
+            self.legs.append(Leg(name, sole, frame, joints, order, placement))
+        self.hands = [leg for leg in self.legs if leg.sole is None]
         held = {int(j) for leg in self.legs for j in leg.joints}
         self.dependent = np.array([j for leg in self.legs for j in leg.joints], dtype=np.intp)
         self.independent = np.array([j for j in range(robot.n) if j not in held], dtype=np.intp)
@@ -77,30 +108,35 @@ class StanceCoordinates:
         self.rb = RigidBody(self.model, base="rpy")
         self._build_symbolic_pieces()
         legs = ca.SX.sym("legs", self.nl)
-        start = self.split(posture)[1]
+        self.start, start = self.split(posture)
         self.start_determinants = np.array(
             ca.Function("det", [legs], [self.leg_determinants(legs)])(start) if self.legs else np.zeros(0)
         ).ravel()
 
-    def _leg_samples(self, frame: str, joints: Index, posture: Array) -> list[Array]:
+    def _leg_samples(self, frame: str, chain: Index, posture: Array) -> list[Array]:
+        """Jacobians (6, 6) of the last joints of a chain (k,), at postures near this one."""
         rng = np.random.default_rng(0)
         out = []
-        angles = self.robot.joint_positions(posture)[joints]
+        angles = self.robot.joint_positions(posture)[chain]
         for k in range(5):
             step = np.zeros(self.model.nv)
             if k:
-                near = angles + 0.15 * rng.standard_normal(6)
-                step[self.base + joints] = (
-                    np.clip(near, self.robot.lower[joints], self.robot.upper[joints]) - angles
-                )
+                near = angles + 0.15 * rng.standard_normal(len(chain))
+                step[self.base + chain] = np.clip(near, self.robot.lower[chain], self.robot.upper[chain])
+                step[self.base + chain] -= angles
             qk = pin.integrate(self.model, posture, step)
             if self.robot.floating:
                 qk[:7] = [0, 0, 0, 0, 0, 0, 1]
             jac = pin.computeFrameJacobian(
                 self.model, self.data, qk, self.model.getFrameId(frame), pin.LOCAL_WORLD_ALIGNED
             )
-            out.append(np.array(jac[:, self.base + joints]))
+            out.append(np.array(jac[:, self.base + chain[-LEG:]]))
         return out
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """What is held, by the model's frames: soles first, then hands."""
+        return tuple(leg.frame for leg in self.legs)
 
     # ------------------------------------------------------------------ symbolic
     def _build_symbolic_pieces(self) -> None:
@@ -114,10 +150,10 @@ class StanceCoordinates:
         # in the base's own frame: the base at the world's origin, unturned
         self._sole = []
         for leg in self.legs:
-            rotation, point = rb.frame(leg.sole.frame)
-            jac = rb.jacobian(leg.sole.frame)[:, [self.base + int(j) for j in leg.joints]]
-            twist = rb.frame_velocity(leg.sole.frame, rb.v)
-            acc = rb.frame_acceleration(leg.sole.frame, rb.v, rb.a)
+            rotation, point = rb.frame(leg.frame)
+            jac = rb.jacobian(leg.frame)[:, [self.base + int(j) for j in self._moves(leg)]]
+            twist = rb.frame_velocity(leg.frame, rb.v)
+            acc = rb.frame_acceleration(leg.frame, rb.v, rb.a)
             self._sole.append(
                 ca.Function("sole", [rb.q, rb.v, rb.a], [rotation, point, ca.densify(jac), twist, acc])
             )
@@ -135,11 +171,17 @@ class StanceCoordinates:
         """q of the "rpy" coordinates (nv,) from y (ny,) and the leg joints (nl,), SX."""
         return self._embed(y[: self.base], y[self.base :], legs)
 
-    def _sole_terms(self, k: int, legs: Any, v: Any, a: Any) -> Any:
-        """Rotation, point, leg Jacobian, twist and acceleration of sole k in the base's own frame."""
-        zero = ca.SX.zeros(len(self.independent))
-        q = self._embed(ca.SX.zeros(self.base), zero, legs)
-        return self._sole[k](q, v, a)
+    def _moves(self, leg: Leg) -> Index:
+        """The joints (6 or more) between base and leg's end: the leg's own last."""
+        return np.array(self.robot.limb(leg.frame), dtype=np.intp)
+
+    def _sole_terms(self, k: int, y: Any, legs: Any, v: Any, a: Any) -> Any:
+        """Rotation, point, Jacobian of the leg's own joints, twist and acceleration of sole k in the base's
+        own frame; and the Jacobian of the joints before them, which a hand has.
+        """
+        q = self._embed(ca.SX.zeros(self.base), y[self.base :], legs)
+        rotation, point, jac, twist, acc = self._sole[k](q, v, a)
+        return rotation, point, jac[:, -LEG:], twist, acc, jac[:, :-LEG]
 
     def velocity(self, y: Any, legs: Any, rates: Any) -> Any:
         """Pinocchio velocities v = N(y) ydot (nv, k) that keep the held soles at rest, SX.
@@ -157,14 +199,14 @@ class StanceCoordinates:
         ]
         leg_rates = []
         for s, leg in enumerate(self.legs):
-            _, _, jac, _, _ = self._sole_terms(s, legs, nothing, nothing)
-            twists = [self._sole_terms(s, legs, self._base_only(b), nothing)[3] for b in base]
+            jac = self._sole_terms(s, y, legs, nothing, nothing)[2]
+            twists = [
+                self._sole_terms(s, y, legs, self._embed(b, rates[6:, i], still), nothing)[3]
+                for i, b in enumerate(base)
+            ]
             leg_rates.append(solve_in_order(jac, -ca.horzcat(*twists), leg.order)[0])
         parts = ca.vertcat(*leg_rates)
         return ca.horzcat(*[self._embed(base[i], rates[6:, i], parts[:, i]) for i in range(k)])
-
-    def _base_only(self, base: Any) -> Any:
-        return self._embed(base, ca.SX.zeros(len(self.independent)), ca.SX.zeros(self.nl))
 
     def motion(self, y: Any, legs: Any, yd: Any, ydd: Any) -> tuple[Any, Any]:
         """Pinocchio v and a (nv,) that keep the held soles at rest, SX.
@@ -182,16 +224,17 @@ class StanceCoordinates:
         )[1]
         accs = []
         for s, leg in enumerate(self.legs):
-            _, _, jac, _, acc = self._sole_terms(s, legs, v, self._base_only(a_base))
+            _, _, jac, _, acc, _ = self._sole_terms(s, y, legs, v, self._embed(a_base, ydd[6:], still))
             accs.append(solve_in_order(jac, -acc, leg.order)[0])
         return v, self._embed(a_base, ydd[6:], ca.vertcat(*accs))
 
     def leg_determinants(self, legs: Any) -> Any:
         """Determinant, up to its sign, of each held leg's Jacobian (a leg), SX; zero at a straight knee."""
-        nothing = ca.SX.zeros(self.rb.nv)
+        # what is before a leg's own joints turns its Jacobian as a whole
+        nothing, anywhere = ca.SX.zeros(self.rb.nv), ca.SX(self.start)
         out = []
         for s, leg in enumerate(self.legs):
-            jac = self._sole_terms(s, legs, nothing, nothing)[2]
+            jac = self._sole_terms(s, anywhere, legs, nothing, nothing)[2]
             out.append(solve_in_order(jac, ca.SX(6, 0), leg.order)[1])
         return ca.vertcat(*out)
 
@@ -202,8 +245,8 @@ class StanceCoordinates:
         """
         still, nothing = ca.SX.zeros(self.nl), ca.SX.zeros(self.rb.nv)
         base = self._base_motion(self.configuration(y, still), self._embed(yd[:6], yd[6:], still), nothing)[0]
-        v = self._embed(base, ca.SX.zeros(len(self.independent)), rates)
-        return ca.vertcat(*[self._sole_terms(k, legs, v, nothing)[3] for k in range(len(self.legs))])
+        v = self._embed(base, yd[6:], rates)
+        return ca.vertcat(*[self._sole_terms(k, y, legs, v, nothing)[3] for k in range(len(self.legs))])
 
     def upper_motion(self, y: Any, yd: Any, ydd: Any) -> tuple[Any, Any, Any]:
         """q, v, a (SX) with the leg joints left out (zero): enough for frames that no stance leg carries."""
@@ -220,7 +263,7 @@ class StanceCoordinates:
         q = self.configuration(y, legs)
         out = []
         for leg in self.legs:
-            rotation, point = self.rb_frame(leg.sole.frame, q)
+            rotation, point = self.rb_frame(leg.frame, q)
             d = ca.mtimes(rotation, ca.DM(leg.placement.rotation.T))
             w = 0.5 * ca.vertcat(d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1])
             out += [point - ca.DM(leg.placement.translation), w]
@@ -231,7 +274,7 @@ class StanceCoordinates:
         f = ca.Function("frame", [self.rb.q], list(self.rb.frame(name)))
         return f(q)
 
-    def sole_wrench_map(self, legs: Any, wrenches: Any) -> Any:
+    def sole_wrench_map(self, y: Any, legs: Any, wrenches: Any) -> Any:
         """Generalized force (nv,) J_soles^T w of the soles' wrenches, SX.
 
         wrenches (6 a sole): force [N] and moment [N m] in each sole's own frame.
@@ -240,13 +283,18 @@ class StanceCoordinates:
         if not self.legs:
             return ca.SX.zeros(nv)
         zero_v, base, leg_tau = ca.SX.zeros(nv), ca.SX.zeros(6), []
-        for k in range(len(self.legs)):
-            rotation, point, jac, _, _ = self._sole_terms(k, legs, zero_v, zero_v)
+        others = [ca.SX(0.0)] * self.robot.n  # on the joints that are coordinates
+        for k, leg in enumerate(self.legs):
+            rotation, point, jac, _, _, before = self._sole_terms(k, y, legs, zero_v, zero_v)
             w = wrenches[6 * k : 6 * k + 6]
             f, n = ca.mtimes(rotation, w[:3]), ca.mtimes(rotation, w[3:])
             base = base + ca.vertcat(f, n + ca.cross(point, f))
             leg_tau.append(ca.mtimes(jac.T, ca.vertcat(f, n)))
-        return self._embed(base, ca.SX.zeros(len(self.independent)), ca.vertcat(*leg_tau))
+            tau = ca.mtimes(before.T, ca.vertcat(f, n))
+            for i, j in enumerate(self._moves(leg)[:-LEG]):
+                others[j] = others[j] + tau[i]
+        of_independent = ca.vertcat(ca.SX(0, 1), *[others[j] for j in self.independent])
+        return self._embed(base, of_independent, ca.vertcat(*leg_tau))
 
     # ------------------------------------------------------------------ numeric
     def split(self, q_pin: Array) -> tuple[Array, Array]:
@@ -273,7 +321,7 @@ class StanceCoordinates:
             pin.computeJointJacobians(model, data, q)
             worst = 0.0
             for k, leg in enumerate(self.legs):
-                fid = model.getFrameId(leg.sole.frame)
+                fid = model.getFrameId(leg.frame)
                 m = pin.updateFramePlacement(model, data, fid)
                 error = pin.log6(m.actInv(leg.placement)).vector
                 worst = max(worst, float(np.abs(error).max()))
@@ -297,7 +345,7 @@ class StanceCoordinates:
         model, data = self.model, self.data
         pin.computeJointJacobians(model, data, q)
         pin.updateFramePlacements(model, data)
-        ids = [model.getFrameId(leg.sole.frame) for leg in self.legs]
+        ids = [model.getFrameId(leg.frame) for leg in self.legs]
         jac = np.vstack(
             [np.zeros((0, model.nv)), *[pin.getFrameJacobian(model, data, i, pin.LOCAL) for i in ids]]
         )
@@ -319,7 +367,7 @@ class StanceCoordinates:
             pin.forwardKinematics(model, data, q, v, a)
             drift = np.concatenate(
                 [
-                    pin.getFrameAcceleration(model, data, model.getFrameId(leg.sole.frame), pin.LOCAL).vector
+                    pin.getFrameAcceleration(model, data, model.getFrameId(leg.frame), pin.LOCAL).vector
                     for leg in self.legs
                 ]
             )

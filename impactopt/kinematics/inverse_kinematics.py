@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ def inverse_kinematics(
     point: Array,
     guess: Array,
     *,
+    also: Sequence[tuple[str, Array]] = (),
     facing: tuple[Array, Array] | None = None,
     margin: float = 0.02,
     starts: int = 8,
@@ -28,6 +31,7 @@ def inverse_kinematics(
 ) -> Array:
     """A pin configuration (nq,) with the striking point at ``point`` (3,) [m], the soles in place.
 
+    also : other strikers, each with its place.
     Joints are inside their limits by ``margin`` [rad].  facing : an axis of the striker's frame, and the
     direction (world) that it is to have, as nearly as may be; unit vectors (3,).
 
@@ -40,7 +44,8 @@ def inverse_kinematics(
     """
     robot, model = coordinates.robot, coordinates.model
     data = model.createData()
-    fid = model.getFrameId(f"striker:{striker}")
+    aims = [(striker, point), *also]
+    hands = [(model.getFrameId(f"striker:{name}"), point) for name, point in aims]
     lower, upper = robot.lower + margin, robot.upper - margin
     # a continuous joint takes two numbers of q, and has no limits
     joints = list(model.joints)[-robot.n :]
@@ -63,20 +68,20 @@ def inverse_kinematics(
             pin.updateFramePlacements(model, data)
             errors, jacs = [], []
             for leg in coordinates.legs:
-                f = model.getFrameId(leg.sole.frame)
+                f = model.getFrameId(leg.frame)
                 errors.append(pin.log6(data.oMf[f].actInv(leg.placement)).vector)
                 jacs.append(pin.getFrameJacobian(model, data, f, pin.LOCAL))
-            gap = point - data.oMf[fid].translation
-            errors.append(gap)
-            hand = pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)
-            hand = np.reshape(hand, (6, model.nv))  # pin drops an axis where nv is 1
-            jacs.append(hand[:3])
+            for fid, point in reversed(hands):
+                errors.append(point - data.oMf[fid].translation)
+                hand = pin.getFrameJacobian(model, data, fid, pin.LOCAL_WORLD_ALIGNED)
+                hand = np.reshape(hand, (6, model.nv))  # pin drops an axis where nv is 1
+                jacs.append(hand[:3])
             off = float(np.abs(np.concatenate(errors)).max())
             best_gap = min(best_gap, off)
             turning = facing is not None and turn < TURNING
             if off < tolerance and not turning:
                 return q
-            damping = np.full(6 * len(coordinates.legs) + 3, 1e-8)
+            damping = np.full(6 * len(coordinates.legs) + 3 * len(hands), 1e-8)
             if facing is not None and turning:
                 axis = data.oMf[fid].rotation @ facing[0]
                 sides = across(axis)  # turning about the axis changes nothing
@@ -102,10 +107,13 @@ def inverse_kinematics(
                 free[base:] &= ~out
             q = pin.integrate(model, q, np.clip(step, -0.15, 0.15))
     pin.framesForwardKinematics(model, data, guess)
+    fid, point = hands[0]
     start = data.oMf[fid].translation
+    names = " and ".join(f"'{name}'" for name, _ in aims)
+    others = "".join(f" and {np.round(other, 4).tolist()} m" for _, other in hands[1:])
     raise InputError(
-        f"the point {np.round(point, 4).tolist()} m is out of reach of '{striker}' with the soles in place: "
-        f"the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
+        f"the point {np.round(point, 4).tolist()} m{others} is out of reach of {names} with the soles in "
+        f"place: the nearest posture found is off by {best_gap:.3g} m (the striking point starts at "
         f"{np.round(start, 3).tolist()} m); move the point nearer"
     ) from None
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_array
-from impactopt.robots.robot import Robot, Sole
+from impactopt.robots.robot import Robot, Sole, Striker
 
 __all__ = ["BothSoles", "FixedBase", "OneSole", "Stance", "usual_stance"]
 
@@ -34,9 +34,13 @@ class Stance(ABC):
         """Frames of the soles that are held."""
         return tuple(sole.frame for sole in self.soles(robot))
 
+    def held_hands(self, robot: Robot) -> tuple[Striker, ...]:
+        """The hands that are held; InputError for one that the robot has not."""
+        return ()
+
     def hand_frames(self, robot: Robot) -> tuple[str, ...]:
         """Frames of the hands that are held; InputError for one that the robot has not."""
-        return ()
+        return tuple(hand.model_frame for hand in self.held_hands(robot))
 
     def constraint_frames(self, robot: Robot) -> tuple[str, ...]:
         """Frames of the model that are held in all six directions: soles first, then hands."""
@@ -83,8 +87,8 @@ class _OnSoles(Stance):
                     f"virtual base: {name}: {value:g}; give a number > 0, or None for exactly held soles"
                 )
 
-    def hand_frames(self, robot: Robot) -> tuple[str, ...]:
-        return tuple(robot.striker(name).model_frame for name in self.hands)
+    def held_hands(self, robot: Robot) -> tuple[Striker, ...]:
+        return tuple(robot.striker(name) for name in self.hands)
 
     @property
     def compliance(self) -> NDArray[np.float64]:

@@ -12,12 +12,13 @@ Array = NDArray[np.float64]
 
 
 def static_wrenches(c: StanceCoordinates, y: Array, legs: Array) -> Array:
-    """Sole wrenches (6 a sole) of least norm that carry the robot at rest."""
+    """Sole wrenches (6 a sole) of least norm that carry the robot at rest. Hands bear nothing."""
     if not c.legs:
         return np.zeros(0)
     model, data = c.model, c.model.createData()
     q = c.join(y, legs)
     tau = np.array(pin.computeGeneralizedGravity(model, data, q))
-    jac = c.sole_jacobians(q)[0][:, :6]
-    lever = np.array([1, 1, 1, 10, 10, 10] * len(c.legs))  # moments cost more: keep the CoP in the sole
-    return np.asarray(np.linalg.lstsq(jac.T / lever, tau[:6], rcond=None)[0] / lever)
+    jac = c.sole_jacobians(q)[0][: 6 * len(c.soles), :6]
+    lever = np.array([1, 1, 1, 10, 10, 10] * len(c.soles))  # moments cost more: keep the CoP in the sole
+    found = np.linalg.lstsq(jac.T / lever, tau[:6], rcond=None)[0] / lever
+    return np.concatenate([found, np.zeros(6 * len(c.hands))])

@@ -22,6 +22,7 @@ def support_polygon(robot: Any, coordinates: Any) -> Array:
     corners = [
         (leg.placement.rotation @ np.array([x, y, 0.0]) + leg.placement.translation)[:2]
         for leg in coordinates.legs
+        if leg.sole is not None
         for x, y in leg.sole.polygon
     ]
     if not corners:

@@ -23,7 +23,7 @@ from impactopt.kinematics.splines import quintic
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.wrench_cone import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit, VelocityLimit
+from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.plan import Trajectory, complete_reference
 from impactopt.transcription.start import strike_rates
@@ -102,7 +102,7 @@ def _phases(
     c = problem.coordinates
     y0, _ = c.split(problem.start_posture)
     hit, legs = c.split(problem.contact_posture)
-    rates = strike_rates(c, problem.striker, hit, legs, speed * problem.normal, base=0.02)  # by the arm
+    rates = strike_rates(c, problem.strikers, hit, legs, speed * problem.normal, base=0.02)  # by the arm
     zero = np.zeros(c.ny)
     back = float(np.mean(problem.follow.duration))
     return [(there, (y0, zero, hit, rates)), (back, (hit, rates, y0, zero))]
@@ -159,6 +159,14 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     n = 6 * len(c.legs)
     rows, bounds = [], []
     for k, leg in enumerate(c.legs):
+        if leg.sole is None:
+            grip = problem.extra(Grip)
+            assert grip is not None  # the problem has it
+            block = np.zeros((12, n))
+            block[:6, 6 * k : 6 * k + 6], block[6:, 6 * k : 6 * k + 6] = np.eye(6), -np.eye(6)
+            rows.append(block)
+            bounds.append(np.tile(np.repeat([grip.force, grip.moment], 3), 2))
+            continue
         facets = contact_wrench_cone(leg.sole.polygon, cone.friction, margin=cone.margin)
         block = np.zeros((len(facets) + 1, n))
         block[:-1, 6 * k : 6 * k + 6] = -facets

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -10,7 +10,9 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.loads import DriveLoads
 from impactopt.transcription.mesh_refinement import GEAR
 
-__all__ = ["gears_beyond"]
+__all__ = ["gear_caution", "gears_beyond"]
+
+REPLAYED = 0.1  # beyond what gears may bear: replays of a plan that keeps to it stay within this
 
 
 def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: float = GEAR) -> str:
@@ -28,3 +30,13 @@ def gears_beyond(problem: ImpactProblem, found: Iterable[DriveLoads], more: floa
             of_limit = f"{loads.gear[k]:.3g} times its torque limit, which may be {most[k]:.3g}"
             worst, said = share[k], f"gear of {loads.joints[k]}: {of_limit}"
     return said
+
+
+def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> dict[str, str]:
+    """What is to be said of gears that bear too much: of a plan that lets them, and of replays of others."""
+    loads = [one for one in found if one is not None]
+    if problem.gear_load.active:
+        text = gears_beyond(problem, loads, more=REPLAYED)
+        return {"gear_caution": f"{text}, more than it may"} if text else {}
+    beyond = [text for one in loads if (text := one.beyond_peak())]
+    return {"gear_caution": beyond[0]} if beyond else {}

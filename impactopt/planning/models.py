@@ -140,7 +140,7 @@ def _skips_first(problem: ImpactProblem, say: Callable[[str], None]) -> bool:
     speed = _SHARE * most if np.isfinite(most) else _GUESSED
     try:
         legs = c.solve_legs(y, legs)
-        rates = strike_rates(c, problem.striker, y, legs, speed * problem.normal)
+        rates = strike_rates(c, problem.strikers, y, legs, speed * problem.normal)
         q, v, _ = c.complete_motion(y, rates, np.zeros(c.ny), legs)
         torque = holding_torque(problem.robot, q, v, stance=problem.stance)
     except InputError:

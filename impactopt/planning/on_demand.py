@@ -102,6 +102,8 @@ def _broken(
 ) -> dict[str, str]:
     """What is broken of terms on demand that have no rows, by name, in words."""
     problem, has, out = t.problem, rows_on_demand(t.problem), dict[str, str]()
+    if problem.second is not None:  # their rows are about one striker
+        return out
     planned: Plan | PlannedStrike = t.decode(result.x)
     for name, kind in _KINDS.items():
         term = problem.term(kind)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
-from impactopt.planning.gears import gears_beyond
+from impactopt.planning.gears import gear_caution
 from impactopt.planning.multistart import Attempt
 from impactopt.planning.on_demand import rows_on_demand
 from impactopt.planning.sliding import slide, slide_caution
@@ -32,7 +32,6 @@ from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.rattle import HeldBlow, Rattle
 
 Array = NDArray[np.float64]
-_REPLAYED = 0.1  # beyond what gears may bear: replays of a plan that keeps to it stay within this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -386,16 +385,6 @@ def blow_numbers(hit: Plan | PlannedStrike, collision: PlannedCollision) -> dict
         "contact_ms": 1e3 * duration,
         "hand_speed_m_s": hit.hand_speed,
     }
-
-
-def gear_caution(problem: ImpactProblem, found: Sequence[DriveLoads | None]) -> dict[str, str]:
-    """What is to be said of gears that bear too much: of a plan that lets them, and of replays of others."""
-    loads = [one for one in found if one is not None]
-    if problem.gear_load.active:
-        text = gears_beyond(problem, loads, more=_REPLAYED)
-        return {"gear_caution": f"{text}, more than it may"} if text else {}
-    beyond = [text for one in loads if (text := one.beyond_peak())]
-    return {"gear_caution": beyond[0]} if beyond else {}
 
 
 def versions() -> dict[str, str]:

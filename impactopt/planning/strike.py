@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.gears import gear_caution
 from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
@@ -27,7 +28,7 @@ from impactopt.planning.multistart import (
     with_effort_of,
 )
 from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
-from impactopt.planning.solution import Solved, blow_numbers, gear_caution, versions
+from impactopt.planning.solution import Solved, blow_numbers, versions
 from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
@@ -131,6 +132,8 @@ def optimize_strike(
             f"unknown method {method!r}{did_you_mean(method, METHODS)}: give {' or '.join(METHODS)}"
         )
     if method == "shooting":
+        if problem.coordinates.hands or problem.second is not None:
+            raise InputError('by shooting one hand strikes, and none holds on: take method="collocation"')
         options = _of_shooting(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=start is not None)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
-from impactopt.errors import MOST, InputError, check_number, check_whole, did_you_mean
+from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
 from impactopt.kinematics.support import margin, support_polygon
-from impactopt.problem.terms import Term
+from impactopt.problem.terms import Grip, Term
+from impactopt.robots.checks import LEG, check_arms
 from impactopt.robots.robot import Robot
 
 __all__ = [
@@ -25,14 +26,19 @@ __all__ = [
     "check_apart",
     "check_at_rest",
     "check_collision",
+    "check_elements",
+    "check_hands",
     "check_moves",
     "check_names",
+    "check_stance",
 ]
 
 # models of the collision, cheapest first; those of no duration; "auto": the cheapest that is good enough
 INSTANT = ("rigid", "virtual-mass")
 COLLISIONS = (*INSTANT, "sdc-paper", "sdc", "full", "auto")
 MOST_FREEZES = 64
+LONGEST_CONTACT = 100.0  # [s]
+MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
 MANY = 100  # scenarios or obstacles
 STUCK = 1e-12  # mobility along the normal over the largest in any direction, that is none
 
@@ -65,11 +71,51 @@ def check_at_rest(
         )
 
 
+def check_stance(problem: Any) -> None:
+    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own."""
+    robot, stance = problem.robot, problem.stance
+    if np.any(stance.compliance > 0):
+        raise InputError(
+            f"a plan holds its soles exactly: give {type(stance).__name__} without the virtual base "
+            "(base_mass, base_inertia), which is for collision models"
+        )
+    hands = [(hand.name, hand.model_frame) for hand in stance.held_hands(robot)]
+    check_arms(robot, stance.sole_frames(robot), hands)
+
+
+def check_hands(problem: Any) -> None:
+    """InputError for a hand that holds on where it cannot, or by a grip of no known strength."""
+    p, robot, grip = problem, problem.robot, problem.extra(Grip)
+    hands = p.stance.held_hands(robot)
+    if not hands:
+        if grip is not None:
+            raise InputError(
+                "Grip is about hands that hold on, and none does: name them in the stance (hands=), or leave "
+                "it out"
+            )
+        return
+    if grip is None:
+        raise InputError(
+            f"the hand {hands[0].name!r} holds on: say what its grip bears, by the term Grip(force=, moment=)"
+        )
+    if p.collision != "full":
+        raise InputError(f'a plan whose hand holds on needs collision="full", not {p.collision!r}')
+    for hand in hands:
+        arm = set(robot.limb(hand.model_frame)[-LEG:])
+        for name in p.strikers:
+            if not (both := arm & set(robot.limb(robot.striker(name).model_frame))):
+                continue
+            raise InputError(
+                f"the hand {hand.name!r} holds on, so it cannot carry the striker {name!r} (both move "
+                f"by {', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
+            )
+
+
 def check_moves(problem: Any) -> None:
     """InputError if no joint moves the striking point along the normal where it meets the target."""
     c, n = problem.coordinates, problem.normal
     striker = problem.robot.striker(problem.striker).model_frame
-    mobility = Held.at(c.model, problem.contact_posture, [s.frame for s in c.soles], striker).inverse_mass()
+    mobility = Held.at(c.model, problem.contact_posture, c.frames, striker).inverse_mass()
     if n @ mobility @ n <= STUCK * np.linalg.norm(mobility):
         raise InputError(
             f"no joint of {problem.robot.name!r} moves {problem.striker!r} along the normal "
@@ -123,6 +169,32 @@ def check_collision(problem: Any) -> None:
                 f"restitution, as KelvinVoigt or HuntCrossley, not {type(law).__name__}: hammer and nail "
                 "approach and part several times in a blow"
             )
+
+
+def check_elements(problem: Any) -> None:
+    """InputError for elements and durations of the contact that are none."""
+    given: Any = problem.collision_elements
+    given = given.tolist() if isinstance(given, np.ndarray) else given
+    if not isinstance(given, (list, tuple)) or len(given) != 2:
+        raise InputError(
+            "collision_elements are those of compression and those of restitution, two tuples, not "
+            f"{shortened(str(given))}"
+        )
+    elements = tuple(tuple(check_array("collision_elements", x, (None,)).tolist()) for x in given)
+    object.__setattr__(problem, "collision_elements", elements)
+    stages = check_whole("collision_stages", problem.collision_stages, least=2, most=3)
+    object.__setattr__(problem, "collision_stages", stages)
+    for lengths in elements:
+        if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
+            raise InputError(
+                f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
+                f"{shortened(str(lengths))}"
+            )
+    lo, hi = check_array("contact_duration [s]", problem.contact_duration, (2,), most=LONGEST_CONTACT)
+    if not (0 <= lo <= hi and hi > 0):
+        raise InputError(
+            f"contact_duration must be (shortest, longest) in seconds, not {problem.contact_duration}"
+        )
 
 
 def check_freezes(problem: Any) -> None:

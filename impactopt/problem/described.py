@@ -30,13 +30,18 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
         frozen = f", {p.freezes} freezes" if p.freezes else ""
         more = {"rigid": f", restitution {p.coefficient_of_restitution:g}", "sdc": frozen}
         out["collision"] = p.collision + more.get(p.collision, "")
+    if p.second is not None:
+        out["second"] = {"striker": p.second.striker, "point_m": p.second.point.tolist()}
+    if hands := p.stance.held_hands(p.robot):
+        out["holds_on_with"] = [hand.name for hand in hands]
     if p.robot.source and p.robot.source.repairs:
         out["inertias"] = [f"repaired: {text}" for text in p.robot.source.repairs]
     out |= {"scenarios": [str(s) for s in p.scenarios]} if p.scenarios else {}
     if p.objectives != DEFAULT_OBJECTIVES:
         out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in p.objectives]
-    if off := [
-        term.name for term in (p.self_collision, p.keep_out, p.gear_load, p.term(Slide)) if not term.active
-    ]:
+    of_one = (p.gear_load, p.term(Slide))  # about a single striker
+    off = [term.name for term in (p.self_collision, p.keep_out, *of_one) if not term.active]
+    off += [term.name for term in of_one if term.active and p.second is not None]
+    if off:
         out["off"] = off
     return out

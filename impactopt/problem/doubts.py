@@ -74,7 +74,7 @@ def _out_of_balance(problem: ImpactProblem) -> str:
 
 def _nearest(problem: ImpactProblem, polygon: Array) -> Reach:
     c, robot = problem.coordinates, problem.robot
-    held = [(leg.sole.frame, leg.placement) for leg in c.legs]
+    held = [(leg.frame, leg.placement) for leg in c.legs]
     rng = np.random.default_rng(0)
     guesses = [problem.contact_posture, problem.start_posture]
     for _ in range(DRAWN):

@@ -26,9 +26,13 @@ def problem_hash(problem: Any) -> str:
     from, and whether a default was given or left out make no difference. Numbers count to the last digit.
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
+    second = shape.pop("second")
+    if second is not None:
+        other = problem.robot.striker(second.striker)
+        shape["second"] = (other.frame, other.point, second.point)
     own = {type(term): term for term in (*DEFAULT_TERMS, *ON_DEMAND_TERMS, *problem.terms)}
     shape |= {
-        "robot": _robot(problem.robot, problem.striker) | _drives(problem),
+        "robot": _robot(problem.robot, problem.striker) | _drives(problem) | _hands(problem),
         "law": _contact(problem.law),
         "target": _contact(problem.target),
         "start": problem.start_posture,
@@ -55,6 +59,12 @@ def _drives(problem: Any) -> dict[str, Any]:
     if problem.of_drives:
         return {"actuators": problem.robot.actuators}
     return {"gear_limit": problem.robot.gear_limit} if problem.gear_load.active else {}
+
+
+def _hands(problem: Any) -> dict[str, Any]:
+    """The hands that hold on, where one does."""
+    held = problem.stance.held_hands(problem.robot)
+    return {"hands": [(hand.frame, hand.point) for hand in held]} if held else {}
 
 
 def _contact(thing: Any) -> tuple[Any, ...]:

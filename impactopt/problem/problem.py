@@ -24,8 +24,6 @@ from impactopt.errors import (
     check_array,
     check_name,
     check_number,
-    check_whole,
-    shortened,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
@@ -36,14 +34,18 @@ from impactopt.problem.checks import (
     check_apart,
     check_at_rest,
     check_collision,
+    check_elements,
+    check_hands,
     check_moves,
     check_names,
+    check_stance,
 )
 from impactopt.problem.described import described
 from impactopt.problem.hashing import problem_hash
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.second import SecondStriker, check_second
 from impactopt.problem.terms import (
     DEFAULT_TERMS,
     ON_DEMAND_TERMS,
@@ -64,9 +66,6 @@ __all__ = ["COLLISIONS", "ImpactProblem", "Phase"]
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)
 
-LONGEST_CONTACT = 100.0  # [s]
-MOST_ELEMENTS = 100  # of compression or restitution: two are within a few per mille
-
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ImpactProblem:
@@ -78,9 +77,10 @@ class ImpactProblem:
     point (3,) [m] : where the striking point meets the target, in the world frame. The ground is z = 0. The
         soles of the start posture are centred on the origin.
     normal (3,) : unit vector in the world frame, along which the target is pushed.
+    second : another striker that hits the same target at the same time, at a point of its own.
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
         once and stands again before the striker leaves it.
-    stance : which soles are held.
+    stance : which soles are held, and which hands hold on: to where they are in the start posture.
     start : the posture that the motion starts from at rest: a name of ``robot.postures`` or a pin
         configuration (nq,).
     swing, follow : wind-up and strike; follow-through to rest.
@@ -121,6 +121,7 @@ class ImpactProblem:
     normal: Array
     law: ContactLaw
     target: Target
+    second: SecondStriker | None = None
     stance: Stance = field(default_factory=BothSoles)
     start: str | Array = "half_sitting"
     swing: Phase = field(default_factory=lambda: Phase(duration=(0.8, 0.8)))
@@ -152,8 +153,8 @@ class ImpactProblem:
         found.attempt(lambda: check_name("the problem", self.name, empty=True))
         hits = found.attempt(lambda: self.robot.striker(self.striker))
         aimed = found.attempt(self._check_aim)
-        stands = found.attempt(self._check_stance) and found.attempt(self._check_start)
-        for check in (self._check_elements, self._check_prices, partial(check_collision, self)):
+        stands = found.attempt(partial(check_stance, self)) and found.attempt(self._check_start)
+        for check in (partial(check_elements, self), self._check_prices, partial(check_collision, self)):
             found.attempt(check)
         if found.attempt(self._check_scenarios):
             for scenario in self.scenarios:
@@ -164,7 +165,10 @@ class ImpactProblem:
             for term in self.terms:
                 found.attempt(partial(check_names, self.robot, term))
         found.attempt(self._check_objectives)
-        if hits and aimed and stands and termed and found.attempt(lambda: self.contact_posture):
+        sound = hits and stands and termed and found.attempt(partial(check_second, self))
+        if sound:
+            found.attempt(partial(check_hands, self))
+        if sound and aimed and found.attempt(lambda: self.contact_posture):
             found.attempt(partial(check_moves, self))
         found.raise_if_any("the problem")
 
@@ -176,30 +180,6 @@ class ImpactProblem:
             unit = f": did you mean {np.round(normal / length, 6).tolist()}?" if length > 0 else ""
             raise InputError(f"normal must be a unit vector, its length is {length:.6g}{unit}")
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
-
-    def _check_elements(self) -> None:
-        given: Any = self.collision_elements
-        given = given.tolist() if isinstance(given, np.ndarray) else given
-        if not isinstance(given, (list, tuple)) or len(given) != 2:
-            raise InputError(
-                "collision_elements are those of compression and those of restitution, two tuples, not "
-                f"{shortened(str(given))}"
-            )
-        elements = tuple(tuple(check_array("collision_elements", x, (None,)).tolist()) for x in given)
-        object.__setattr__(self, "collision_elements", elements)
-        stages = check_whole("collision_stages", self.collision_stages, least=2, most=3)
-        object.__setattr__(self, "collision_stages", stages)
-        for lengths in elements:
-            if not 0 < len(lengths) <= MOST_ELEMENTS or min(lengths) <= 0 or abs(sum(lengths) - 1) > 1e-9:
-                raise InputError(
-                    f"collision_elements must be 1 to {MOST_ELEMENTS} positive fractions that sum to 1, not "
-                    f"{shortened(str(lengths))}"
-                )
-        lo, hi = check_array("contact_duration [s]", self.contact_duration, (2,), most=LONGEST_CONTACT)
-        if not (0 <= lo <= hi and hi > 0):
-            raise InputError(
-                f"contact_duration must be (shortest, longest) in seconds, not {self.contact_duration}"
-            )
 
     def _check_prices(self) -> None:
         for name in ("smoothness", "wrench_price", "return_price"):
@@ -228,18 +208,6 @@ class ImpactProblem:
             raise InputError(f"obstacles must be a tuple of Obstacle, not {self.obstacles!r}")
         object.__setattr__(self, "obstacles", tuple(self.obstacles))
         check_apart("obstacle", [o.name for o in self.obstacles])
-
-    def _check_stance(self) -> None:
-        if np.any(self.stance.compliance > 0):
-            raise InputError(
-                f"a plan holds its soles exactly: give {type(self.stance).__name__} without the virtual base "
-                "(base_mass, base_inertia), which is for collision models"
-            )
-        if self.stance.hand_frames(self.robot):
-            raise InputError(
-                f"a plan stands on soles only: give {type(self.stance).__name__} without hands, which are "
-                "for collision models"
-            )
 
     def _check_terms(self) -> None:
         listed = isinstance(self.terms, (list, tuple))
@@ -317,8 +285,9 @@ class ImpactProblem:
 
     @cached_property
     def coordinates(self) -> StanceCoordinates:
-        """Independent coordinates of the stance at the start posture."""
-        return StanceCoordinates(self.robot, self.stance.soles(self.robot), self.start_posture)
+        """Independent coordinates of the stance at the start posture, in which hands hold on, too."""
+        stance, robot = self.stance, self.robot
+        return StanceCoordinates(robot, stance.soles(robot), self.start_posture, stance.held_hands(robot))
 
     @cached_property
     def contact_posture(self) -> Array:
@@ -329,11 +298,12 @@ class ImpactProblem:
         Raises InputError if none is found: the point is out of reach.
         """
         given = self.coordinates, self.striker, self.point, self.start_posture
+        also = [] if self.second is None else [(self.second.striker, self.second.point)]
         if (hand := self.extra(HandOrientation)) is not None:
             direction = self.normal if hand.direction is None else np.array(hand.direction)
             with suppress(InputError):
-                return inverse_kinematics(*given, facing=(np.array(hand.axis), direction))
-        return inverse_kinematics(*given)
+                return inverse_kinematics(*given, also=also, facing=(np.array(hand.axis), direction))
+        return inverse_kinematics(*given, also=also)
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
@@ -360,12 +330,28 @@ class ImpactProblem:
         """Whether any two bodies are not to touch."""
         return self.self_collision.enabled or self.keep_out.enabled
 
+    @property
+    def middle(self) -> Array:
+        """(3,) [m] of the target's face: the point, or what is between the two."""
+        return self.point if self.second is None else (self.point + self.second.point) / 2
+
+    @property
+    def strikers(self) -> tuple[str, ...]:
+        """Names of all that hit."""
+        return tuple(striker for striker, _ in self.contacts)
+
+    @property
+    def contacts(self) -> tuple[tuple[str, Array], ...]:
+        """Strikers, each with the point [m] that it meets."""
+        mine = (self.striker, self.point)
+        return (mine,) if self.second is None else (mine, (self.second.striker, self.second.point))
+
     @cached_property
     def world(self) -> tuple[WorldBody, ...]:
         """The bodies that are not the robot's: the ground, the target and what holds it, the obstacles."""
         return (
             ground(),
-            *target_bodies(self.body, self.target, self.point, self.normal),
+            *target_bodies(self.body, self.target, self.middle, self.normal),
             *obstacle_bodies(self.obstacles),
         )
 
@@ -378,16 +364,17 @@ class ImpactProblem:
         InputError : the start posture is in the target, in what holds it, or in an obstacle.
         """
         robot, model = self.robot, self.robot.model
-        frames = [robot.striker(self.striker).model_frame, *(s.frame for s in self.stance.soles(robot))]
-        strikes, *stands = (int(model.frames[model.getFrameId(name)].parentJoint) for name in frames)
+        hits = [robot.striker(name).model_frame for name in self.strikers]
+        frames = [*hits, *(s.frame for s in self.stance.soles(robot))]
+        joints = [int(model.frames[model.getFrameId(name)].parentJoint) for name in frames]
         return Bodies(
             self.robot,
             self.world,
             self.start_posture,
             normal=self.normal,
-            striking=strikes,
+            striking=tuple(joints[: len(hits)]),
             strict=self.keep_out.enabled,
-            standing=tuple(stands),
+            standing=tuple(joints[len(hits) :]),
         )
 
     def describe(self) -> dict[str, Any]:

@@ -168,6 +168,32 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
     found.raise_if_any("the stance")
 
 
+def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]]) -> None:
+    """InputError with all hands, (name, frame) each, that hold on with no arm of their own: its last six
+    joints, which move neither a held sole, by its frame, nor another hand.
+    """
+    found = Mistakes()
+    chains = {frame: robot.limb(frame) for frame in (*soles, *(frame for _, frame in hands))}
+    for name, frame in hands:
+        arm = chains[frame][-LEG:]
+        told = ", ".join(robot.joint_names[j] for j in arm)
+        others = {j for other, chain in chains.items() if other != frame for j in chain}
+        shared = ", ".join(robot.joint_names[j] for j in arm if j in others)
+        if len(arm) < LEG:
+            found.found.append(
+                f"hand {name!r} cannot hold on in all six directions: between the base and it there are "
+                f"{len(arm)} joints{': ' if told else ''}{told}; give a hand with {LEG} or more"
+            )
+        elif shared:
+            found.found.append(
+                f"hand {name!r} cannot hold on: of the last {LEG} joints that lead to it, {shared} move "
+                "something else that is held; give a hand on an arm of its own"
+            )
+        elif np.any(robot.passive[list(arm)]):
+            found.found.append(f"hand {name!r} cannot hold on by a soft grip: give the hand, not its tool")
+    found.raise_if_any("the stance")
+
+
 def check_configuration(model: pin.Model, q: ArrayLike, name: str) -> Array:
     """`q` as a float64 copy, known to be a configuration of the model."""
     q = check_array(name, q, (model.nq,))

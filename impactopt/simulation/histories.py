@@ -45,15 +45,16 @@ def simulation_of(
     robot: Robot, scene: Scene, rows: list[tuple[Any, ...]], touches: Touches, **rest: Any
 ) -> Simulation:
     """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
-    wrench of each sole, slip and lift of each, torque through the gears since the row before; ``rest``: the
-    other fields.
+    wrench of each sole and each hand that holds on, slip and lift of each sole, torque through the gears
+    since the row before; ``rest``: the other fields.
     """
     if not rows:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*rows, strict=True)]
     time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, slip, lift, gear = columns
     contact_start, contact_end = touches.blow()
-    joints = v[:, -robot.n :]
+    joints, soles = v[:, -robot.n :], len(scene.soles)
+    sole_ground, grips = sole_ground[:, :soles], sole_ground[:, soles:]
     return Simulation(
         time=time,
         q=q,
@@ -68,6 +69,7 @@ def simulation_of(
         cop_margin=cop_margin(robot, scene, q, sole_ground),
         slip=slip.reshape(len(time), -1),
         lift=lift.reshape(len(time), -1),
+        grip_force=np.linalg.norm(grips[:, :, :3], axis=2),
         gear=gear,
         loads=DriveLoads.of(
             robot,

@@ -1,4 +1,4 @@
-"""Replay in MuJoCo with nothing held: the robot is free on its soles.
+"""Replay in MuJoCo with nothing held, but by its own hands: the robot is free on its soles.
 
 Unilateral contact with friction at the soles' corners, the servo with its limits, the target moved by the
 contact law's force. Shares no code with the planner: it reads a reference (times, positions, velocities,
@@ -22,7 +22,8 @@ from impactopt.simulation.gears import GearWatch
 from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
 from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.mujoco_robot import MujocoRobot
-from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file
+from impactopt.simulation.mujoco_welds import Welds
+from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log_file, site_name
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
@@ -55,16 +56,18 @@ class _Replay(MujocoRobot):
             )
         solids = self.scene.solids
         near = solids.near(robot.model, reference)
-        super().__init__(robot, build_world(robot, self.scene, perturbation, solver, near), "striker")
+        world = build_world(robot, self.scene, perturbation, solver, near)
+        super().__init__(robot, world, *(site_name(k + 1) for k in range(len(scene.strikers))))
+        self.grips = Welds(self.world, scene.hands)
         self.besides = Besides(self.world, solids)
         self.follow(reference)
         self.struck = Struck(self.scene)
         # the target's state, and how far it has gone [m]
         self.target, self.travel = self.struck.untouched, self.struck.travel_at_start(reference)
-        # its depth at the end of a step in contact; of the step before, hand speed and force
-        self.kept: float | None = None
-        self.before: tuple[float, float] | None = None
-        # how fast the robot accelerates (nv,) by a unit of the contact's force, where it may be one
+        # strikers' depths in it at the end of a step in contact; of the step before, their speeds and forces
+        self.kept: Array | None = None
+        self.before: tuple[Array, Array] | None = None
+        # how fast the robot accelerates (h, nv) by a unit of each contact's force, where there may be one
         self.yields: Array | None = None
         self.held = {name: k for k, name in enumerate(scene.soles)}
         self.geom_sole = np.full(self.world.ngeom, -1)
@@ -103,41 +106,43 @@ class _Replay(MujocoRobot):
 
     def start(self, q: Array) -> None:
         self.put(q)
+        self.mujoco.mj_kinematics(self.world, self.data)
+        self.grips.put(self.data)
         self.mujoco.mj_forward(self.world, self.data)
         self.start_corners = self.corner_places()
 
     # ------------------------------------------------------------------ what a step needs
-    def hand_speed(self) -> float:
-        """Speed of the striking point along the normal [m/s]."""
-        return self.speed_along(self.scene.normal)
+    def hand_speeds(self) -> Array:
+        """Speeds (h,) of the striking points along the normal [m/s]."""
+        return self.speeds_along(self.scene.normal)
 
-    def push(self, speed: float, step: float) -> Push:
+    def push(self, speeds: Array, step: float) -> Push:
         """The contact in the step that begins now; moves the target.
 
-        The hand gains speed as in the step before, where its soles and servos had the same to say.
+        Hands gain speed as in the step before, where soles and servos had the same to say.
         """
-        struck, d = self.struck, self.data
-        place = d.site_xpos[self.site]
+        struck, d, none = self.struck, self.data, 0.0 * speeds
+        places = self.places()
         if self.kept is not None:
-            # the depth is the contact's: it is followed more exactly there than the arm is
-            along = struck.depth(place, 0.0)
-            self.travel = along - self.kept if np.isfinite(along) else self.travel
-        depth = -np.inf if self.perturbation.missing else struck.depth(place, self.travel)
+            # depths are the contact's: they are followed more exactly there than the arms are
+            gone = struck.depths(places, 0.0) - self.kept
+            known = gone[np.isfinite(gone)]
+            self.travel = float(known.mean()) if known.size else self.travel
+        depths = none - np.inf if self.perturbation.missing else struck.depths(places, self.travel)
         self.kept, self.yields = None, None
-        if struck.near(depth, speed, self.target, step):
-            answer = np.zeros((1, self.world.nv))
-            self.mujoco.mj_solveM(self.world, d, answer, self.along[None])
-            self.yields = answer[0]
-            yields = float(self.along @ answer[0])
-            gain = 0.0 if self.before is None else (speed - self.before[0]) / step
-            gain += 0.0 if self.before is None else self.before[1] * yields
-            push = struck.pushed(depth, speed, gain, yields, self.target, self.travel, step)
-            self.kept = push.depth
+        if struck.near(depths, speeds, self.target, step):
+            self.yields = np.zeros_like(self.along)
+            self.mujoco.mj_solveM(self.world, d, self.yields, self.along)
+            yields = self.along @ self.yields.T
+            gains = none if self.before is None else (speeds - self.before[0]) / step
+            gains = gains + (none if self.before is None else yields @ self.before[1])
+            push = struck.pushed(depths, speeds, gains, yields, self.target, self.travel, step)
+            self.kept = push.depths
         else:
             state = struck.moved(self.target, 0.0, step)
             travel = self.travel + step * struck.speed(state)
-            push = Push(force=0.0, half=0.0, peak=0.0, state=state, travel=travel, depth=depth)
-        self.before = (speed, push.force)
+            push = Push(forces=none, halves=none, peaks=none, state=state, travel=travel, depths=depths)
+        self.before = (speeds, push.forces)
         self.target, self.travel = push.state, push.travel
         return push
 
@@ -155,12 +160,12 @@ class _Replay(MujocoRobot):
         self.besides.place(self.data, self.travel * self.scene.normal + broken * AWAY)
 
     # ------------------------------------------------------------------ what a record needs
-    def look_at(self, gears: GearWatch, torque: Array, force: float, peak: float) -> None:
-        """After a step with torque (n,) [N m] of the servos, under a mean force [N] and its peak."""
+    def look_at(self, gears: GearWatch, torque: Array, push: Push) -> None:
+        """After a step with torque (n,) [N m] of the servos, under these forces."""
         acceleration = self.data.qacc[self.dof]
         gears.look(torque, acceleration)
         if self.yields is not None:
-            gears.look(torque, acceleration + (force - peak) * self.yields[self.dof])
+            gears.look(torque, acceleration + (push.forces - push.peaks) @ self.yields[:, self.dof])
 
     def base(self) -> tuple[Array, Array, float]:
         """Position (3,), rotation (3, 3) and speed [m/s] of the base."""
@@ -195,6 +200,14 @@ class _Replay(MujocoRobot):
         force = np.einsum("kji,kj->ki", axes, parts)
         np.add.at(out, sole[on], np.hstack([force, np.cross(place, force)]))
         return out
+
+    def ground(self) -> Array:
+        """(soles and hands, 6) wrench of the world on what stands on it and holds on to it, about its origin;
+        after the step's forces are known.
+        """
+        found, places = self.grips.wrenches(self.data)
+        found[:, 3:] += np.cross(places, found[:, :3])
+        return np.vstack([self.sole_ground(), found])
 
     def fallen(self, q_planned: Array) -> str:
         """Whether the base is far from where the reference (nq,) has it: a plan may bow deeply itself."""
@@ -265,6 +278,11 @@ def simulate_mujoco(
     """
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
+    if controller is not None and (scene.hands or scene.second):
+        raise InputError(
+            "the whole-body controller has one hand that strikes, and none that holds on: take "
+            "controller='servo'"
+        )
     world = perturbation if perturbation is not None else Perturbation()
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller)
@@ -277,13 +295,14 @@ def simulate_mujoco(
     lag = round(wait / step)
     told = np.zeros((2, robot.n))  # what the servo tells the motors: demand, and what saturation leaves of it
     force = 0.0
-    ground = np.zeros((len(scene.soles), 6))
+    ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
-    impulse, left = 0.0, replay.target  # given to the target [N s], and its state when it was last touched
+    # given to the target [N s] by each striker, and its state when it was last touched
+    impulses, left = np.zeros(len(scene.strikers)), replay.target
     with no_log_file():
         for k in range(round(min(float(reference.end) + settle, until) / step)):
             t = k * step
@@ -306,29 +325,40 @@ def simulate_mujoco(
             torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
             if passive.any():  # springs, that no computer samples
                 torque = np.where(passive, servo.springs(data.qpos[replay.place], rates), torque)
-            speed = replay.hand_speed()
+            speeds = replay.hand_speeds()
             target_speed = replay.struck.speed(replay.target)
-            push = replay.push(speed, step)
+            push = replay.push(speeds, step)
             force = push.force
             peak = max(peak, push.peak)
-            replay.apply(torque, force)
+            replay.apply(torque, push.forces)
             replay.shove(t)
             touches.add(t, force, step, push.since)
             saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
             replay.place_target()
-            impulse += step * force
+            impulses += step * push.forces
             left = replay.target if force > 0 else left
             kept = k % record == 0 or force > 0
             state = replay.state() if kept else None
             moves = replay.sole_moves() if kept else None
             mujoco.mj_step2(model, data)
             replay.besides.look(data, t)
-            replay.look_at(gears, torque, force, push.peak)
+            replay.look_at(gears, torque, push)
             if kept:
-                ground = replay.sole_ground()
+                ground = replay.ground()
                 assert state is not None and moves is not None
                 rows.append(
-                    (t, *state, force, target_speed, speed, demand, torque, ground, *moves, gears.taken())
+                    (
+                        t,
+                        *state,
+                        force,
+                        target_speed,
+                        float(speeds[0]),
+                        demand,
+                        torque,
+                        ground,
+                        *moves,
+                        gears.taken(),
+                    )
                 )
                 check_not_diverged(data.qvel, t, step)
                 fall = replay.fallen(replay.planned(t))
@@ -341,13 +371,14 @@ def simulate_mujoco(
         rows,
         touches,
         engine="mujoco",
-        impulse=impulse,
+        impulse=float(impulses.sum()),
+        impulses=impulses,
         peak_force=peak,
         outcome=replay.scene.target.outcome(left),
         saturated=saturated,
         cuts=cuts.told() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
-        fall=fall or replay.not_standing(ground, weight_of(robot)),
+        fall=fall or replay.not_standing(ground[: len(scene.soles)], weight_of(robot)),
         touched=replay.besides.touched(),
         missed=world.missing,
     )

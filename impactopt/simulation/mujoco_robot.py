@@ -19,11 +19,11 @@ class MujocoRobot:
     """A robot in a compiled MuJoCo model, struck at one of its sites.
 
     world, data : MuJoCo's model and its data.  dof, place : where the joints' rates and angles are in qvel
-    and qpos.  site : of the striking point, and along (nv,): its Jacobian along the normal, where it has been
-    last.
+    and qpos.  sites : of the striking points, and along (h, nv): their Jacobians along the normal, where they
+    have been last.
     """
 
-    def __init__(self, robot: Robot, world: Any, striker: str) -> None:
+    def __init__(self, robot: Robot, world: Any, *strikers: str) -> None:
         self.mujoco, self.robot, self.world = mujoco_module(), robot, world
         self.data = self.mujoco.MjData(world)
         self.floating = robot.floating
@@ -34,8 +34,8 @@ class MujocoRobot:
         self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
         # a continuous joint's angle is (cosine, sine) in Pinocchio
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
-        self.site = world.site(striker).id
-        self._rows, self.along = np.zeros((3, world.nv)), np.zeros(world.nv)
+        self.sites = [world.site(striker).id for striker in strikers]
+        self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
 
     def put(self, q: Array, v: Array | None = None) -> None:
         """Go to q (nq), v (nv; None: the rates stay); what depends on them is not computed yet."""
@@ -69,13 +69,18 @@ class MujocoRobot:
         self.mujoco.mju_quat2Mat(rotation, self.data.qpos[3:7])
         return rotation.reshape(3, 3)
 
-    def speed_along(self, normal: Array) -> float:
-        """Speed [m/s] of the striking point along a normal (3,); leaves its row in `along`."""
-        self.mujoco.mj_jacSite(self.world, self.data, self._rows, None, self.site)
-        self.along = normal @ self._rows
-        return float(self.along @ self.data.qvel)
+    def places(self) -> Array:
+        """(h, 3) [m] of the striking points."""
+        return np.array(self.data.site_xpos[self.sites])
 
-    def apply(self, torque: Array, force: float) -> None:
-        """Torque (n) [N m] at the joints, and the contact's force [N], which pushes against the normal."""
-        self.data.qfrc_applied[:] = -force * self.along
+    def speeds_along(self, normal: Array) -> Array:
+        """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`."""
+        for k, site in enumerate(self.sites):
+            self.mujoco.mj_jacSite(self.world, self.data, self._rows, None, site)
+            self.along[k] = normal @ self._rows
+        return np.asarray(self.along @ self.data.qvel)
+
+    def apply(self, torque: Array, forces: Array | float) -> None:
+        """Torque (n) [N m] at the joints, and the contacts' forces (h,) [N], against the normal."""
+        self.data.qfrc_applied[:] = -np.atleast_1d(forces) @ self.along
         self.data.qfrc_applied[self.dof] += torque

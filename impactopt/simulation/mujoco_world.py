@@ -18,6 +18,8 @@ from impactopt.simulation.result import Scene
 from impactopt.simulation.solids import FLOOR
 
 Array = NDArray[np.float64]
+# of a weld, MuJoCo's own limits: impedance, and time constant in steps
+_IMPEDANCE, _TIME_CONSTANT = 0.9999, 2.0
 FOOT = 0.005  # [m] radius of the spheres under a sole's corners; they touch the floor where the corner is
 
 
@@ -60,24 +62,26 @@ def build_world(
 ) -> Any:
     """The compiled mujoco.MjModel.
 
-    Joints have the model's names; the striking point is the site ``striker``; each sole of the robot, held by
-    the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing else touches
-    anything, but the pairs of solids (`near`), which push each other back: hulls of links, named ``solid
-    <number>``, and bodies of the world; those that move with the target are on the mocap body ``target``.
-    The contact law between target and striker is the engine's business.
+    Joints have the model's names; striking points are the sites ``striker`` and ``striker 2``; each sole of
+    the robot, held by the plan or not, has a sphere ``sole <frame> <k>`` under each of its corners. Nothing
+    else touches anything, but the pairs of solids (`near`), which push each other back: hulls of links, named
+    ``solid <number>``, and bodies of the world; those that move with the target are on the mocap body
+    ``target``. The contact law between target and striker is the engine's business. Hands that hold on are
+    welded.
     """
-    spec, bodies = robot_on_floor(robot, scene.striker, perturbation, solver)
+    spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver)
     _solids(mujoco_module(), spec, bodies, scene, near)
+    add_welds(spec, bodies, robot, scene.hands, solver.step)
     return spec.compile()
 
 
 def robot_on_floor(
-    robot: Robot, striker: str, perturbation: Perturbation, solver: MujocoOptions
+    robot: Robot, strikers: Sequence[str], perturbation: Perturbation, solver: MujocoOptions
 ) -> tuple[Any, list[Any]]:
     """The world of :func:`build_world` before it is compiled, without target and solids; and its bodies, as
     of :func:`robot_bodies`.
 
-    striker : frame of the model that hits.
+    strikers : frames of the model that hit.
     """
     mujoco = mujoco_module()
     spec = spec_of(robot, solver)
@@ -86,7 +90,7 @@ def robot_on_floor(
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
     _surface(floor, perturbation, sole=False)
-    return spec, _robot_bodies(mujoco, spec, robot, striker, perturbation)
+    return spec, _robot_bodies(mujoco, spec, robot, strikers, perturbation)
 
 
 def spec_of(robot: Robot, solver: MujocoOptions) -> Any:
@@ -145,8 +149,13 @@ def primitive(mujoco: Any, solid: Any) -> dict[str, Any]:
     return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0.0, 0.0], **place}
 
 
+def site_name(number: int) -> str:
+    """Of a striker, the first of which is 1."""
+    return "striker" if number == 1 else f"striker {number}"
+
+
 def _robot_bodies(
-    mujoco: Any, spec: Any, robot: Robot, striker: str, perturbation: Perturbation
+    mujoco: Any, spec: Any, robot: Robot, strikers: Sequence[str], perturbation: Perturbation
 ) -> list[Any]:
     model = robot.model
     bodies = robot_bodies(mujoco, spec, robot)
@@ -162,9 +171,10 @@ def _robot_bodies(
                 mass=0.0,
             )
             _surface(sphere, perturbation, sole=True)
-    frame = model.frames[model.getFrameId(striker)]
-    hand = bodies[frame.parentJoint]
-    hand.add_site(name="striker", pos=frame.placement.translation)
+    for k, striker in reversed(list(enumerate(strikers, start=1))):  # the first one carries the payload
+        frame = model.frames[model.getFrameId(striker)]
+        hand = bodies[frame.parentJoint]
+        hand.add_site(name=site_name(k), pos=frame.placement.translation)
     if perturbation.payload > 0:
         load = hand.add_body(name="payload", pos=frame.placement.translation)
         _inertial(load, perturbation.payload, np.zeros(3), 1e-4 * perturbation.payload * np.eye(3))
@@ -198,6 +208,27 @@ def robot_bodies(mujoco: Any, spec: Any, robot: Robot) -> list[Any]:
             armature=float(model.armature[model.joints[j].idx_v]),
         )
     return bodies
+
+
+def add_welds(spec: Any, bodies: Sequence[Any], robot: Robot, frames: Sequence[str], step: float) -> None:
+    """Sites at these frames of the robot, welded as hard as MuJoCo lets them be in steps [s] of this length.
+
+    bodies : of :func:`robot_bodies`.
+    """
+    mujoco = mujoco_module()
+    for name in frames:
+        frame = robot.model.frames[robot.model.getFrameId(name)]
+        bodies[frame.parentJoint].add_site(
+            name=name, pos=frame.placement.translation, quat=quaternion(frame.placement.rotation)
+        )
+        spec.worldbody.add_site(name=f"ground {name}")
+        weld = spec.add_equality()
+        weld.type, weld.objtype = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_SITE
+        weld.name1, weld.name2 = name, f"ground {name}"
+        weld.solref = [_TIME_CONSTANT * step, 1.0]
+        weld.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
+    if frames:
+        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # their rows are read
 
 
 def _surface(geom: Any, perturbation: Perturbation, *, sole: bool) -> None:

@@ -102,6 +102,7 @@ class Perturbation:
             planned,
             solids=solids,
             point=planned.point + way,
+            second=None if planned.second is None else (planned.second[0], planned.second[1] + way),
             law=type(law)(**of_law),
             target=type(target)(**of_target),
         )

@@ -33,7 +33,7 @@ class _State:
     v: Array
     x: float  # the target's travel [m]
     target: Array  # and state
-    impulse: float  # that it was given [N s]
+    impulses: Array  # that it was given by each striker [N s]
     drive: Array  # torque of the motors [N m]
 
 
@@ -42,7 +42,7 @@ class _Rates:
     v: Array
     a: Array
     vt: float  # the target's speed [m/s]
-    force: float
+    forces: Array  # of each striker [N]
     hand_speed: float
     asked: Array  # (2, n) of the servos: demand, and what saturation leaves of it
     demand: Array  # that reaches the motors
@@ -56,7 +56,9 @@ class _World:
     def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
         self.robot, self.scene = robot, scene
         self.model, self.base = robot.model, robot.model.nv - robot.n
-        self.body = PinocchioBody(robot, scene.soles, np.zeros(6), scene.striker, scene.normal)
+        self.body = PinocchioBody(
+            robot, (*scene.soles, *scene.hands), np.zeros(6), scene.strikers, scene.normal
+        )
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
 
@@ -65,34 +67,42 @@ class _World:
         q, v, struck = np.array(reference.q[0]), np.zeros(self.model.nv), self.struck
         first = np.array(self.servo.torque(0.0, self.servo.angles(q), v[self.base :]))
         drive = self.motors.cut(first[1], v[self.base :])
-        return _State(q, v, struck.travel_at_start(reference), struck.untouched, 0.0, drive)
+        return _State(
+            q,
+            v,
+            struck.travel_at_start(reference),
+            struck.untouched,
+            np.zeros(len(self.scene.strikers)),
+            drive,
+        )
 
-    def depth(self, s: _State) -> float:
-        """[m] of the striking point in the target, at the state at which the body has been last."""
-        return self.struck.depth(self.body.hand_place(), s.x)
+    def depths(self, s: _State) -> Array:
+        """(h,) [m] of the striking points in the target, at the state at which the body has been last."""
+        return self.struck.depths(self.body.hand_places(), s.x)
 
-    def rates(self, t: float, s: _State, *, force: float | None = None, step: float = 0.0) -> _Rates:
-        """At a state under the force [N] of its step, or that of the step [s] that begins here."""
+    def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
+        """At a state under the forces [N] of its step, or those of the step [s] that begins here."""
         body = self.body
         speed = body.look(s.q, s.v)
-        depth = self.depth(s)
+        speeds, depths = body.rows @ s.v, self.depths(s)
         joints = s.v[self.base :]
         asked = np.array(self.servo.torque(t, self.servo.angles(s.q), joints))
         demand, wanted = self.delay.at(t, asked)
         cut = self.motors.cut(wanted, joints)
         torque = self.motors.now(s.drive, cut)
         push, struck = None, self.struck
-        if force is None:
-            force = struck.force(depth, speed, s.target)
-            if struck.near(depth, speed, s.target, step):
-                a = body.accelerate(torque, 0.0)
-                yields = float(body.row @ (a - body.accelerate(torque, 1.0)))
-                push = struck.pushed(depth, speed, body.drift(a), yields, s.target, s.x, step)
+        if forces is None:
+            forces = struck.forces(depths, speeds, s.target)
+            if struck.near(depths, speeds, s.target, step):
+                units = np.eye(len(speeds))
+                a = body.accelerate(torque, 0.0 * speeds)
+                lost = np.column_stack([a - body.accelerate(torque, unit) for unit in units])
+                push = struck.pushed(depths, speeds, body.drifts(a), body.rows @ lost, s.target, s.x, step)
         return _Rates(
             v=s.v.copy(),
-            a=body.accelerate(torque, force),
+            a=body.accelerate(torque, forces),
             vt=struck.speed(s.target),
-            force=force,
+            forces=forces,
             hand_speed=speed,
             asked=asked,
             demand=demand,
@@ -103,7 +113,7 @@ class _World:
         )
 
     def ground(self) -> Array:
-        """(soles, 6) wrench of the ground on each held sole about the world's origin, of the last call of
+        """(soles and hands, 6) wrench of the world on what it holds, about its origin, of the last call of
         ``rates``.
         """
         out = self.body.wrenches()
@@ -114,7 +124,7 @@ class _World:
         """World places (k, 3) of each held sole's corners."""
         return [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
-            for m, c in zip(self.body.placements(), self.scene.corners, strict=True)
+            for m, c in zip(self.body.placements(), self.scene.corners, strict=False)  # then hands
         ]
 
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
@@ -124,31 +134,32 @@ class _World:
         """
         push = first.push
         a = first.a
-        if push is not None and push.half != first.force:
-            a = self.body.accelerate(first.torque, push.half)
+        if push is not None and np.any(push.halves != first.forces):
+            a = self.body.accelerate(first.torque, push.halves)
         half = _State(
             q=pin.integrate(self.model, s.q, h / 2 * s.v),
             v=s.v + h / 2 * a,
             x=s.x,
             target=s.target,
-            impulse=s.impulse,
+            impulses=s.impulses,
             drive=self.motors.after(s.drive, first.cut, h / 2),
         )
-        middle = self.rates(t + h / 2, half, force=push.force if push is not None else 0.0)
+        middle = self.rates(t + h / 2, half, forces=0.0 * first.forces if push is None else push.forces)
         after = _State(
             q=pin.integrate(self.model, s.q, h * middle.v),
             v=s.v + h * middle.a,
             x=s.x + h * first.vt,
             target=self.struck.moved(s.target, 0.0, h) if push is None else push.state,
-            impulse=s.impulse + h * middle.force,
+            impulses=s.impulses + h * middle.forces,
             drive=self.motors.after(s.drive, middle.cut, h),
         )
         if push is None:
             return after
-        # the depth is the contact's: it is followed more exactly there than the arm is
+        # depths are the contact's: they are followed more exactly there than the arms are
         self.body.look(after.q, after.v)
-        along = self.depth(replace(after, x=0.0))
-        return replace(after, x=along - push.depth if np.isfinite(along) else push.travel)
+        gone = self.depths(replace(after, x=0.0)) - push.depths
+        known = gone[np.isfinite(gone)]
+        return replace(after, x=float(known.mean()) if known.size else push.travel)
 
 
 def simulate_pinocchio(
@@ -192,18 +203,18 @@ def simulate_pinocchio(
             touches.add(t, 0.0, step)
         else:
             touches.add(t, push.force, step, push.since)
-        peak = max(peak, first.force if push is None else push.peak)
+        peak = max(peak, float(first.forces.sum()) if push is None else push.peak)
         gears.look(first.torque, first.a)
         if touches.touching or k % record == 0:
             corners = world.corners()
             start = corners if start is None else start
-            motion = (state.q, state.v, first.force, first.vt, first.hand_speed)
+            motion = (state.q, state.v, float(first.forces.sum()), first.vt, first.hand_speed)
             moves = slip_and_lift(corners, start)
             rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves, gears.taken()))
         if push is not None:  # the force of a contact that begins within the step jumps there
-            gears.look(first.torque, world.body.accelerate(first.torque, push.peak))
+            gears.look(first.torque, world.body.accelerate(first.torque, push.peaks))
         before, state = state, world.step(t, state, first, step)
-        left = state.target if state.impulse > before.impulse else left
+        left = state.target if state.impulses.sum() > before.impulses.sum() else left
         check_not_diverged(state.v, t, step)
     return simulation_of(
         robot,
@@ -211,7 +222,8 @@ def simulate_pinocchio(
         rows,
         touches,
         engine="pinocchio",
-        impulse=state.impulse,
+        impulse=float(state.impulses.sum()),
+        impulses=state.impulses,
         peak_force=peak,
         outcome=scene.target.outcome(left),
         saturated=saturated,

@@ -29,39 +29,47 @@ class Body(ABC):
     robot : what moves.
     frames : held in all six directions.
     compliance : (6,) of each held frame, as `Stance.compliance`.
-    striker : the striking frame.
+    striker : the striking frame, or several.
     normal : (3,) of the blow.
     """
 
     def __init__(
-        self, robot: Robot, frames: tuple[str, ...], compliance: Array, striker: str, normal: Array
+        self,
+        robot: Robot,
+        frames: tuple[str, ...],
+        compliance: Array,
+        striker: str | tuple[str, ...],
+        normal: Array,
     ) -> None:
         self.model, self.n, self.nv = robot.model, robot.n, robot.nv
         self.data: Any = robot.model.createData()
         self.frames = [self.model.getFrameId(frame) for frame in frames]
         self.compliance, self.normal = np.tile(compliance, len(frames)), normal
-        self.hand = self.model.getFrameId(striker)
-        self.row = np.zeros(self.nv)
+        strikers = (striker,) if isinstance(striker, str) else striker
+        self.hands = [self.model.getFrameId(name) for name in strikers]
+        self.rows = np.zeros((len(strikers), self.nv))
 
     @abstractmethod
     def look(self, q: Array, v: Array) -> float:
-        """Speed of the striking point along the normal [m/s] at q (nq), v (nv), to which it goes."""
+        """Speed of the first striking point along the normal [m/s] at q (nq), v (nv), to which it goes."""
 
     @abstractmethod
-    def accelerate(self, torque: Array, force: float) -> Array:
+    def accelerate(self, torque: Array, force: float | Array) -> Array:
         """Acceleration (nv) where it has been last.
 
         torque : (n) [N m] at the joints, friction included.
-        force : [N] of the contact, pushing the hand against the normal.
+        force : [N] of the contact, pushing the hand against the normal; of several, (hands,).
         """
 
     @abstractmethod
     def wrenches(self) -> Array:
         """On the held frames (frames, 6), at their origins in world axes, of the last acceleration."""
 
-    def hand_place(self) -> Array:
-        """(3,) [m] of the striking point, where it has been last."""
-        return np.array(pin.updateFramePlacement(self.model, self.data, self.hand).translation)
+    def hand_places(self) -> Array:
+        """(hands, 3) [m] of the striking points, where they have been last."""
+        return np.array(
+            [pin.updateFramePlacement(self.model, self.data, hand).translation for hand in self.hands]
+        )
 
     def placements(self) -> list[pin.SE3]:
         """Of the held frames in the world, where it has been last."""
@@ -75,8 +83,12 @@ class Body(ABC):
         J = pin.getFrameJacobian(self.model, self.data, frame, _AXES)
         return np.reshape(J, (6, self.nv))  # a single column comes without its second dimension
 
-    def _push(self, torque: Array, force: float) -> Array:
-        push = -force * self.row
+    def _rows(self) -> Array:
+        """(hands, nv) of the striking points' speeds along the normal, once all Jacobians are known."""
+        return np.array([self.normal @ self._jacobian(hand)[:3] for hand in self.hands])
+
+    def _push(self, torque: Array, force: float | Array) -> Array:
+        push = -np.atleast_1d(force) @ self.rows
         push[-self.n :] += torque
         return push
 
@@ -106,12 +118,12 @@ class DenseBody(Body):
             self._matrix[rows, :nv] = J
             self._matrix[:nv, rows] = -J.T
             self._right[rows] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
-        self.row = self.normal @ self._jacobian(self.hand)[:3]
+        self.rows = self._rows()
         self._matrix[:nv, :nv] = pin.crba(model, data, q)
         self._bias = pin.nonLinearEffects(model, data, q, v)
-        return float(self.row @ v)
+        return float(self.rows[0] @ v)
 
-    def accelerate(self, torque: Array, force: float) -> Array:
+    def accelerate(self, torque: Array, force: float | Array) -> Array:
         self._right[: self.nv] = self._push(torque, force) - self._bias
         found = np.array(np.linalg.solve(self._matrix, self._right), dtype=np.float64)
         self._wrenches = found[self.nv :].reshape(-1, 6)
@@ -169,10 +181,10 @@ class PinocchioBody(Body):
         self._at = q, v
         pin.forwardKinematics(self.model, self.data, q, v)
         pin.computeJointJacobians(self.model, self.data)
-        self.row = self.normal @ self._jacobian(self.hand)[:3]
-        return float(self.row @ v)
+        self.rows = self._rows()
+        return float(self.rows[0] @ v)
 
-    def accelerate(self, torque: Array, force: float) -> Array:
+    def accelerate(self, torque: Array, force: float | Array) -> Array:
         push, model = self._push(torque, force), self.model
         if not self.frames:
             return np.array(pin.aba(model, self._dynamics, *self._at, push))
@@ -189,11 +201,14 @@ class PinocchioBody(Body):
             out[k, 3:] = placement.rotation @ local.angular
         return out
 
-    def drift(self, a: Array) -> float:
-        """[m/s2] of the striking point along the normal at accelerations (nv), where it has been last."""
-        pin.forwardKinematics(self.model, self.data, *self._at, a)
-        found = pin.getFrameClassicalAcceleration(self.model, self.data, self.hand, _AXES)
-        return float(self.normal @ found.linear)
+    def drifts(self, a: Array) -> Array:
+        """(hands,) [m/s2] of the striking points along the normal at accelerations (nv), where they have been
+        last.
+        """
+        model, data = self.model, self.data
+        pin.forwardKinematics(model, data, *self._at, a)
+        found = [pin.getFrameClassicalAcceleration(model, data, hand, _AXES) for hand in self.hands]
+        return np.array([self.normal @ one.linear for one in found])
 
 
 FORMS: dict[str, type[Body]] = {"lagrange": DenseBody, "pinocchio": PinocchioBody}

@@ -22,6 +22,7 @@ REPORT = (
     "standing",
     "reason",
     "impulse_Ns",
+    "impulses_Ns",
     "impulse_error_pct",
     "step_error_pct",
     "peak_force_N",
@@ -50,6 +51,7 @@ REPORT = (
     "hand_speed_m_s",
     "sole_cop_margin_m",
     "target",
+    "grip_force_N",
     "clearance_mm",
     "nearest",
     "contacts_besides",
@@ -70,7 +72,8 @@ class Scene:
     target: the contact's force and the target's motion; striker: frame of the model that hits; soles: frames
     of the model that the plan holds to the ground; corners: (k, 2) [m] of each, in the plane of its frame,
     counter-clockwise; polygon (k, 2) [m]: support polygon on the ground, counter-clockwise. solids: what
-    else can touch.
+    else can touch. hands: frames of the model that hold on to where the reference has them at first.
+    second: of another striker that hits the same target, its frame of the model and its point (3,) [m].
     """
 
     point: Array
@@ -82,6 +85,13 @@ class Scene:
     corners: tuple[Array, ...]
     polygon: Array
     solids: Solids = field(default_factory=Solids)
+    hands: tuple[str, ...] = ()
+    second: tuple[str, Array] | None = None
+
+    @property
+    def strikers(self) -> tuple[str, ...]:
+        """Frames of the model that hit."""
+        return (self.striker,) if self.second is None else (self.striker, self.second[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +118,7 @@ class Simulation:
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
     before.  loads: what gears and motors bear at most.  cuts: joints whose demand the line of their motor
     has cut, the longest first; None where no motor's line is known.
+    grip_force (k, hands) [N]: on each hand that holds on.  impulses (strikers,) [N s]: of each.
     """
 
     engine: str
@@ -141,6 +152,8 @@ class Simulation:
     gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     loads: DriveLoads | None = field(default=None, repr=False)
     cuts: tuple[MotorCut, ...] | None = None
+    grip_force: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    impulses: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
     @property
     def ground(self) -> Array:
@@ -206,6 +219,8 @@ class Simulation:
             **({} if self.loads is None else self.loads.summary()),
             **self._cut_numbers(),
         }
+        if len(self.impulses) > 1:
+            out["impulses_Ns"] = self.impulses.tolist()
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {
             n: float(ratio[phase == k].max()) for k, n in enumerate(PHASES) if (phase == k).any()
@@ -223,6 +238,8 @@ class Simulation:
                 for n, m in zip(self.soles, self.cop_margin.T, strict=True)
                 if np.isfinite(m).any()
             }
+            if self.grip_force.size:
+                out["grip_force_N"] = float(self.grip_force.max())
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())
             out["sole_lift_mm"] = 1e3 * float(self.lift.max())
             collision = self.lift[phase == 1]

@@ -19,7 +19,9 @@ def scene_of(problem: ImpactProblem) -> Scene:
         law=p.law,
         target=p.target,
         striker=p.robot.striker(p.striker).model_frame,
-        soles=p.stance.constraint_frames(p.robot),
+        soles=p.stance.sole_frames(p.robot),
+        hands=p.stance.hand_frames(p.robot),
+        second=None if p.second is None else (p.robot.striker(p.second.striker).model_frame, p.second.point),
         corners=tuple(sole.polygon for sole in p.stance.soles(p.robot)),
         polygon=support_polygon(p.robot, p.coordinates),
     )

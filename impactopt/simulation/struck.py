@@ -27,18 +27,28 @@ MOST = 20_000  # places within one step: a contact that needs more is no contact
 class Push:
     """What a contact has come to within one step of an engine.
 
-    force [N]: mean over the step, and over its first half (half); peak [N]; state, travel [m]: of the target
-    at the end; depth [m]: of the striking point in it, then; since [s]: up to when in the step there was no
-    force.
+    Of each striker (h,): forces [N], their means over the step, and over its first half (halves); peaks [N],
+    when their sum is largest; depths [m] in the target, at the end. state, travel [m]: of the target, then;
+    since [s]: up to when in the step there was no force.
     """
 
-    force: float
-    half: float
-    peak: float
+    forces: Array
+    halves: Array
+    peaks: Array
     state: Array
     travel: float
-    depth: float
+    depths: Array
     since: float = 0.0
+
+    @property
+    def force(self) -> float:
+        """Mean over the step [N], of all strikers together."""
+        return float(self.forces.sum())
+
+    @property
+    def peak(self) -> float:
+        """The largest force [N] of all strikers together."""
+        return float(self.peaks.sum())
 
 
 class Struck:
@@ -49,6 +59,7 @@ class Struck:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.law, self.target = scene, scene.law, scene.target
+        self.points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
         self.untouched: Array = np.zeros(self.target.n_states)
 
     def speed(self, state: Array) -> float:
@@ -60,46 +71,62 @@ class Struck:
         before = self.speed(self.untouched)
         return -before * float(reference.contact_start) if before else 0.0
 
-    def depth(self, place: Array, travel: float) -> float:
-        """[m] of a striking point at a place (3,) [m] in a target that has gone so far [m]; beside its face
-        minus infinity.
+    def depths(self, places: Array, travel: float) -> Array:
+        """(h,) [m] of striking points at places (h, 3) [m] in a target that has gone so far [m]; beside its
+        face minus infinity.
         """
+        return np.array(
+            [self._depth(at, point, travel) for at, point in zip(places, self.points, strict=True)]
+        )
+
+    def _depth(self, place: Array, point: Array, travel: float) -> float:
         normal = self.scene.normal
-        way = place - self.scene.point
+        way = place - point
         along = float(normal @ way)
         return -np.inf if np.linalg.norm(way - along * normal) > FACE else along - travel
 
-    def force(self, depth: float, speed: float, state: Array) -> float:
-        """Contact force [N] of a striking point so deep in the target [m], with a speed along the normal
+    def forces(self, depths: Array, speeds: Array, state: Array) -> Array:
+        """Contact forces (h,) [N] of striking points so deep in the target [m], with speeds along the normal
         [m/s].
         """
-        return float(self.law.force(depth, speed - self.speed(state))) if depth > 0 else 0.0
+        rates = speeds - self.speed(state)
+        pairs = zip(depths, rates, strict=True)
+        return np.array([float(self.law.force(depth, rate)) if depth > 0 else 0.0 for depth, rate in pairs])
 
-    def near(self, depth: float, speed: float, state: Array, step: float) -> bool:
-        """Whether the two may touch within a step [s]."""
-        return depth + NEAR * step * (abs(speed - self.speed(state)) + 1.0) > 0
+    def near(self, depths: Array, speeds: Array, state: Array, step: float) -> bool:
+        """Whether any of them may touch the target within a step [s]."""
+        return bool(np.any(depths + NEAR * step * (np.abs(speeds - self.speed(state)) + 1.0) > 0))
 
     def pushed(
-        self, depth: float, speed: float, gain: float, yields: float, state: Array, travel: float, step: float
+        self,
+        depths: Array,
+        speeds: Array,
+        gains: Array,
+        yields: Array,
+        state: Array,
+        travel: float,
+        step: float,
     ) -> Push:
-        """The contact over one step [s] of the engine: hand and target alone, with errors of their own.
+        """The contact over one step [s] of the engine: hands and target alone, with errors of their own.
 
-        The hand is a point whose speed [m/s] gains so much [m/s2] without the contact, and loses `yields`
-        [1/kg] times the impulse. A light target behind a stiff contact moves a thousand times within a step,
-        which an engine could not follow.
+        Hands are points whose speeds (h,) [m/s] gain so much [m/s2] without the contact, and lose `yields`
+        (h, h) [1/kg] times their impulses. A light target behind a stiff contact moves a thousand times
+        within a step, which an engine could not follow.
         """
+        h = len(speeds)
+        there = np.maximum(depths, -FACE)  # beside the face: far away
 
-        def forces(t: float, y: Array) -> tuple[float, float, float]:
-            """Force, and the speeds of hand and target."""
-            hand, target = speed + gain * t - yields * y[1], self.speed(y[3:])
-            force = float(self.law.force(y[0], hand - target)) if y[0] > 0 else 0.0
-            return force, hand, target
+        def forces(t: float, y: Array) -> tuple[Array, Array, float]:
+            """Forces, and the speeds of hands and target."""
+            hands, target = speeds + gains * t - yields @ y[h : 2 * h], self.speed(y[2 * h + 1 :])
+            return self.forces(y[:h], hands, y[2 * h + 1 :]), hands, target
 
         def rates(t: float, y: Array) -> list[float]:
-            force, hand, target = forces(t, y)
-            return [hand - target, force, target, *self.target.derivative(y[3:], force)]
+            force, hands, target = forces(t, y)
+            moves = self.target.derivative(y[2 * h + 1 :], float(force.sum()))
+            return [*(hands - target), *force, target, *moves]
 
-        begin = np.concatenate([[depth, 0.0, 0.0], state])
+        begin = np.concatenate([there, np.zeros(h + 1), state])
         found = solve_ivp(
             rates,
             (0.0, step),
@@ -114,16 +141,17 @@ class Struck:
                 f"the contact cannot be followed within a step of {step:g} s: soften it, or give the target "
                 "more mass"
             )
-        end, impulse = found.y[:, -1], found.y[1]
+        end, impulses = found.y[:, -1], found.y[h : 2 * h]
         values = np.array([forces(t, y)[0] for t, y in zip(found.t, found.y.T, strict=True)])
+        total = values.sum(axis=1)
         return Push(
-            force=float(impulse[-1]) / step,
-            half=float(np.interp(step / 2, found.t, impulse)) / (step / 2),
-            peak=float(values.max()),
-            state=np.array(end[3:]),
-            travel=travel + float(end[2]),
-            depth=float(end[0]),
-            since=float(found.t[max(int(np.argmax(values > 0)) - 1, 0)]),
+            forces=impulses[:, -1] / step,
+            halves=np.array([np.interp(step / 2, found.t, impulse) for impulse in impulses]) / (step / 2),
+            peaks=values[int(np.argmax(total))],
+            state=np.array(end[2 * h + 1 :]),
+            travel=travel + float(end[2 * h]),
+            depths=np.where(np.isfinite(depths), end[:h], -np.inf),
+            since=float(found.t[max(int(np.argmax(total > 0)) - 1, 0)]),
         )
 
     def rates(self, state: Array, force: float) -> Array:

@@ -77,6 +77,7 @@ def collision_model(
     content: File, robot: Robot, stance: Stance, section: AtContact, accuracy: float = 1e-2
 ) -> CollisionModel:
     """The model that [at_contact] names, for a problem file's blow; accuracy: as of `SDC`."""
+    content.check_one_striker()
     options: dict[str, Any] = {
         "robot": robot,
         "striker": content.problem.striker,

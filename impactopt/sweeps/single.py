@@ -70,7 +70,8 @@ def planned_numbers(record: Record) -> dict[str, dict[str, Any]]:
         planned["torque_ratio"] = float(np.abs(torque / a["torque_limit"]).max())
     if len(ground) and len(a["polygon"]):
         planned["zmp_margin_m"] = float(margin(a["polygon"], zmp(ground)).min())
-        planned["sole_force_N"] = float(a["collision_sole_wrench"][:, 2::6].min())
+        soles = sum(name.startswith("sole_") for name in a)  # hands that hold on come after them
+        planned["sole_force_N"] = float(a["collision_sole_wrench"][:, 2 : 6 * soles : 6].min())
     out = {"planned": planned}
     names = {"torque_ratio": "torque_ratio_by_phase", "zmp_margin_m": "zmp_margin_by_phase_m"}
     for name, by_phase in (("simulated", {key: key for key in names}), ("replayed", names)):

@@ -109,7 +109,7 @@ class ContactStates:
 
     def _reach(self, point: tuple[float, ...]) -> Posture | str:
         robot, q = self.robot, self.start
-        coordinates = StanceCoordinates(robot, self.stance.soles(robot), q)
+        coordinates = self._coordinates(q)
         try:
             q = inverse_kinematics(coordinates, self.striker, np.array(point), q)
         except InputError:
@@ -129,10 +129,15 @@ class ContactStates:
                 f"there are {', '.join(known)}"
             )
         robot.check_stance(q, self.stance.sole_names(robot))
-        coordinates = StanceCoordinates(robot, self.stance.soles(robot), q)
+        coordinates = self._coordinates(q)
         bend = None if v is None else coasting_reference(coordinates, q, v, until=lasts)
         polygon = support_polygon(robot, coordinates)
         return Posture(q=q, v=v, torque=torque, bend=bend, polygon=polygon)
+
+    def _coordinates(self, q: Array) -> StanceCoordinates:
+        """Of what the stance holds, where it is in a posture (nq,)."""
+        robot, stance = self.robot, self.stance
+        return StanceCoordinates(robot, stance.soles(robot), q, stance.held_hands(robot))
 
     def _of_result(self, result: str) -> tuple[Array, Array, Array, float]:
         """q, v, torque, and for how long [s] the reference is to be known."""
@@ -153,13 +158,19 @@ class ContactStates:
 
     # ------------------------------------------------------------ rows
     def check_joint(self, name: str) -> None:
-        """InputError for a joint that there is not, or one whose motion would move a held sole."""
+        """InputError for a joint that there is not, or one whose motion would move what is held."""
         k = self.robot.joint_index(name)
         for sole in self.stance.soles(self.robot):
             if k in self.robot.limb(sole.frame):
                 raise InputError(
                     f"[at_contact] joints_rad: {name} would move the sole {sole.name!r}, which is held; move "
                     "joints above the legs, or [problem] point_m"
+                )
+        for hand in self.stance.held_hands(self.robot):
+            if k in self.robot.limb(hand.model_frame):
+                raise InputError(
+                    f"[at_contact] joints_rad: {name} would move the hand {hand.name!r}, which holds on; "
+                    "move other joints, or [problem] point_m"
                 )
 
     def rows(

@@ -151,6 +151,14 @@ class ContactProgram(ABC):
         ]
         return [*nodes, *self.hit.drives()]
 
+    def wrenches(self) -> list[tuple[Place, Affine]]:
+        """Wrenches on soles and held hands (6 each), at the nodes and at collocation points of all contacts
+        that last.
+        """
+        nodes = [(place, slots[4]) for place, slots in self._node_slots()]
+        lasting = [c for c in self.hit.collisions if isinstance(c, Collision)]
+        return [*nodes, *(found for collision in lasting for found in collision.wrenches())]
+
     def first_instants(self) -> list[tuple[Place, Index]]:
         """First instants of damped contacts, of a program with a term that looks at them.
 
@@ -267,6 +275,10 @@ class ContactProgram(ABC):
     @abstractmethod
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         """Places of nodes, torques over limit there, and slots of the block ``node``."""
+
+    @abstractmethod
+    def _node_slots(self) -> list[tuple[Place, list[Affine]]]:
+        """The same without torques, which not every program has as variables."""
 
     def _spring_points(self) -> list[SpringPoint]:
         """Where springs of joints are held to their law."""

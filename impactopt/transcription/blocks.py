@@ -18,6 +18,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
 from impactopt.transcription.contact_blocks import (
+    SECOND,
     base_scale,
     carried,
     coasting,
@@ -38,8 +39,12 @@ __all__ = [
 ]
 
 
-def sizes(c: StanceCoordinates, target: Target, block: str, *, frozen: bool = False) -> dict[str, int]:
-    """Lengths of the named slices of a block's output, in order; of models with frozen dynamics or not."""
+def sizes(
+    c: StanceCoordinates, target: Target, block: str, *, frozen: bool = False, second: bool = False
+) -> dict[str, int]:
+    """Lengths of the named slices of a block's output, in order; of models with frozen dynamics or not, with
+    a second striker or not.
+    """
     n, base, soles = c.robot.n, c.base, len(c.legs)
     legs = {"legs": c.nl, "lag": c.nl, "hand": 1} if frozen else {}
     coasting = {"rate": c.nl, "acceleration": c.nl} if frozen else {"twist": 6 * soles}
@@ -62,6 +67,7 @@ def sizes(c: StanceCoordinates, target: Target, block: str, *, frozen: bool = Fa
             "speed": 1,
             "event": int(bool(target.guards)),
             "invariant": int(bool(target.guards)),
+            **(dict.fromkeys(SECOND, 1) if second else {}),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
         "spring": {"torque": c.ny - base},
@@ -87,7 +93,7 @@ def node(c: StanceCoordinates) -> BlockExpression:
     u, udot = ca.SX.sym("u", ny), ca.SX.sym("udot", ny)
     v, a = c.motion(y, legs, u, udot)
     rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
-    tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(legs, w)
+    tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(y, legs, w)
     out = {
         "closure": c.closure(y, legs),
         "base": tau[: c.base] / base_scale(c, weight, lever),
@@ -183,16 +189,17 @@ def builders(
     frozen: Effects | None = None,
     freezes: int = 0,
     first: bool = False,
+    second: str = "",
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Block's name -> a function that builds its expression; ``instant``: for an impact without duration;
     ``frozen``: the terms of a model with frozen dynamics, and its freezes on the way; ``first``: whether the
-    first instant of contact is looked at.
+    first instant of contact is looked at; ``second``: another striker.
 
     That is slow: it is only called when the compiled library is not in the cache.
     """
     hit: dict[str, Callable[[], BlockExpression]] = {
-        "collision": lambda: collision(c, striker, frozen),
-        "force": lambda: force(c, striker, law, target, frozen),
+        "collision": lambda: collision(c, striker, frozen, second),
+        "force": lambda: force(c, striker, law, target, frozen, second),
     }
     if c.legs:
         hit["coasting"] = lambda: coasting(c, frozen)
@@ -204,6 +211,9 @@ def builders(
         hit["impact"] = lambda: impact(c, striker)
     if target.guards:
         hit["join"] = join
+    if second:
+        hit["second_contact"] = lambda: contact(c, second)
+        hit["second_approach"] = lambda: approach(c, second)
     if first:
         hit["first"] = lambda: first_instant(c, striker, law)
     return {

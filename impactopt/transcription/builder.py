@@ -132,6 +132,7 @@ class Builder:
     def parts(self, block: str) -> dict[str, Any]:
         """Indices of the named slices of a block's output."""
         frozen = self.problem.frozen is not None
-        size = symbolic.sizes(self.coordinates, self.problem.target, block, frozen=frozen)
+        second = self.problem.second is not None
+        size = symbolic.sizes(self.coordinates, self.problem.target, block, frozen=frozen, second=second)
         offset = np.cumsum([0, *size.values()])
         return {k: np.arange(offset[i], offset[i + 1]) for i, k in enumerate(size)}

@@ -19,38 +19,50 @@ TOO_NEAR = millimetres("too near")
 
 
 def add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase) -> None:
-    """Rows at the nodes of the swing, and at those of the follow-through if the target stays."""
+    """Rows at the nodes of the swing, and at those of the follow-through if the target stays; of all
+    strikers.
+    """
+    for k, block in enumerate(["approach", "second_approach"][: len(b.problem.strikers)]):
+        _add_clearance(b, swing, follow, block, k)
+
+
+def _add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase, block: str, number: int) -> None:
     p, before, after, start = b.problem, swing.nodes[:-1], follow.nodes, len(b.rows.lower)
+    striker, point = b.problem.contacts[number]
     motions = [swing.at(s)[0] for s in before]
     if p.target.stays:
         motions += [follow.at(s)[0] for s in after]
-    first = b.add_block("approach", [[y] for y in motions], p.normal)
+    first = b.add_block(block, [[y] for y in motions], p.normal)
     ahead = float(np.mean(p.swing.duration))
-    surface, coming = Affine.constant(float(p.normal @ p.point)), float(p.target.speed_before())
+    surface, coming = Affine.constant(float(p.normal @ point)), float(p.target.speed_before())
     for i, s in enumerate(before):
         plane = surface - swing.T[0] * (coming * (1 - s))
-        _add_rows(b, "no touch before contact", [(first + i, swing.place_at(s), (1 - s) * ahead)], plane)
+        spots = [(first + i, swing.place_at(s), (1 - s) * ahead)]
+        _add_rows(b, "no touch before contact", number, spots, plane)
     aparts = [(1 - s) * ahead for s in before]
-    b.follow(lambda b: _follow(b, start, aparts))
+    b.follow(lambda b: _follow(b, number, start, aparts))
     if not p.target.stays:
         return
     # the striker has left the target where it is then; a nail that coasts on only makes room
     first, behind, place = first + len(before), float(np.mean(p.follow.duration)), follow.place_at
-    there = b.lift("target left", np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
+    name = f"target left by {striker}" if number else "target left"
+    there = b.lift(name, np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
     spots = [(first + i, place(s), s * behind) for i, s in enumerate(after) if i]
     left = len(b.rows.lower)
-    _add_rows(b, "no touch after contact", spots, there)
-    b.follow(lambda b: _follow(b, left, [apart for _, _, apart in spots], planes=False))
+    _add_rows(b, "no touch after contact", number, spots, there)
+    b.follow(lambda b: _follow(b, number, left, [apart for _, _, apart in spots], planes=False))
 
 
-def _add_rows(b: Builder, term: str, spots: list[tuple[int, Place, float]], plane: Affine) -> None:
+def _add_rows(
+    b: Builder, term: str, number: int, spots: list[tuple[int, Place, float]], plane: Affine
+) -> None:
     """``spots``: output, place and time from contact [s]; plane [m]: the target's, along the normal."""
-    nearest = _nearest(b)
+    nearest = _nearest(b, number)
     for output, place, apart in spots:
         b.rows.add(
             term=term,
             place=place,
-            components=[b.problem.striker],
+            components=[b.problem.contacts[number][0]],
             outputs=np.array([output]),
             affine=-plane,
             upper=-min(nearest, HASTE * apart),
@@ -58,19 +70,19 @@ def _add_rows(b: Builder, term: str, spots: list[tuple[int, Place, float]], plan
         )
 
 
-def _follow(b: Builder, start: int, aparts: list[float], *, planes: bool = True) -> None:
-    """Rows from number ``start`` on, of places at these times from contact [s]; planes: that of the target,
-    and not one that is a variable.
+def _follow(b: Builder, number: int, start: int, aparts: list[float], *, planes: bool = True) -> None:
+    """Rows from ``start`` on, of places at these times from contact [s]; planes: that of the target, and not
+    one that is a variable.
     """
-    nearest, surface = _nearest(b), float(b.problem.normal @ b.problem.point)
+    nearest, surface = _nearest(b, number), float(b.problem.normal @ b.problem.contacts[number][1])
     for k, apart in enumerate(aparts, start=start):
         b.rows.bound(k, -np.inf, -min(nearest, HASTE * apart))
         if planes:
             b.rows.affine[k] = replace(b.rows.affine[k], const=np.full(1, -surface))
 
 
-def _nearest(b: Builder) -> float:
-    """How near [m] behind the target's plane the striking point may stay: as near as it starts, at least."""
-    p = b.problem
-    at = striking_point(p.robot, p.striker, p.start_posture)
-    return min(CLEARANCE, max(float(p.normal @ (p.point - at)), 0.0))
+def _nearest(b: Builder, number: int) -> float:
+    """How near [m] behind the target's plane a striking point may stay: as near as it starts, at least."""
+    p, (striker, point) = b.problem, b.problem.contacts[number]
+    at = striking_point(p.robot, striker, p.start_posture)
+    return min(CLEARANCE, max(float(p.normal @ (point - at)), 0.0))

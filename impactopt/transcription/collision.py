@@ -56,6 +56,7 @@ class Collision(ContactNumbers, Collocated):
     ) -> None:
         self._b, self.contact, self.stages = b, contact, stages
         self.number, self.scenario, self.torques = number, scenario, []
+        self._each = ["", "second "][: len(b.problem.strikers)]  # of the strikers, before names of outputs
         p, c, limits = b.problem, b.coordinates, b.limits
         phases = range(len(p.target.phases))
         self.end = [max(i for i, s in enumerate(stages) if s.phase == k) for k in phases]
@@ -88,7 +89,7 @@ class Collision(ContactNumbers, Collocated):
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
             least = np.where(driven, -np.inf, 0.0)[:, None]
         most = np.where(last, 0.0, np.inf)
-        self.f = add("contact force", 1, scale=FORCE_SCALE, lower=least, upper=most)
+        self.f = add("contact force", len(p.strikers), scale=FORCE_SCALE, lower=least, upper=most)
         self.state = add("target state", p.target.n_states, scale=typical_state(p.target))
         self.xt = add("target travel", 1, labels=["target"])
         self.p = add("impulse so far", 1)
@@ -239,11 +240,13 @@ class Collision(ContactNumbers, Collocated):
             ends.append(("end of compression", "approach speed", len(ends), "rate", still))
         ends.append(("separation", "force", len(ends), "separation", Measure("N", FORCE_SCALE, "left")))
         for term, component, k, name, measure in ends:
-            self._b.equal(term, where, [component], start + self.end[k] * size + part[name], measure)
+            for one in self._each if name in ("rate", "separation") else self._each[:1]:
+                outputs = start + self.end[k] * size + part[one + name]
+                self._b.equal(term, where, [one + component], outputs, measure)
 
     def _dynamics_rows(self, i: int, place: Place, first: dict[str, int]) -> None:
         b, c, joints = self._b, self._b.coordinates, self._b.robot.joint_names
-        closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
+        closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
         if "coasting" in first:
             names = [*closure, *[f"{n} rate" for n in closure]]
             measures = [*along(closure, "off"), *rates(closure)]
@@ -265,7 +268,8 @@ class Collision(ContactNumbers, Collocated):
         part, fast = b.parts("force"), Measure("m/s", 1.0, "off")
         if i != self.end[-1]:  # there the force is zero by its bounds
             force = Measure("N", FORCE_SCALE, "off")
-            b.equal("contact law", place, ["force"], first + part["law"], force)
+            for one in self._each:
+                b.equal("contact law", place, [f"{one}force"], first + part[f"{one}law"], force)
         states = [f"state {k}" for k in range(target.n_states)]
         of_size = percent("of its size off")
         b.equal("target's motion", place, states, first + part["target"], of_size)
@@ -319,9 +323,8 @@ class Collision(ContactNumbers, Collocated):
         c, p, layout = self._b.coordinates, self._b.problem, self._b.layout
         place = np.array([s.place for s in self.stages])
         phase = np.array([s.phase for s in self.stages])
-        mass, speed = effective_mass(c, p.striker, p.normal, y, legs, rates)
-        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
-        found = blow(law, target, mass, speed, phase, place)
+        mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
+        found = blow(*self.alone(), mass, speed, phase, place)
         times = np.clip(found.durations, *np.transpose([layout.bounds(group) for group in self.T]))
         for group, value in zip(self.T, times, strict=True):
             group.write(x, value)
@@ -333,7 +336,7 @@ class Collision(ContactNumbers, Collocated):
         self.state.write(x, found.state)
         self.xt.write(x, found.travel[:, None] * per_time)
         self.f.write(x, np.where(np.arange(len(place)) == self.end[-1], 0.0, found.force)[:, None])
-        self.p.write(x, found.impulse[:, None])
+        self.p.write(x, len(p.strikers) * found.impulse[:, None])
         if p.target.guards:
             share = times[:2, None] / before[2]
             self.joined.write(x, (share * d[self.end[:2]]).sum(axis=0))
@@ -357,20 +360,22 @@ class Collision(ContactNumbers, Collocated):
         *before, last = (float(g.read(x)[0, 0]) for g in self.T)
         return sum(before), last
 
-    def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
+    def decode(self, x: Array, outputs: dict[str, Array], approaches: Array) -> PlannedCollision:
         """The collision that solver variables (n,) stand for; ``outputs`` are the blocks'."""
         b, target = self._b, self._b.problem.target
         durations = [float(g.read(x)[0, 0]) for g in self.T]
         time = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in self.stages]
         before = float(target.speed_before(self.target))
-        first, wrench = float(b.problem.law.branch(0.0, approach - before, True, self.law)), self.w.read(x)
+        first = [float(b.problem.law.branch(0.0, float(v) - before, True, self.law)) for v in approaches]
+        forces, wrench = np.vstack([first, self.f.read(x)]), self.w.read(x)
         start = self.number * len(self.stages)  # of its instances in the blocks
         of_stages = slice(start, start + len(self.stages))
         torque = outputs["collision"][of_stages, b.parts("collision")["torque"]]
         speed = outputs["force"][of_stages, b.parts("force")["speed"][0]]
         return PlannedCollision(
             time=np.array([0.0, *time]),
-            force=np.array([first, *self.f.read(x)[:, 0]]),
+            force=forces.sum(axis=1),
+            forces=forces,
             target_speed=np.array([before, *speed]),
             torque=np.vstack([self._feedforward().evaluate(x), torque]) * b.robot.torque_limit,
             sole_wrench=wrench,

@@ -39,6 +39,7 @@ class Collocated:
     joined_x: Group
     suffix: str
     legs: Group
+    w: Group
     contact: Contact
     torques: list[Affine]
 
@@ -110,6 +111,10 @@ class Collocated:
         """Of each stage, once rows are there, if a term is about drives."""
         pairs = zip(self.stages, self.torques, strict=True)
         return [DrivePoint(self._place(s), torque, self._motion(i)) for i, (s, torque) in enumerate(pairs)]
+
+    def wrenches(self) -> list[tuple[Place, Affine]]:
+        """Of each stage, on soles and held hands."""
+        return [(self._place(s), self.w[i]) for i, s in enumerate(self.stages)]
 
     def _motion(self, i: int) -> list[Affine]:
         """Slots of a `impactopt.problem.joint_motion.joint_motion` at a stage."""

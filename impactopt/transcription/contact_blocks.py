@@ -22,6 +22,7 @@ __all__ = [
     "DEPTH_SCALE",
     "FORCE_SCALE",
     "RESTITUTING",
+    "SECOND",
     "base_scale",
     "carried",
     "coasting",
@@ -38,6 +39,7 @@ __all__ = [
 
 FORCE_SCALE = 100.0  # [N] contact forces in the program's rows
 DEPTH_SCALE = 0.01  # [m] penetration in the program's rows
+SECOND = ("second law", "second rate", "second penetration", "second separation")  # outputs of `force`
 RESTITUTING = 6  # which parameter of `force` says so
 
 
@@ -73,7 +75,9 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
     return make_block([*z, bends], [s, after], out, lanes=2)
 
 
-def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None) -> BlockExpression:
+def collision(
+    c: StanceCoordinates, striker: str, frozen: Effects | None = None, second: str = ""
+) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision.
 
     H, J and bias are those at the point, anew at each (steps 1a to 4a of the paper); or those that a freeze
@@ -83,7 +87,7 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
     tau = tau_ff + Kp (phi_ref - phi) + Kd (phidot_ref - phidot).
 
     z = y0, u0 (ydot) at contact; feed-forward over torque limit (n); d1, T1, d, T: y = y0 + T1 d1 + T d;
-        u = ydot; u' (in the phase's s); legs; f [N]; w (6 a sole).
+        u = ydot; u' (in the phase's s); legs; f [N], with a second striker two; w (6 a sole).
       not frozen: legs and leg rates of the coasting reference.
       frozen: y, ydot and legs of the freeze; rates of the reference's legs when its segment began, their
         acceleration, time [s] since; rates of the legs and their lag behind the reference, each with its
@@ -96,7 +100,8 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
     ny, n, nl, nw = c.ny, c.robot.n, c.nl, 6 * len(c.legs)
     y0, u0, d1, d, u, u1 = (ca.SX.sym(s, ny) for s in ("y0", "u0", "d1", "d", "u", "u1"))
     legs, ff, w = ca.SX.sym("legs", nl), ca.SX.sym("ff", n), ca.SX.sym("w", nw)
-    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
+    strikers = _strikers(striker, second)
+    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f", len(strikers))
     normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
     weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
@@ -118,9 +123,11 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
             more.append(carried)
     v, a = _motion(c, *at, ydd, jdot=frozen is None or frozen.jdot)
     q = c.configuration(at[0], at[2])
-    row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{striker}")[:3, :])])(q)
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
-    tau += ca.mtimes(row.T, normal) * f - c.sole_wrench_map(at[2], w - carried)
+    for k, name in enumerate(strikers):
+        row = ca.Function("row", [c.rb.q], [ca.densify(c.rb.jacobian(f"striker:{name}")[:3, :])])(q)
+        tau += ca.mtimes(row.T, normal) * f[k]
+    tau -= c.sole_wrench_map(at[0], at[2], w - carried)
     # position and rate of the reference relative to the robot, by joint (the base's part is not the servo's)
     if frozen is None:
         lag, slower = lag - legs, slower - leg_part(c, v)
@@ -145,6 +152,10 @@ def collision(c: StanceCoordinates, striker: str, frozen: Effects | None = None)
     return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through, lanes=4)
 
 
+def _strikers(striker: str, second: str) -> list[str]:
+    return [striker, second] if second else [striker]
+
+
 def _motion(
     c: StanceCoordinates, y: Any, u: Any, legs: Any, ydd: Any, *, jdot: bool = True
 ) -> tuple[Any, Any]:
@@ -161,25 +172,35 @@ def _inverse_dynamics(c: StanceCoordinates, q: Any, v: Any, a: Any, *, bias: boo
 
 
 def force(
-    c: StanceCoordinates, striker: str, law: ContactLaw, target: Target, frozen: Effects | None = None
+    c: StanceCoordinates,
+    striker: str,
+    law: ContactLaw,
+    target: Target,
+    frozen: Effects | None = None,
+    second: str = "",
 ) -> BlockExpression:
     """Contact law and target at one collocation point (equations 14 to 17, integrated).
 
     z = y0; d1, T1, d, T, u as in :func:`collision`, or where its dynamics are frozen in place of y0, d1, d
-        and u those of the hand along the normal (no y0; 7b); f [N]; the target's state and its slope (in s);
+        and u those of the hand along the normal (no y0; 7b); f [N], with a second striker two, whose sum the
+        target feels; the target's state and its slope (in s);
         travel x of its surface, x' and x1 as d, u and d1; slope p' of the impulse.
     p = point (3), normal (3), 1 in restitution else 0, the law's parameters, the target's; of a target with
-        events before them, of each phase, 1 in it else 0, and how long [s] it has to last.
+        events before them, of each phase, 1 in it else 0, and how long [s] it has to last; the second point.
     out = (f - law) / 100 N, state' - T d(state)/dt over its typical size, x' - speed [m/s], p' - T f [N s],
         approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N, speed of the target's
-        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts.
+        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts; of a second
+        striker: law, approach speed, penetration and what is zero at separation.
     """
     ny, n = c.ny if frozen is None else 1, target.n_states
     y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
-    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f")
+    strikers = _strikers(striker, second)
+    T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f", len(strikers))
+    total = ca.sum1(f)
     state, slope = ca.SX.sym("state", n), ca.SX.sym("slope", n)
     x, rate_x, x1, rate_p = (ca.SX.sym(s) for s in ("x", "rate_x", "x1", "rate_p"))
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("n", 3)
+    other = ca.SX.sym("other", 3 * bool(second))
     restituting, phases = ca.SX.sym("restituting"), range(len(target.phases) if target.guards else 0)
     within, shortest = ca.SX.sym("within", len(phases)), ca.SX.sym("shortest", min(len(phases), 1))
     of_law = ca.SX.sym("law", len(law.parameters))
@@ -187,13 +208,15 @@ def force(
     y, gone = ca.SX.sym("y", ny), ca.SX.sym("gone")
     if frozen is None:
         q, vel, _ = c.upper_motion(y, u, ca.SX.zeros(ny))
-        place, twist, _ = striker_kinematics(c, striker)(q, vel, ca.SX.zeros(c.rb.nv))
-        way, approach = ca.dot(normal, place - point), ca.dot(normal, twist)
+        hands = []
+        for name, at in zip(strikers, (point, other), strict=False):
+            place, twist, _ = striker_kinematics(c, name)(q, vel, ca.SX.zeros(c.rb.nv))
+            hands.append((ca.dot(normal, place - at), ca.dot(normal, twist)))
     else:
-        way, approach = y, u
+        hands = [(y, u)]
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
-    pieces = [target.smooth(state, f, k, numbers) for k in phases or (0,)]
+    pieces = [target.smooth(state, total, k, numbers) for k in phases or (0,)]
     speed, moves = ca.SX(pieces[0][0]), ca.vertcat(ca.SX(0, 1), *pieces[0][1])
     event = invariant = ca.SX(0, 1)
 
@@ -203,27 +226,34 @@ def force(
     if target.guards:
         speed, moves = of_phase([[v] for v, _ in pieces]), of_phase([rates for _, rates in pieces])
         event = of_phase(
-            [[target.guard(state, f, T - shortest, k, numbers)] for k in range(len(target.guards))]
+            [[target.guard(state, total, T - shortest, k, numbers)] for k in range(len(target.guards))]
         )
-        invariant = of_phase([target.invariant(state, f, k, numbers) for k in phases])
-    penetration, rate = way - gone, approach - speed
-    compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
+        invariant = of_phase([target.invariant(state, total, k, numbers) for k in phases])
+    of_hands = []
+    for k, (way, approach) in enumerate(hands):
+        penetration, rate = way - gone, approach - speed
+        compress, restitute = (law.branch(penetration, rate, flag, named) for flag in (True, False))
+        off = (f[k] - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE
+        ends = ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE
+        of_hands.append((off, rate, penetration / DEPTH_SCALE, ends))
+    off, rate, deep, ends = of_hands[0]
     out = {
-        "law": (f - ((1 - restituting) * compress + restituting * restitute)) / FORCE_SCALE,
+        "law": off,
         "target": (slope - T * moves) / np.array(typical_state(target)),
         "travel": rate_x - speed,
-        "impulse": rate_p - T * f,
+        "impulse": rate_p - T * total,
         "rate": rate,
-        "penetration": penetration / DEPTH_SCALE,
-        "separation": ca.SX(law.separation(penetration, rate, named)) / FORCE_SCALE,
+        "penetration": deep,
+        "separation": ends,
         "speed": speed,
         "event": event,
         "invariant": invariant,
+        **(dict(zip(SECOND, of_hands[1], strict=True)) if second else {}),
     }
     z = [*([y0] if frozen is None else []), d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
     start = y0 if frozen is None else 0.0
     through = [(y, start + T1 * d1 + T * d), (gone, T1 * x1 + T * x)]
-    p = [point, normal, restituting, within, shortest, of_law, of_target]
+    p = [point, normal, restituting, within, shortest, of_law, of_target, other]
     return make_block(z, p, out, through, lanes=4)
 
 
@@ -249,7 +279,7 @@ def carried(c: StanceCoordinates) -> BlockExpression:
     w, weight, lever = ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("weight"), ca.SX.sym("lever")
     v = c.velocity(y, legs, u)
     force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv)) - c.sole_wrench_map(
-        legs, w
+        y, legs, w
     )
     out = {"base": force[: c.base] / base_scale(c, weight, lever)}
     return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
@@ -278,7 +308,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     limit, weight, lever = ca.SX.sym("limit", n), ca.SX.sym("weight"), ca.SX.sym("lever")
     q, push = _pushed(c, striker, y, legs, normal)
     change = c.velocity(y, legs, du)
-    balance = _inertia(c)(q, change) + push * blow - c.sole_wrench_map(legs, w)
+    balance = _inertia(c)(q, change) + push * blow - c.sole_wrench_map(y, legs, w)
     lost = -ca.dot(
         push, change
     )  # speed that the impulse takes from the hand; I over it is the effective mass
@@ -312,7 +342,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     weight, lever, before = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("before")
     q, push = _pushed(c, striker, y, legs, normal)
     jump = c.velocity(y, legs, change)
-    balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(legs, w)
+    balance = _inertia(c)(q, jump) + push * f - c.sole_wrench_map(y, legs, w)
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {

@@ -22,7 +22,7 @@ from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact import Contact, ContactState, add_coasting
 from impactopt.transcription.contact_blocks import DEPTH_SCALE, RESTITUTING
 from impactopt.transcription.finer_contact import carry_contact, same_places
-from impactopt.transcription.hit import Hit
+from impactopt.transcription.hit import Hit, approaches
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.mesh import CollocationPoint, Elements, halved
 from impactopt.transcription.mesh_refinement import GEAR
@@ -75,7 +75,7 @@ def contact_error(t: ContactProgram, x: Array) -> ContactError | None:
         return ContactError(pct=np.inf, coarse=np.inf, of_elements=unknown, missed=False)
     coarse, grown, errors = [], [], []
     finer, outputs = list[PlannedCollision](), again.program.outputs(branches)
-    approach = float(t.program.outputs(x)["contact"][0, 3])
+    approach = approaches(t.program.outputs(x))
     for new, old in zip(again.hit.collisions, t.hit.collisions, strict=True):
         assert isinstance(new, Collision) and isinstance(old, Collision)
         finer.append(new.decode(branches, outputs, approach))
@@ -130,6 +130,8 @@ class _Again:
         last = len(self.hit.stages) - 1
         for k in range(len(self.hit.collisions)):
             b.equal("contact law", "end", ["force"], self.hit.output(k, last, "law"))
+            if t.problem.second is not None:
+                b.equal("contact law", "end", ["second force"], self.hit.output(k, last, "second law"))
         n = b.layout.n
         self.program = StructuredProgram(
             b.layout,
@@ -193,7 +195,7 @@ class _Again:
         depth, rate = DEPTH_SCALE * of[:, part["penetration"][0]], of[:, part["rate"][0]]
         restituting = block.value.inputs[1][: block.count, RESTITUTING] > 0
         law, n = self._builder.problem.law, len(self.hit.stages)
-        wrong = np.zeros(block.count, dtype=bool)
+        wrong = np.zeros(block.count, dtype=bool)  # of two strikers by the first: both turn at one instant
         for k, collision in enumerate(self.hit.collisions):
             assert isinstance(collision, Collision)
             mine = slice(k * n, (k + 1) * n)
@@ -237,12 +239,13 @@ def _grown(new: Collision, old: Collision, z: Array, x: Array) -> Array:
 
 def _off(new: Collision, old: Collision, z: Array, x: Array) -> float:
     """Error of the impulse [%]; inf where bodies part within a phase, or do not part at its end."""
-    force, last = new.f.read(z)[:, 0], list(new.stages[-1].members)
+    each, last = new.f.read(z), list(new.stages[-1].members)
+    force = each.sum(axis=1)
     duration, peak = float(new.T[-1].read(z)[0, 0]), float(np.abs(force).max())
     # it falls to zero a little earlier or later than planned
     places = duration * np.array([new.stages[k].place for k in last])
     slope = float(np.polyval(np.polyder(np.polyfit(places, force[last], len(last) - 1)), places[-1]))
-    apart = not new.holds and force[: last[0]].min(initial=0.0) < -_MISSED * peak
+    apart = not new.holds and each[: last[0]].min(initial=0.0) < -_MISSED * peak
     if apart or (slope >= 0 and force[-1] > _MISSED * peak):
         return float(np.inf)
     left = 0.5 * float(force[-1]) ** 2 / -slope if slope < 0 else 0.0

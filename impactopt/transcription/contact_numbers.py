@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -46,10 +47,15 @@ class ContactNumbers:
         if not anew and alike(numbers, self._known):
             return
         self._known = numbers
-        law, target = type(p.law)(**self.law), type(p.target)(**self.target)
         # how long the last phase [s] is of a point mass's blow: the unit of what is too short
-        self.natural = float(natural_durations(law, target, self.mass)[-1])
+        self.natural = float(natural_durations(*self.alone(), self.mass)[-1])
         self.shortest = shortest_phases(p, self.natural)
+
+    def alone(self) -> tuple[Any, Any]:
+        """Law and target as one of all strikers has them, which has its share of a mass."""
+        p, numbers = self._b.problem, dict(self.target)
+        numbers |= {"mass": numbers["mass"] / len(p.strikers)} if "mass" in numbers else {}
+        return type(p.law)(**self.law), type(p.target)(**numbers)
 
     def follow(self) -> None:
         """Bounds of durations follow the problem."""
@@ -63,6 +69,7 @@ class ContactNumbers:
         phases = np.column_stack([np.eye(len(self.end)), self.shortest])
         within = phases if p.target.guards else phases[:, :0]
         numbers = [*self.law.values(), *self.target.values()]
+        numbers += [] if p.second is None else [*p.second.point]
         return [
             [*p.point, *p.normal, float(s.phase == len(self.end) - 1), *within[s.phase], *numbers]
             for s in self.stages

@@ -42,6 +42,7 @@ def own_blocks(
         frozen=problem.frozen,
         freezes=problem.freezes,
         first=problem.first_instant,
+        second="" if problem.second is None else problem.second.striker,
     )
 
 

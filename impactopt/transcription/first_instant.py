@@ -80,8 +80,8 @@ class FirstInstant:
 def jump(
     problem: ImpactProblem, c: StanceCoordinates, law: ContactLaw, y: Array, rates: Array, legs: Array
 ) -> tuple[float, Array, Array, Array]:
-    """First force [N]; by how much it changes yddot (ny,) and the sole wrenches (6 a sole); and the joints'
-    accelerations (n,) then, of a robot that has coasted until then.
+    """First force [N] of all strikers; by how much it changes yddot (ny,) and the sole wrenches (6 a sole);
+    and the joints' accelerations (n,) then, of a robot that has coasted until then.
     """
     model = problem.robot.model
     q, v, a = c.complete_motion(y, rates, np.zeros(c.ny), legs)
@@ -89,13 +89,15 @@ def jump(
     upper = np.triu(pin.crba(model, data, q))
     inertia = upper + np.triu(upper, 1).T
     soles = c.sole_jacobians(q)[0] if c.legs else np.zeros((0, model.nv))
-    hand = model.getFrameId(problem.robot.striker(problem.striker).model_frame)
+    hands = [model.getFrameId(problem.robot.striker(name).model_frame) for name in problem.strikers]
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     axes = pin.LOCAL_WORLD_ALIGNED
-    row = problem.normal @ np.reshape(pin.getFrameJacobian(model, data, hand, axes), (6, model.nv))[:3]
-    force = float(law.branch(0.0, float(row @ v - problem.target.speed_before()), True))
-    both = np.linalg.solve(inertia, np.column_stack([soles.T, -force * row]))
+    found = [np.reshape(pin.getFrameJacobian(model, data, hand, axes), (6, model.nv))[:3] for hand in hands]
+    rows = np.array([problem.normal @ jacobian for jacobian in found])
+    rates = rows @ v - float(problem.target.speed_before())
+    forces = np.array([float(law.branch(0.0, float(rate), True)) for rate in rates])
+    both = np.linalg.solve(inertia, np.column_stack([soles.T, -forces @ rows]))
     spread, free = both[:, :-1], both[:, -1]
     w: Array = np.zeros(0)
     if len(soles):
@@ -106,4 +108,4 @@ def jump(
         base[:3] = pin.rpy.rpyToMatrix(y[3:6]) @ base[:3]
         base[3:] = np.linalg.solve(pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL), base[3:])
     independent = np.concatenate([base, change[c.base :][c.independent]])
-    return force, independent, w, np.asarray((a + change)[c.base :])
+    return float(forces.sum()), independent, w, np.asarray((a + change)[c.base :])

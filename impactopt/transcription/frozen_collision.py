@@ -300,7 +300,7 @@ class FrozenCollision(Collision):
 
     def _reference_rows(self, start: int, size: int) -> None:
         b, part = self._b, self._b.parts("coasting")
-        closure = [f"{leg.sole.name} sole {d}" for leg in b.coordinates.legs for d in DIRECTIONS]
+        closure = [f"{leg.end} {d}" for leg in b.coordinates.legs for d in DIRECTIONS]
         for k in range(self.coast_legs.count):
             term, place = "legs of the coasting reference", f"freeze {k}{self.suffix}"
             outputs = start + k * size
@@ -360,4 +360,4 @@ class FrozenCollision(Collision):
     def _speed(self, y: Array, rates: Array, legs: Array) -> float:
         """Of the hand along the normal [m/s]."""
         p = self._b.problem
-        return effective_mass(self._b.coordinates, p.striker, p.normal, y, legs, rates)[1]
+        return effective_mass(self._b.coordinates, p.strikers, p.normal, y, legs, rates)[1]

@@ -6,7 +6,7 @@ The law and the target are the true ones, switches and all, integrated by SciPy.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,21 +53,27 @@ class Blow:
 
 
 def effective_mass(
-    c: StanceCoordinates, striker: str, normal: Array, y: Array, legs: Array, rates: Array
+    c: StanceCoordinates, strikers: Sequence[str], normal: Array, y: Array, legs: Array, rates: Array
 ) -> tuple[float, float]:
-    """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s]."""
-    frames = [sole.frame for sole in c.soles]
-    body = Held.at(c.model, c.join(y, legs), frames, c.robot.striker(striker).model_frame)
-    v = c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
-    mass = 1 / float(normal @ body.inverse_mass() @ normal)
-    return mass, max(float(normal @ body.hand @ v), 0.1)
+    """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s].
+
+    Of several strikers: of each, with the others as fast; and their mean speed.
+    """
+    q, v = c.join(y, legs), c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
+    bodies = [Held.at(c.model, q, c.frames, c.robot.striker(name).model_frame) for name in strikers]
+    rows, held = np.array([normal @ body.hand for body in bodies]), bodies[0].held
+    speed, m = float((rows @ v).mean()), len(held)
+    both = np.vstack([held, rows])
+    inner = both @ np.linalg.solve(bodies[0].inertia, both.T)
+    yields = inner[m:, m:] - inner[m:, :m] @ np.linalg.lstsq(inner[:m, :m], inner[:m, m:], rcond=1e-12)[0]
+    return float(np.linalg.solve(yields, np.ones(len(rows))).mean()), max(speed, 0.1)
 
 
 def mass_at_contact(problem: ImpactProblem) -> float:
     """Of the robot at its striker [kg], where inverse kinematics reaches the target."""
     c = problem.coordinates
     y, legs = c.split(problem.contact_posture)
-    return effective_mass(c, problem.striker, problem.normal, y, legs, np.zeros(c.ny))[0]
+    return effective_mass(c, problem.strikers, problem.normal, y, legs, np.zeros(c.ny))[0]
 
 
 def coasted(

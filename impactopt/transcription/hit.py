@@ -25,6 +25,12 @@ from impactopt.transcription.rows import Index, Place
 DRIFT = 2e-3  # of the contact's time: how far a freeze may be from where it is asked for
 
 
+def approaches(outputs: dict[str, Array]) -> Array:
+    """Speeds (strikers,) [m/s] along the normal at contact, from the blocks' outputs."""
+    names = ("contact", "second_contact")
+    return np.array([float(outputs[name][0, 3]) for name in names if name in outputs])
+
+
 class Hit(Contacts):
     """Takes what all collisions start from; hands them back.
 
@@ -161,7 +167,7 @@ class Hit(Contacts):
 
     def decode(self, x: Array, outputs: dict[str, Array]) -> dict[str, Any]:
         """What plans and strikes say of the contact, for solver variables (n,) and the blocks' outputs."""
-        approach = float(outputs["contact"][0, 3])
+        approach = approaches(outputs)
         compression, restitution = self.expected.durations(x)
         scenarios = [
             PlannedScenario(
@@ -176,7 +182,7 @@ class Hit(Contacts):
             "compression": compression,
             "restitution": restitution,
             "collision": self.expected.decode(x, outputs, approach),
-            "hand_speed": approach,
+            "hand_speed": float(approach[0]),
             "impulse": self.impulse(x),
             "scenarios": tuple(scenarios),
         }

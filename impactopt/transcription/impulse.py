@@ -109,7 +109,7 @@ class InstantImpact:
     def durations(self, x: Array) -> tuple[float, float]:
         return 0.0, 0.0
 
-    def decode(self, x: Array, outputs: dict[str, Array], approach: float) -> PlannedCollision:
+    def decode(self, x: Array, outputs: dict[str, Array], approaches: Array) -> PlannedCollision:
         b = self._b
         gained = float(self.blow.read(x)[0, 0]) / self.mass
         outcome = self.target.outcome([gained] * self.target.n_states)

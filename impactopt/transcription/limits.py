@@ -17,6 +17,7 @@ from impactopt.problem.terms import (
     TorqueLimit,
     VelocityLimit,
 )
+from impactopt.problem.terms.grip import WRENCH
 from impactopt.transcription.rows import Measure
 
 GRAVITY = 9.81
@@ -62,7 +63,5 @@ class Limits:
             "upper": self.legs_upper,
             "labels": c.leg_labels,
         }
-        wrench_labels = [
-            f"{leg.sole.name} sole {k}" for leg in c.legs for k in ("fx", "fy", "fz", "mx", "my", "mz")
-        ]
+        wrench_labels = [f"{leg.end} {k}" for leg in c.legs for k in WRENCH]
         self.of_wrenches: dict[str, Any] = {"scale": self.wrench_scale, "labels": wrench_labels}

@@ -25,7 +25,7 @@ def add_nodes(
     limits, rates = b.robot.torque_limit, b.robot.velocity_limit[c.dependent]
     numbers = np.concatenate([limits, rates, b.limits.units, c.start_determinants])
     first, torques = b.add_block("node", instances, numbers), []
-    closure = [f"{leg.sole.name} sole {d}" for leg in c.legs for d in DIRECTIONS]
+    closure = [f"{leg.end} {d}" for leg in c.legs for d in DIRECTIONS]
     fast = percent("over its limit", of=b.limits.velocity.fraction)
     for i, (place, slots) in enumerate(zip(places, instances, strict=True)):
         at = first + i * b.blocks[-1].n_out
@@ -48,7 +48,7 @@ def add_nodes(
         b.rows.add(
             term=b.limits.extension.name,
             place=place,
-            components=[f"{leg.sole.name} leg" for leg in c.legs],
+            components=[leg.limb for leg in c.legs],
             outputs=at + part["extension"],
             lower=b.limits.extension.minimum,
             measure=percent("too near to straight", of=b.limits.extension.minimum),
@@ -63,9 +63,11 @@ def add_cone_rows(
 ) -> None:
     """Rows: each sole's wrench (6 a sole) is in its cone, its normal force [N] no less than the least."""
     for k, leg in enumerate(b.coordinates.legs):
+        if leg.sole is None:  # a hand: see `Grip`
+            continue
         w = wrench[6 * k : 6 * k + 6]
         rows = contact_wrench_cone(leg.sole.polygon, b.limits.cone.friction, margin=margin) / b.limits.weight
-        normal, sole = w[2:3] * (1 / b.limits.weight), f"{leg.sole.name} sole"
+        normal, sole = w[2:3] * (1 / b.limits.weight), leg.end
         b.rows.add(
             term=b.limits.cone.name,
             place=place,

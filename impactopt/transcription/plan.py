@@ -63,12 +63,12 @@ class Motion:
 class PlannedCollision:
     """The collision that the plan predicts, at its m collocation points.
 
-    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N]; target_speed (m + 1,) [m/s] of
-    its surface; outcome: what the blow has brought the target, by name and unit (``speed_m_s`` of a free
-    mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n) [N m], servo and feed-forward;
-    ground (m, 6) total ground wrench about the world's origin [N, N m]; sole_wrench (m, 6 a sole) in each
-    sole's frame. velocity, acceleration (m + 1, n) [rad/s, rad/s^2] of the joints, the first at once after
-    contact, when a damped contact has a force already; (0, 0) where a model does not know them.
+    time (m + 1,) [s] since contact, which is the first; force (m + 1,) [N], forces (m + 1, strikers) of each;
+    target_speed (m + 1,) [m/s] of its surface; outcome: what the blow has brought the target, by name and
+    unit (``speed_m_s`` of a free mass, ``depth_m`` of a nail, ``broken`` of a board); torque (m + 1, n)
+    [N m], servo and feed-forward; ground (m, 6) wrench about the world's origin [N, N m]; sole_wrench (m, 6 a
+    sole, 6 a hand that holds on), in own frames. velocity, acceleration (m + 1, n) of the joints, the first
+    at once after contact, when a damped contact has a force already; (0, 0): not known.
     """
 
     time: Array = field(repr=False)
@@ -80,6 +80,7 @@ class PlannedCollision:
     sole_wrench: Array = field(repr=False)
     velocity: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     acceleration: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    forces: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -375,7 +376,7 @@ def complete_reference(
             miss = tau[:6] - jac[:, :6].T @ wrench[k]
             w = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / scale
             tau = tau - jac.T @ w
-            ground[k] = _about_origin(place, w)
+            ground[k] = _about_origin(place[: len(c.soles)], w)
         torque[k] = tau[c.base :]
     return q, v, a, torque, ground
 
@@ -393,7 +394,7 @@ def _about_origin(placements: list[pin.SE3], wrenches: Array) -> Array:
 def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
     """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
 
-    The soles are where they are held.
+    The soles are where they are held. What hands hold on to is not the ground.
     """
-    placements = [leg.placement for leg in coordinates.legs]
+    placements = [leg.placement for leg in coordinates.legs if leg.sole is not None]
     return np.array([_about_origin(placements, w) for w in wrenches])

@@ -70,7 +70,7 @@ def held_blow(t: ContactProgram, x: Array) -> HeldBlow | None:
     if not isinstance(hit, Collision) or not hit.holds:
         return None
     y, legs, rates = t.contact_state[0].evaluate(x), t.contact_legs.evaluate(x), t.u0.read(x)[0]
-    mass, speed = effective_mass(c, p.striker, p.normal, y, legs, rates)
+    mass, speed = effective_mass(c, p.strikers, p.normal, y, legs, rates)
     return HeldBlow(law=p.law, target=p.target, mass=mass, speed=speed, duration=sum(hit.durations(x)))
 
 

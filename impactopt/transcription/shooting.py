@@ -140,7 +140,7 @@ class Shooting:
     def _state(self) -> _Called:
         c = self.coordinates
         held = tuple(
-            (leg.sole.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)), *map(tuple, leg.order))
+            (leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)), *map(tuple, leg.order))
             for leg in c.legs
         )
         found = cached(

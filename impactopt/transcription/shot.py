@@ -57,7 +57,7 @@ class Shot:
         minimum = 0.0 if self.scenario else cone.minimum_force
         rows, least = [np.zeros((0, b.nw))], [np.zeros(0)]
         for k, leg in enumerate(b.coordinates.legs):
-            if margin is None:
+            if margin is None or leg.sole is None:  # a hand, which strikes by shooting refuse
                 continue
             own = np.vstack(
                 [contact_wrench_cone(leg.sole.polygon, cone.friction, margin=margin), np.eye(6)[2]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -29,24 +29,30 @@ OF_MODEL = ("coasting legs", "coasting leg rates")
 
 
 def strike_rates(
-    c: StanceCoordinates, striker: str, y: Array, legs: Array, velocity: Array, *, base: float = 0.3
+    c: StanceCoordinates,
+    strikers: Sequence[str],
+    y: Array,
+    legs: Array,
+    velocity: Array,
+    *,
+    base: float = 0.3,
 ) -> Array:
-    """Least rates ydot (ny,) that give the striking point ``velocity`` (3,) [m/s].
+    """Least rates ydot (ny,) that give the striking points ``velocity`` (3,) [m/s].
 
     ``base`` : ease of the base's rates.
     """
     model, data = c.model, c.model.createData()
-    fid = model.getFrameId(f"striker:{striker}")
+    frames = [model.getFrameId(f"striker:{name}") for name in strikers]
 
     def point(at: Array) -> Array:
         pin.framesForwardKinematics(model, data, c.join(at, legs))
-        return np.array(data.oMf[fid].translation)
+        return np.concatenate([data.oMf[frame].translation for frame in frames])
 
     h = 1e-6
     jac = np.stack([(point(y + h * e) - point(y - h * e)) / (2 * h) for e in np.eye(c.ny)], axis=1)
     weight = np.ones(c.ny)
     weight[: c.base] = base
-    return np.asarray(weight * np.linalg.lstsq(jac * weight, velocity, rcond=None)[0])
+    return np.asarray(weight * np.linalg.lstsq(jac * weight, np.tile(velocity, len(frames)), rcond=None)[0])
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)
-    rates = strike_rates(c, p.striker, y, legs, speed * p.normal)
+    rates = strike_rates(c, p.strikers, y, legs, speed * p.normal)
     return Contact(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 
 

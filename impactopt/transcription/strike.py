@@ -80,6 +80,9 @@ class StrikeTranscription(ContactProgram):
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         return [(Place.plain("contact"), self.feedforward[0], self._node)]
 
+    def _node_slots(self) -> list[tuple[Place, list[Affine]]]:
+        return [(Place.plain("contact"), self._node)]
+
     def _determined(self) -> list[Determined]:
         return [*at_node([*by_leg(self.legs.index(0)), self.w.index(0)[:6]]), *self.hit.determined()]
 

@@ -23,25 +23,34 @@ def _slowest(b: Builder) -> float:
 
 
 def add_touch_rows(b: Builder, state: ContactState) -> None:
-    """Hit point, approach speed and incidence, but for what a term of the problem takes the place of."""
+    """Hit point, approach speed and incidence, but for what a term of the problem takes the place of; of a
+    second striker too.
+    """
+    for k, block in enumerate(["contact", "second_contact"][: len(b.problem.strikers)]):
+        _add_rows(b, state, block, k)
+
+
+def _add_rows(b: Builder, state: ContactState, block: str, number: int) -> None:
     p, incidence = b.problem, b.limits.incidence
-    at = b.add_block("contact", [[state.y, state.y1, state.T]], rotation_rows(p.normal).ravel())
+    striker, point = p.contacts[number]
+    named = f"{striker} " if number else ""
+    at = b.add_block(block, [[state.y, state.y1, state.T]], rotation_rows(p.normal).ravel())
     if p.extra(HitRegion) is None:
         b.rows.add(
             term="hit point",
             place=Place("contact", ""),
-            components=["x", "y", "z"],
+            components=[f"{named}{axis}" for axis in "xyz"],
             outputs=at + np.arange(3),
-            lower=p.point,
-            upper=p.point,
+            lower=point,
+            upper=point,
             measure=millimetres("away"),
         )
         place = len(b.rows.lower) - 1
-        b.follow(lambda b: b.rows.bound(place, b.problem.point, b.problem.point))
+        b.follow(lambda b: b.rows.bound(place, *[b.problem.contacts[number][1]] * 2))
     b.rows.add(
         term="approach speed",
         place="contact",
-        components=["normal"],
+        components=[f"{named}normal"],
         outputs=np.array([at + 3]),
         lower=_slowest(b),
         measure=Measure("m/s", 1.0, "too slow"),
@@ -52,7 +61,7 @@ def add_touch_rows(b: Builder, state: ContactState) -> None:
         b.rows.add(
             term=incidence.name,
             place="contact",
-            components=["tangent 1", "tangent 2"],
+            components=[f"{named}tangent 1", f"{named}tangent 2"],
             outputs=at + np.array([4, 5]),
             lower=-incidence.speed,
             upper=incidence.speed,

@@ -45,6 +45,8 @@ from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.swing import Swing
 from impactopt.transcription.touch import add_touch_rows
 
+SECOND_BLOCKS = ("second_contact", "second_approach")
+
 
 def block_functions(
     problem: ImpactProblem,
@@ -61,9 +63,9 @@ def block_functions(
     recipe = (
         model_hash(robot.model),
         tuple(
-            (leg.sole.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12)))
-            for leg in coordinates.legs
+            (leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in coordinates.legs
         ),
+        tuple(np.round(coordinates.start, 12)) if coordinates.hands else (),
         tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
         problem.striker,
         edges,
@@ -73,7 +75,9 @@ def block_functions(
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     out: dict[str, Any] = {}
     springs = tuple(np.flatnonzero(robot.passive).tolist())
-    keys = {"force": contact, "first": contact[:1], "collision": (*frozen, *springs), "coasting": frozen}
+    second = () if problem.second is None else (problem.second.striker,)
+    keys = {"force": (*contact, *second), "first": contact[:1], "coasting": frozen}
+    keys |= {"collision": (*frozen, *springs, *second), **dict.fromkeys(SECOND_BLOCKS, second)}
     found = {
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()
@@ -263,6 +267,10 @@ class Transcription(ContactProgram):
     def _nodes(self) -> list[tuple[Place, Affine, list[Affine]]]:
         slots, places = self._slots
         return list(zip(places, self.torques, slots, strict=True))
+
+    def _node_slots(self) -> list[tuple[Place, list[Affine]]]:
+        slots, places = self._slots
+        return list(zip(places, slots, strict=True))
 
     def _spring_points(self) -> list[SpringPoint]:
         if not self.robot.passive.any():

@@ -86,10 +86,17 @@ class Blow:
         if scenario is not None:
             self.law, self.target = scenario.numbers(law, target)
             self.fraction, self.margin, self.least = scenario.torque, scenario.cone_margin, 0.0
+        second = problem.second
+        self.points = [problem.point, *([] if second is None else [second.point])]  # of the strikers
         self.phases = len(target.phases)
         self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in range(self.phases)]
         self.typical = np.array(target.typical or (1.0,) * target.n_states)
         self.durations = [f"{self.prefix}{name} duration" for name in target.phases]
+
+    @property
+    def _each(self) -> list[str]:
+        """What names of rows begin with, of each striker."""
+        return ["", "second "][: len(self.points)]
 
     # ------------------------------------------------------------------ variables
     def scales(self) -> dict[str, Array]:
@@ -187,7 +194,7 @@ class Blow:
             rates = self.get(v, "coasting leg rates", i)
             return robot.coasting(y, self.get(v, "coasting legs", i), u0, rates)
 
-        closure = [f"{sole.name} sole {d}" for sole, *_ in robot.soles for d in DIRECTIONS]
+        closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
         names = [*closure, *[f"{name} rate" for name in closure]]
         return Piece.of(value, [("legs of the coasting reference", self.place(i), names, 0.0, 0.0)])
 
@@ -209,7 +216,7 @@ class Blow:
             y0, u0, ff = self._start(v), v.get("rate at contact"), v.get("feed-forward at contact")
             y, time, _, _ = self.moved(v, i, y0)
             u, legs = self.get(v, "collision rate", i), self.get(v, "collision legs", i)
-            w, f = self.get(v, "collision sole wrench", i), float(self.get(v, "contact force", i)[0])
+            w, f = self.get(v, "collision sole wrench", i), self.get(v, "contact force", i)
             q, qd, qdd = self.motion(v, i)
             tau = robot.torque(q, qd, qdd, w, f)
             lag = self.get(v, "coasting legs", i) - legs
@@ -220,7 +227,7 @@ class Blow:
             bounded = servo if lifted is None else servo - v.get(lifted)
             return np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
 
-        closure = [f"{sole.name} sole {d}" for sole, *_ in robot.soles for d in DIRECTIONS]
+        closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
         inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, self.least)
         if self.margin is None:
             inside, cone = (lambda w: np.zeros(0)), []
@@ -243,16 +250,16 @@ class Blow:
         legs = self.get(v, "collision legs", i)
         return self.robot.motion(y, legs, self.get(v, "collision rate", i), slope)
 
-    def contact(self, v: Variables, i: int) -> tuple[float, float, float, float, Array]:
-        """At stage i: penetration [m] and its rate [m/s], force [N], duration [s] of its phase, the target's
-        state.
+    def contact(self, v: Variables, i: int, k: int = 0) -> tuple[float, float, float, float, Array]:
+        """At stage i: penetration [m] of striker k and its rate [m/s], force [N] of all, duration [s] of its
+        phase, the target's state.
         """
         y, _, T, gone = self.moved(v, i, self._start(v))
-        place, fast, _ = self.robot.striking(y, self.get(v, "collision rate", i))
+        place, fast, _ = self.robot.striking(y, self.get(v, "collision rate", i), k)
         normal, state = self.robot.normal, self.get(v, "target state", i)
-        f = float(self.get(v, "contact force", i)[0])
+        f = float(self.get(v, "contact force", i).sum())
         speed = float(self._smooth(i, state, f)[0])
-        way = float(normal @ (place - self.problem.point))
+        way = float(normal @ (place - self.points[k]))
         return way - gone, float(normal @ fast) - speed, f, T, state
 
     def _smooth(self, i: int, state: Array, f: float) -> tuple[Any, Array]:
@@ -268,14 +275,18 @@ class Blow:
         releases = phase == self.phases - 1
 
         def value(v: Variables) -> Array:
-            depth, rate, f, T, now = self.contact(v, i)
+            _, rate, f, T, now = self.contact(v, i)
             speed, moves = self._smooth(i, now, f)
             slopes = self.slope(v, "target state", i, np.zeros(n)) - T * moves
             travel = self.slope(v, "target travel", i, np.zeros(1), anew=True) - float(speed)
             given = self.slope(v, "impulse so far", i, np.zeros(1)) - T * f
             parts = [slopes / self.typical, travel, given]
-            if i != self.end[-1]:
-                parts.append(np.array([(f - float(law.branch(depth, rate, not releases, self.law))) / FORCE]))
+            own = self.get(v, "contact force", i) if i != self.end[-1] else ()
+            for k, force in enumerate(own):
+                deep, fast, *_ = self.contact(v, i, k)
+                parts.append(
+                    np.array([(force - float(law.branch(deep, fast, not releases, self.law))) / FORCE])
+                )
             if signed:
                 parts.append(np.array([rate]))
             if guarded:
@@ -288,7 +299,7 @@ class Blow:
             ("impulse", place, ["target"], 0.0, 0.0),
         ]
         if i != self.end[-1]:
-            rows.append(("contact law", place, ["force"], 0.0, 0.0))
+            rows.append(("contact law", place, [f"{one}force" for one in self._each], 0.0, 0.0))
         if signed:
             way = (-np.inf, 0.0) if releases else (0.0, np.inf)
             rows.append(("approach speed", place, ["striker and target"], *way))
@@ -312,15 +323,17 @@ class Blow:
             turn = self.end[len(target.guards)]
 
             def turned(v: Variables) -> Array:
-                return np.array([self.contact(v, turn)[1]])
+                return np.array([self.contact(v, turn, k)[1] for k in range(len(self.points))])
 
-            out.append(Piece.of(turned, [("end of compression", where, ["approach speed"], 0.0, 0.0)]))
+            names = [f"{one}approach speed" for one in self._each]
+            out.append(Piece.of(turned, [("end of compression", where, names, 0.0, 0.0)]))
 
         def parted(v: Variables) -> Array:
-            depth, rate, *_ = self.contact(v, self.end[-1])
-            return np.array([float(law.separation(depth, rate, self.law)) / FORCE])
+            last = (self.contact(v, self.end[-1], k)[:2] for k in range(len(self.points)))
+            return np.array([float(law.separation(*found, self.law)) / FORCE for found in last])
 
-        out.append(Piece.of(parted, [("separation", where, ["force"], 0.0, 0.0)]))
+        names = [f"{one}force" for one in self._each]
+        out.append(Piece.of(parted, [("separation", where, names, 0.0, 0.0)]))
         if target.guards:
             out.append(self._joined(where))
         return out

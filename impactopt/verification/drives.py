@@ -191,7 +191,7 @@ class FirstInstant:
             fast = float(robot.normal @ robot.striking(y, u)[1])
             still = np.zeros(robot.model.nv)
             bare = robot.torque(q, still, still, 0 * v.get(self._wrench))
-            left = robot.torque(q, still, jump, v.get(self._wrench), force) - bare
+            left = robot.torque(q, still, jump, v.get(self._wrench), [force]) - bare
             wanted = float(law.branch(0.0, fast - before, True, self._blow.law))
             return np.concatenate(
                 [

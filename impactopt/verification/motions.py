@@ -15,11 +15,13 @@ from impactopt.problem.phase import Phase
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     ContactWrenchCone,
+    Grip,
     LegExtension,
     PositionLimit,
     TorqueLimit,
     VelocityLimit,
 )
+from impactopt.problem.terms.grip import WRENCH
 from impactopt.verification.robot_motion import RobotMotion
 from impactopt.verification.variables import Piece, Variables
 
@@ -37,6 +39,7 @@ class Limits:
         r = problem.robot
         self.torque, self.velocity = problem.term(TorqueLimit), problem.term(VelocityLimit)
         self.cone, self.extension = problem.term(ContactWrenchCone), problem.term(LegExtension)
+        self.grip = problem.extra(Grip)
         margin = problem.term(PositionLimit).margin
         lower, upper = r.lower + margin, r.upper - margin
         box = BASE_BOX[: robot.base]
@@ -47,16 +50,26 @@ class Limits:
         self.legs = lower[robot.dependent], upper[robot.dependent]
 
     def cone_rows(
-        self, robot: RobotMotion, place: str, margin: float, least: float
+        self, robot: RobotMotion, place: str, margin: float | None, least: float
     ) -> tuple[Callable[[Array], Array], list[Any]]:
-        """Of wrenches (6 a sole): how far inside the cone they are; with the rows that say so."""
+        """Of wrenches (6 a sole): how far inside the cone they are, and what hands that hold on bear, over
+        what they may; with the rows that say so.  margin : [m]; None: the cone is not asked for.
+        """
         parts, rows = [], list[Any]()
-        for k, (sole, *_) in enumerate(robot.soles):
-            facets = contact_wrench_cone(sole.polygon, self.cone.friction, margin=margin) / robot.weight
+        for k, (leg, *_) in enumerate(robot.soles):
+            if leg.sole is None:
+                assert self.grip is not None  # the problem has it
+                most = np.repeat([self.grip.force, self.grip.moment], 3)
+                parts.append((k, np.diag(1 / most)))
+                rows.append((self.grip.name, place, [f"{leg.end} {name}" for name in WRENCH], -1.0, 1.0))
+                continue
+            if margin is None:
+                continue
+            facets = contact_wrench_cone(leg.sole.polygon, self.cone.friction, margin=margin) / robot.weight
             normal = np.zeros((1, 6))
             normal[0, 2] = 1 / robot.weight
             parts.append((k, np.vstack([facets, normal])))
-            name = f"{sole.name} sole"
+            name = leg.end
             components = [f"{name}, facet {i}" for i in range(len(facets))]
             rows.append((self.cone.name, place, components, 0.0, np.inf))
             rows.append(("normal force", place, [name], least / robot.weight, np.inf))
@@ -151,7 +164,7 @@ def node_piece(
     names, fraction = problem_limits.joint_names, limits.torque.fraction
     rates, fast = problem_limits.velocity_limit[robot.dependent], limits.velocity.fraction
     inside, cone = limits.cone_rows(robot, place, limits.cone.margin, limits.cone.minimum_force)
-    closure = [f"{sole.name} sole {d}" for sole, *_ in robot.soles for d in DIRECTIONS]
+    closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
 
     def value(v: Variables) -> Array:
         y, y1, y2, legs, w, T = state(v)
@@ -173,7 +186,7 @@ def node_piece(
         (
             limits.extension.name,
             place,
-            [f"{s.name} leg" for s, *_ in robot.soles],
+            [leg.limb for leg, *_ in robot.soles],
             limits.extension.minimum,
             np.inf,
         ),

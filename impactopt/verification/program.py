@@ -21,7 +21,15 @@ from impactopt.problem.objectives import (
     TargetEnergy,
 )
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import DEFAULT_TERMS, Balance, GearLoad, HandOrientation, Incidence, TargetSpeed
+from impactopt.problem.terms import (
+    DEFAULT_TERMS,
+    Balance,
+    GearLoad,
+    Grip,
+    HandOrientation,
+    Incidence,
+    TargetSpeed,
+)
 from impactopt.verification.apart import apart_pieces
 from impactopt.verification.blow import Blow
 from impactopt.verification.drives import COASTED, Drives, node_torque
@@ -34,7 +42,7 @@ __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
 CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
-_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), HandOrientation, TargetSpeed, GearLoad)
+_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), GearLoad, Grip, HandOrientation, TargetSpeed)
 _KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum, Effort)
 
 
@@ -198,26 +206,39 @@ class Program:
         _, _, vt = np.linalg.svd(p.normal.reshape(1, 3))
         axes = np.vstack([p.normal, vt[1:]])
 
-        def value(v: Variables) -> Array:
-            place, fast, _ = self.robot.striking(*self.state_at_contact(v))
-            return np.concatenate([place, axes @ fast])
+        slow = 0.05 + float(p.target.speed_before())
+        for k, (name, point) in enumerate(self._aims()):
 
-        tangents = ["tangent 1", "tangent 2"]
-        rows: list[Any] = [
-            ("hit point", "contact", ["x", "y", "z"], p.point, p.point),
-            ("approach speed", "contact", ["normal"], 0.05 + float(p.target.speed_before()), np.inf),
-            (incidence.name, "contact", tangents, -incidence.speed, incidence.speed),
-        ]
-        self.rows.append(Piece.of(value, rows))
+            def value(v: Variables, k: int = k) -> Array:
+                place, fast, _ = self.robot.striking(*self.state_at_contact(v), k)
+                return np.concatenate([place, axes @ fast])
+
+            own = f"{name} " if k else ""
+            tangents = [f"{own}tangent 1", f"{own}tangent 2"]
+            rows: list[Any] = [
+                ("hit point", "contact", [f"{own}{axis}" for axis in "xyz"], point, point),
+                ("approach speed", "contact", [f"{own}normal"], slow, np.inf),
+                (incidence.name, "contact", tangents, -incidence.speed, incidence.speed),
+            ]
+            self.rows.append(Piece.of(value, rows))
+
+    def _aims(self) -> list[tuple[str, Array]]:
+        """Strikers and where they hit."""
+        p = self.problem
+        return [(p.striker, p.point), *([] if p.second is None else [(p.second.striker, p.second.point)])]
 
     def _clearance(self) -> None:
+        for k, (striker, point) in enumerate(self._aims()):
+            self._clearance_of(k, striker, point)
+
+    def _clearance_of(self, k: int, striker: str, point: Array) -> None:
         p, robot = self.problem, self.robot
         swing, follow = self.ways[:2]
-        start = robot.striking(robot.y0, np.zeros(robot.ny))[0]
-        nearest = min(CLEARANCE, max(float(p.normal @ (p.point - start)), 0.0))
+        start = robot.striking(robot.y0, np.zeros(robot.ny), k)[0]
+        nearest = min(CLEARANCE, max(float(p.normal @ (point - start)), 0.0))
 
         def along(y: Array) -> float:
-            return float(p.normal @ robot.striking(y, np.zeros(robot.ny))[0])
+            return float(p.normal @ robot.striking(y, np.zeros(robot.ny), k)[0])
 
         def add(term: str, way: Way, s: float, apart: float, plane: Callable[[Variables], float]) -> None:
             at = way.at(s)
@@ -226,25 +247,25 @@ class Program:
                 return np.array([along(at(v)[0]) - plane(v)])
 
             most = -min(nearest, HASTE * apart)
-            self.rows.append(Piece.of(value, [(term, way.place(s), [p.striker], -np.inf, most)]))
+            self.rows.append(Piece.of(value, [(term, way.place(s), [striker], -np.inf, most)]))
 
         def surface(s: float, v: Variables) -> float:
             """[m] of the target along the normal at a fraction of the swing, which it may come in."""
-            return float(p.normal @ p.point) - float(p.target.speed_before()) * (1 - s) * v.one(swing.T)
+            return float(p.normal @ point) - float(p.target.speed_before()) * (1 - s) * v.one(swing.T)
 
         ahead, behind = float(np.mean(p.swing.duration)), float(np.mean(p.follow.duration))
         for s in map(float, swing.nodes[:-1]):
             add("no touch before contact", swing, s, (1 - s) * ahead, partial(surface, s))
         if not p.target.stays:
             return
+        name, first = f"target left by {striker}" if k else "target left", follow.at(0.0)
         for s in map(float, follow.nodes[1:]):
-            add("no touch after contact", follow, s, s * behind, lambda v: v.one("target left"))
-        first = follow.at(0.0)
+            add("no touch after contact", follow, s, s * behind, lambda v: v.one(name))
 
         def left(v: Variables) -> Array:
-            return np.array([along(first(v)[0]) - v.one("target left")])
+            return np.array([along(first(v)[0]) - v.one(name)])
 
-        rows = [("target left", follow.place(0.0), ["target left"], 0.0, 0.0)]
+        rows = [(name, follow.place(0.0), [name], 0.0, 0.0)]
         self.rows.append(Piece.of(left, rows))
 
     def _links(self) -> None:

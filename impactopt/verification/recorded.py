@@ -145,16 +145,17 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
     Each sole's wrench follows from its leg's torques; together they have to be the ground's.
     """
     robot, limit = p.robot, p.problem.robot.torque_limit
-    free = np.setdiff1d(np.arange(robot.n), robot.dependent)
-    yield "torque", _gap(torque[free] / limit[free], tau[robot.base + free] / limit[free])
+    free, rest = np.setdiff1d(np.arange(robot.n), robot.dependent), tau.copy()
+    wrenches = np.zeros(0)
+    if robot.soles:
+        wrenches = robot.wrenches(q, tau - np.concatenate([np.zeros(robot.base), torque]))
+        robot.relieve(rest, q, wrenches)  # a hand that holds on is borne by the waist, too
+    yield "torque", _gap(torque[free] / limit[free], rest[robot.base + free] / limit[free])
     if not robot.soles:
         return
-    wrenches = robot.wrenches(q, tau - np.concatenate([np.zeros(robot.base), torque]))
     world = robot.ground(wrenches)
     six = robot.wrench_scale[:6]
     yield "ground wrench", _gap(world, ground, six)
-    rest = tau.copy()
-    robot.relieve(rest, q, wrenches)
     yield "equation of motion of the base", _gap(rest[: robot.base] / six, np.zeros(robot.base))
 
 
@@ -168,7 +169,7 @@ def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:
     durations = [v.one(name) for name in blow.durations]
     own = [sum(durations[: s.phase]) + s.place * durations[s.phase] for s in blow.stages]
     if len(time) == len(own) + 1:
-        forces = np.array([blow.get(v, "contact force", i)[0] for i in range(len(own))])
+        forces = np.array([blow.get(v, "contact force", i).sum() for i in range(len(own))])
         yield Off("blow", _gap(time[1:], own), "collision_time")
         yield Off("blow", _gap(force[1:], forces, 100.0), "collision_force")
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ class RobotMotion:
     ----------
     ny, nl, n, base : numbers of coordinates, leg joints, joints, and the base's coordinates (6 or 0).
     y0 (ny,), legs0 (nl,) : the start posture.  weight : of the robot [N].
+    soles : what is held, each with its leg, frame, joints in v, and placement: soles first, then hands.
     wrench_scale (6 a sole), base_scale (base,) : weight, and weight x lever for moments [N, N m].
     """
 
@@ -34,7 +36,7 @@ class RobotMotion:
         self.data: Any = robot.model.createData()
         self.base, self.n = held.base, robot.n
         self.soles = [
-            (leg.sole, self.model.getFrameId(leg.sole.frame), self.base + leg.joints, leg.placement)
+            (leg, self.model.getFrameId(leg.frame), self.base + leg.joints, leg.placement)
             for leg in held.legs
         ]
         joints = [joint for joint in self.model.joints if joint.nv == 1]
@@ -43,6 +45,8 @@ class RobotMotion:
         plain = [at for at, joint in zip(where, joints, strict=True) if joint.nq == 1]
         self._plain = np.array(plain, dtype=np.intp).reshape(-1, 2).T
         self._endless = [at for at, joint in zip(where, joints, strict=True) if joint.nq == 2]
+        # those that stand; the others are hands that hold on
+        self.standing = len(held.soles)
         self.independent, self.dependent = held.independent, held.dependent
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         self.labels, self.leg_labels = held.labels, held.leg_labels
@@ -51,7 +55,7 @@ class RobotMotion:
         six = self.weight * np.array([1, 1, 1, LEVER, LEVER, LEVER])
         self.wrench_scale = np.tile(six, len(self.soles))
         self.base_scale = six[: self.base]
-        self.hand = self.model.getFrameId(f"striker:{problem.striker}")
+        self.hands = [self.model.getFrameId(f"striker:{name}") for name in problem.strikers]
         self.normal = np.asarray(problem.normal, dtype=float)
         self._seen: Array | None = None
         self._places: list[Any] = []
@@ -172,17 +176,17 @@ class RobotMotion:
         found = [np.linalg.det(jac[:, columns]) for (_, _, columns, _), jac in legs]
         return np.array(found) / self._determinants if found else np.zeros(0)
 
-    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, force: float = 0.0) -> Array:
+    def torque(self, q: Array, v: Array, a: Array, wrenches: Array, forces: Iterable[float] = ()) -> Array:
         """Generalized force (nv,) that this motion needs, under wrenches (6 a sole) in the soles' frames and
-        the contact's force [N] against the normal at the hand.
+        the contact's forces [N] against the normal at the hands.
         """
         model, data = self.model, self.data
         tau: Array = np.array(pin.rnea(model, data, q, v, a))
         if self.soles:
             self.relieve(tau, q, wrenches)
-        if force:
+        for hand, force in zip(self.hands, forces, strict=False):
             self._seen = None
-            jac = np.reshape(pin.computeFrameJacobian(model, data, q, self.hand, _AXES), (6, model.nv))
+            jac = np.reshape(pin.computeFrameJacobian(model, data, q, hand, _AXES), (6, model.nv))
             tau += jac[:3].T @ self.normal * force
         return tau
 
@@ -218,16 +222,16 @@ class RobotMotion:
     def ground(self, wrenches: Array) -> Array:
         """(6,) [N, N m] about the world's origin, of wrenches (6 a sole) on the held soles."""
         total = np.zeros(6)
-        for k, (_, _, _, place) in enumerate(self.soles):
+        for k, (_, _, _, place) in enumerate(self.soles[: self.standing]):
             total += place.act(pin.Force(wrenches[6 * k : 6 * k + 6])).vector
         return total
 
-    def striking(self, y: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Place (3) [m], velocity (3) [m/s] and axes (3, 3) of the striker, which no held leg carries."""
+    def striking(self, y: Array, u: Array, k: int = 0) -> tuple[Array, Array, Array]:
+        """Place (3) [m], velocity (3) [m/s] and axes (3, 3) of striker k, which no held leg carries."""
         q, v, _ = self._upper(y, u)
         pin.forwardKinematics(self.model, self.data, q, v)
-        at = pin.updateFramePlacement(self.model, self.data, self.hand)
-        fast = pin.getFrameVelocity(self.model, self.data, self.hand, _AXES)
+        at = pin.updateFramePlacement(self.model, self.data, self.hands[k])
+        fast = pin.getFrameVelocity(self.model, self.data, self.hands[k], _AXES)
         return np.array(at.translation), np.array(fast.linear), np.array(at.rotation)
 
     def _upper(self, y: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -244,7 +248,7 @@ class RobotMotion:
         joints = np.zeros(self.n)
         joints[self.independent], joints[self.dependent] = y[self.base :], legs
         self._write(q, joints)
-        v[self.base + self.dependent], v[self.base + self.independent] = rates, 0.0
+        v[self.base + self.dependent] = rates
         return np.concatenate([self.closure(q), self.twists(q, v)])
 
     def momentum(self, q: Array, v: Array) -> tuple[Array, Array, Array]:

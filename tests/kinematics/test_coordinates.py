@@ -36,14 +36,14 @@ class Case:
     motion: Any  # y, legs, yd, ydd -> v, a
     velocity: Any  # y, legs, two rates -> two v
     closure: Any  # y, legs -> closure, its Jacobian in (y, legs)
-    wrenches: Any  # legs, w -> generalized force
+    wrenches: Any  # y, legs, w -> generalized force
     upper: Any  # y, yd, ydd -> q, v, a
     twists: Any  # y, legs, yd, leg rates -> twists of the soles
 
 
-def make_case(robot: Robot, posture: str, soles: int | None = None) -> Case:
+def make_case(robot: Robot, posture: str, soles: int | None = None, hands: tuple[str, ...] = ()) -> Case:
     q = robot.posture(posture)
-    c = StanceCoordinates(robot, robot.soles[:soles], q)
+    c = StanceCoordinates(robot, robot.soles[:soles], q, tuple(robot.striker(name) for name in hands))
     y, yd, ydd = (ca.SX.sym(s, c.ny) for s in ("y", "yd", "ydd"))
     legs, w, rates = ca.SX.sym("legs", c.nl), ca.SX.sym("w", 6 * len(c.legs)), ca.SX.sym("rates", c.ny, 2)
     closure = c.closure(y, legs) if c.legs else ca.SX(0, 1)
@@ -56,7 +56,7 @@ def make_case(robot: Robot, posture: str, soles: int | None = None) -> Case:
         motion=ca.Function("motion", [y, legs, yd, ydd], list(c.motion(y, legs, yd, ydd))),
         velocity=ca.Function("velocity", [y, legs, rates], [c.velocity(y, legs, rates)]),
         closure=ca.Function("closure", [y, legs], [closure, ca.jacobian(closure, ca.vertcat(y, legs))]),
-        wrenches=ca.Function("wrenches", [legs, w], [c.sole_wrench_map(legs, w)]),
+        wrenches=ca.Function("wrenches", [y, legs, w], [c.sole_wrench_map(y, legs, w)]),
         upper=ca.Function("upper", [y, yd, ydd], list(c.upper_motion(y, yd, ydd))),
         twists=ca.Function("twists", [y, legs, yd, leg_rates], [twists]),
     )
@@ -67,6 +67,7 @@ CASES = {
     "g1": lambda: make_case(load_robot("g1"), "half_sitting"),
     "biped": lambda: make_case(biped(), "half_sitting"),
     "biped on its left foot": lambda: make_case(biped(), "half_sitting", 1),
+    "stand-in that holds on": lambda: make_case(load_robot("standin"), "half_sitting", hands=("left_hand",)),
     "arm": lambda: make_case(arm(), "start"),
 }
 FLOATING = [name for name in CASES if name != "arm"]
@@ -121,7 +122,7 @@ def test_coordinates_are_the_base_and_the_joints_outside_the_held_legs(case: Cas
     assert len(c.labels) == c.ny
     assert c.nl == 6 * len(c.legs)
     assert sorted([*c.labels[c.base :], *c.leg_labels]) == sorted(robot.joint_names)
-    held = {j for leg in c.legs for j in robot.limb(leg.sole.frame)}
+    held = {j for leg in c.legs for j in robot.limb(leg.frame)[-6:]}  # of an arm, without the waist
     assert held == set(c.dependent.tolist())
     assert held.isdisjoint(c.independent.tolist())
 
@@ -152,7 +153,7 @@ def test_completed_motions_leave_the_soles_at_rest(standing: Case) -> None:
         pin.forwardKinematics(model, data, q, v, a)
         pin.updateFramePlacements(model, data)
         for leg in c.legs:
-            frame = model.getFrameId(leg.sole.frame)
+            frame = model.getFrameId(leg.frame)
             np.testing.assert_allclose(data.oMf[frame].homogeneous, start.oMf[frame].homogeneous, atol=1e-10)
             for of in (pin.LOCAL, pin.LOCAL_WORLD_ALIGNED):
                 assert np.abs(pin.getFrameVelocity(model, data, frame, of).vector).max() < 1e-10
@@ -237,7 +238,7 @@ def test_closure_is_the_sole_error_in_metres_and_radians(standing: Case) -> None
     data = model.createData()
     pin.framesForwardKinematics(model, data, c.join(y, off))
     for value, leg in zip(got, c.legs, strict=True):
-        place = data.oMf[model.getFrameId(leg.sole.frame)]
+        place = data.oMf[model.getFrameId(leg.frame)]
         np.testing.assert_allclose(value[:3], place.translation - leg.placement.translation, atol=1e-12)
         turn = pin.log3(place.rotation @ leg.placement.rotation.T)
         np.testing.assert_allclose(value[3:], turn, atol=1e-3 * np.abs(turn).max())
@@ -257,7 +258,7 @@ def test_sole_twists_are_pinocchios_in_the_axes_of_the_base(standing: Case) -> N
     pin.updateFramePlacements(model, data)
     base = data.oMi[1].rotation
     for twist, leg in zip(got, c.legs, strict=True):
-        frame = model.getFrameId(leg.sole.frame)
+        frame = model.getFrameId(leg.frame)
         wanted = pin.getFrameVelocity(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(base @ twist[:3], wanted.linear, atol=1e-10)
         np.testing.assert_allclose(base @ twist[3:], wanted.angular, atol=1e-10)
@@ -272,9 +273,9 @@ def test_the_wrench_map_is_the_soles_jacobians_transposed(standing: Case) -> Non
     data = model.createData()
     wanted = np.zeros(model.nv)
     for k, leg in enumerate(c.legs):
-        jac = pin.computeFrameJacobian(model, data, q, model.getFrameId(leg.sole.frame), pin.LOCAL)
+        jac = pin.computeFrameJacobian(model, data, q, model.getFrameId(leg.frame), pin.LOCAL)
         wanted += jac.T @ w[6 * k : 6 * k + 6]
-    np.testing.assert_allclose(column(standing.wrenches(legs, w)), wanted, atol=1e-10)
+    np.testing.assert_allclose(column(standing.wrenches(y, legs, w)), wanted, atol=1e-10)
     jac, places = c.sole_jacobians(q)
     np.testing.assert_allclose(jac.T @ w, wanted, atol=1e-10)
     for place, leg in zip(places, c.legs, strict=True):
@@ -392,7 +393,7 @@ def test_a_reached_posture_has_the_point_the_soles_and_the_limits(case: Case) ->
     pin.framesForwardKinematics(model, data, q)
     np.testing.assert_allclose(data.oMf[frame].translation, point, atol=1e-7)
     for leg in c.legs:
-        gap = leg.placement.actInv(data.oMf[model.getFrameId(leg.sole.frame)])
+        gap = leg.placement.actInv(data.oMf[model.getFrameId(leg.frame)])
         assert np.abs(pin.log6(gap).vector).max() < 1e-7
     angles = robot.joint_positions(q)
     assert (angles >= robot.lower + 0.02 - 1e-9).all()

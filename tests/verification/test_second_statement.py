@@ -93,6 +93,13 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
     check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
 
 
+@pytest.mark.parametrize("name", ["strike_holding_on", "push_two_hands"])
+def test_of_two_hands(name: str) -> None:
+    problem = load_problem(PROBLEMS / f"{name}.toml")
+    functions = block_functions(problem, problem.coordinates)
+    check_rows(Transcription(problem, problem.coordinates, functions))
+
+
 @pytest.mark.parametrize("name", ["arm_planar", "chop_arm"])
 def test_of_targets_with_events(name: str) -> None:
     problem = load_problem(PROBLEMS / f"{name}.toml")

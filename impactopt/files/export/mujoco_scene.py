@@ -60,6 +60,11 @@ def write(export: Export, directory: Path) -> None:
             f"mujoco: there is no formula for {type(p.law).__name__} on {type(p.target).__name__}; scenes "
             "know the laws and targets of problem files: export to csv instead"
         )
+    if p.second is not None or p.stance.held_hands(p.robot):
+        raise InputError(
+            "mujoco: the scene has one striker, and no hand that holds on; export to csv instead, or replay "
+            "here (impactopt validate)"
+        )
     if isinstance(p.target, Board) and p.target.initial_velocity:
         raise InputError("mujoco: the scene's board stands still before contact; export to csv instead")
     try:
@@ -76,7 +81,7 @@ def write(export: Export, directory: Path) -> None:
 def _write_scene(export: Export, directory: Path) -> None:
     p, mujoco, step = export.problem, mujoco_module(), _step(export)
     striker = p.robot.striker(p.striker).model_frame
-    spec, bodies = robot_on_floor(p.robot, striker, Perturbation(), MujocoOptions(step=step))
+    spec, bodies = robot_on_floor(p.robot, (striker,), Perturbation(), MujocoOptions(step=step))
     spec.modelname, spec.meshdir = p.name or p.robot.name, MESHES
     _draw_robot(mujoco, spec, bodies, export, directory / MESHES)
     _add_target(mujoco, spec, p, step)

@@ -17,9 +17,8 @@ from impactopt.files.problem_file.mistakes import range_of
 from impactopt.files.problem_file.section import Section
 from impactopt.files.problem_file.sections import File
 from impactopt.files.problem_file.toml import DEEPEST, LONGEST_TEXT, plain_value
-from impactopt.problem.checks import MANY
+from impactopt.problem.checks import LONGEST_CONTACT, MANY, MOST_ELEMENTS
 from impactopt.problem.phase import FINEST, LONGEST, SHORTEST, STEEPEST
-from impactopt.problem.problem import LONGEST_CONTACT, MOST_ELEMENTS
 from impactopt.robots.checks import HEAVIEST
 
 __all__ = ["reference"]

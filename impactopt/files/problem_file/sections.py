@@ -30,6 +30,7 @@ from impactopt.files.problem_file.values import (
     Duration,
     Fractions,
     Freezes,
+    HandNames,
     NotNegative,
     Positive,
     Posture,
@@ -41,6 +42,7 @@ from impactopt.files.problem_file.values import (
 from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
+from impactopt.problem.second import SecondStriker
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller import ControllerSettings
 
@@ -73,10 +75,22 @@ class ProblemSection(Section):
         return _of_problem(cls)
 
 
+class SecondSection(Section):
+    """Another striker that hits the same target at the same time."""
+
+    kind = SecondStriker
+    striker: str = required("name of the robot's other striker")
+    point: Vector = required("where its striking point meets the target [m]", "point_m")
+
+
 class StanceSection(Section):
-    """The soles that are held."""
+    """The soles that are held, and the hands that hold on."""
 
     soles: str = Field(default="both", description='"both", or the name of the sole that is held')
+    hands: HandNames = Field(
+        default=[],
+        description="strikers that hold on, each to where it is in the start posture; see [terms.grip]",
+    )
 
 
 class PhaseSection(Section):
@@ -151,6 +165,7 @@ class File(Section):
     robot: RobotSection = optional("")
     target: Target
     contact: Contact
+    second: SecondSection = optional("")
     stance: StanceSection = optional("")
     swing: SwingSection = optional("")
     follow: FollowSection = optional("")
@@ -190,13 +205,21 @@ class File(Section):
     def make_stance(self, robot: Robot) -> Stance:
         """What [stance] says of a robot; InputError for what it cannot stand on."""
         soles = self.stance.soles if self.stance else "both"
-        stance: Stance = BothSoles() if soles == "both" else OneSole(soles)
+        hands = tuple(self.stance.hands) if self.stance else ()
+        stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
         if not robot.floating:
             if self.stance:
                 raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
             stance = FixedBase()
-        stance.soles(robot)
+        stance.constraint_frames(robot)
         return stance
+
+    def check_one_striker(self) -> None:
+        """InputError if there are two, which models of a collision alone have not."""
+        if self.second is not None:
+            raise InputError(
+                "[second]: a collision model has one striker: leave the section out, or solve the problem"
+            )
 
     def make_start(self, robot: Robot) -> NDArray[np.float64]:
         """The posture (nq,) to start from; InputError for one that the robot cannot have."""
@@ -209,7 +232,9 @@ class File(Section):
         """Arguments of `ImpactProblem` but the robot and the stance, as far as the file gives them."""
         out = {name: value for name, value in self.problem.given().items() if name != "robot"}
         out |= {"law": self.contact.build(), "target": self.target.build()}
-        out |= {name: getattr(self, name).build() for name in ("swing", "follow") if getattr(self, name)}
+        out |= {
+            name: getattr(self, name).build() for name in ("second", "swing", "follow") if getattr(self, name)
+        }
         out |= self.objective.given() if self.objective else {}
         if self.collision is not None:
             given = self.collision.given()

@@ -86,6 +86,13 @@ def _joint_names(value: list[str]) -> list[str]:
     return value
 
 
+def _hand_names(value: list[str]) -> list[str]:
+    """Names, each once."""
+    if len(set(value)) != len(value):
+        raise ValueError(f"{value}; give each name once")
+    return value
+
+
 def _posture(value: Any) -> Any:
     """A name, or a list of numbers."""
     if not (isinstance(value, str) or (value and _numbers(value))):
@@ -180,5 +187,6 @@ Fractions = Annotated[list[Positive], AfterValidator(_fractions)]
 PerJoint = Annotated[Any, PlainValidator(per_joint)]
 Preset = Annotated[str, AfterValidator(_known_robot)]
 JointNames = Annotated[list[str], AfterValidator(_joint_names)]
+HandNames = Annotated[list[str], AfterValidator(_hand_names)]
 Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 IpoptOptions = Annotated[dict[str, Any], AfterValidator(_ipopt_options)]

@@ -26,6 +26,7 @@ from impactopt.files.problem_file.sections import (
     ObstacleSection,
     ProblemSection,
     ScenarioSection,
+    SecondSection,
     SwingSection,
 )
 from impactopt.files.problem_file.solver_sections import SolverSettings
@@ -88,8 +89,12 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
         "target": _of_kind("target", problem.target, TARGETS, "kind"),
         "contact": _of_kind("law", problem.law, LAWS, "law"),
     }
-    if isinstance(problem.stance, OneSole):
-        data["stance"] = {"soles": problem.stance.name}
+    stance = problem.stance
+    hands = {"hands": [hand.name for hand in held]} if (held := stance.held_hands(problem.robot)) else {}
+    if isinstance(stance, OneSole) or hands:
+        data["stance"] = ({"soles": stance.name} if isinstance(stance, OneSole) else {}) | hands
+    if problem.second is not None:
+        data["second"] = _section(SecondSection, problem.second)
     for name, section, phase in (
         ("swing", SwingSection, problem.swing),
         ("follow", FollowSection, problem.follow),

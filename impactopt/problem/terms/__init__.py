@@ -11,6 +11,7 @@ from impactopt.problem.terms.base import Term, check_known, kind_of
 from impactopt.problem.terms.contact_wrench_cone import ContactWrenchCone
 from impactopt.problem.terms.gaze import Gaze
 from impactopt.problem.terms.gear_load import GearLoad
+from impactopt.problem.terms.grip import Grip
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.terms.hit_cone import HitCone
 from impactopt.problem.terms.hit_region import HitRegion
@@ -56,6 +57,7 @@ TERMS: tuple[type[Term], ...] = (
     VelocityJump,
     TargetSpeed,
     Slide,
+    Grip,
 )
 
 __all__ = [
@@ -66,6 +68,7 @@ __all__ = [
     "ContactWrenchCone",
     "Gaze",
     "GearLoad",
+    "Grip",
     "HandOrientation",
     "HitCone",
     "HitRegion",

@@ -72,7 +72,8 @@ class _Drawing:
         first = 2 if self.robot.nv > self.robot.n else 1
         self.links = [(int(model.parents[j]), j) for j in range(first, model.njoints)]
         self.striker = model.getFrameId(self.scene.striker)
-        chain = set(model.supports[model.frames[self.striker].parentJoint])
+        ends = [model.frames[model.getFrameId(name)].parentJoint for name in self.scene.strikers]
+        chain = {joint for end in ends for joint in model.supports[end]}
         self.strikes = np.array([j in chain for _, j in self.links])
         self.travel = self.sim.travel()
         self.figure = Figure(figsize=(9.4, 4.2), dpi=80)

@@ -12,11 +12,12 @@ from impactopt.collision.result import Collision
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 from impactopt.simulation.mujoco_robot import MujocoRobot
+from impactopt.simulation.mujoco_welds import Welds
 from impactopt.simulation.mujoco_world import (
     MujocoOptions,
+    add_welds,
     mujoco_module,
     no_log_file,
-    quaternion,
     robot_bodies,
     spec_of,
 )
@@ -28,8 +29,6 @@ from impactopt.simulation.reference.record import collision_from
 __all__ = ["HeldRobot", "MujocoDynamics", "march"]
 
 Array = NDArray[np.float64]
-# MuJoCo's own limits: impedance of a constraint, and its time constant in steps
-_IMPEDANCE, _TIME_CONSTANT = 0.9999, 2.0
 _RECORD = 5e-5  # [s] between instants that are kept
 
 
@@ -117,47 +116,23 @@ class HeldRobot(MujocoRobot):
         spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         bodies = robot_bodies(mujoco, spec, robot)
-        for name in dict.fromkeys((*frames, striker)):
-            frame = robot.model.frames[robot.model.getFrameId(name)]
-            bodies[frame.parentJoint].add_site(
-                name=name, pos=frame.placement.translation, quat=quaternion(frame.placement.rotation)
-            )
-        for name in frames:
-            spec.worldbody.add_site(name=f"ground {name}")
-            weld = spec.add_equality()
-            weld.type, weld.objtype = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_SITE
-            weld.name1, weld.name2 = name, f"ground {name}"
-            weld.solref = [_TIME_CONSTANT * step, 1.0]
-            weld.solimp = [_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0]
+        add_welds(spec, bodies, robot, frames, step)
+        if striker not in frames:
+            frame = robot.model.frames[robot.model.getFrameId(striker)]
+            bodies[frame.parentJoint].add_site(name=striker, pos=frame.placement.translation)
         super().__init__(robot, spec.compile(), striker)
-        self.frames = [self.world.site(name).id for name in frames]
-        self.ground = [self.world.site(f"ground {name}").id for name in frames]
-        self.world.site_sameframe[self.ground] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE  # they are moved
-        self._wrench_map = np.zeros((6, self.world.nv))
+        self.welds = Welds(self.world, frames)
 
     def start(self, q: Array, v: Array) -> None:
         """Configuration and velocity at contact; the welds hold what they find."""
         self.put(q, v)
-        d = self.data
-        self.mujoco.mj_kinematics(self.world, d)
-        for frame, ground in zip(self.frames, self.ground, strict=True):
-            self.world.site_pos[ground] = d.site_xpos[frame]
-            rotation = np.zeros(4)
-            self.mujoco.mju_mat2Quat(rotation, d.site_xmat[frame])
-            self.world.site_quat[ground] = rotation
+        self.mujoco.mj_kinematics(self.world, self.data)
+        self.welds.put(self.data)
 
     def wrenches(self) -> tuple[Array, Array]:
         """Of the ground on the welded frames (6 a frame), and their places, at the last step's start."""
-        d, J = self.data, self._wrench_map
-        rows = np.reshape(d.efc_J, (-1, self.world.nv))
-        out, places = np.empty((len(self.frames), 6)), np.empty((len(self.frames), 3))
-        for k, frame in enumerate(self.frames):
-            its = slice(6 * k, 6 * k + 6)
-            self.mujoco.mj_jacSite(self.world, d, J[:3], J[3:], frame)
-            # the rows of a weld are in coordinates of its own
-            out[k] = np.linalg.lstsq(J.T, rows[its].T @ d.efc_force[its], rcond=None)[0]
-            places[k] = d.site_xpos[frame]
-        return out.ravel(), places
+        found, places = self.welds.wrenches(self.data)
+        return found.ravel(), places
 
 
 def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles: int) -> Collision:
@@ -170,15 +145,15 @@ def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles
     k = 0
     while True:
         world.mujoco.mj_step1(world.world, data)
-        speed = world.speed_along(normal)
+        speed = float(world.speeds_along(normal)[0])
         if k == 0:
-            start = float(normal @ data.site_xpos[world.site])
+            start = float(normal @ world.places()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
         rate = speed - target_speed
-        depth = float(normal @ data.site_xpos[world.site]) - start - travel
+        depth = float(normal @ world.places()[0]) - start - travel
         demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,13 +49,14 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
     # the first of two instants at the same time is the one before the reference jumps
     chosen = np.searchsorted(reference.time, wanted - 1e-9).clip(0, len(reference.time) - 1)
     at_contact = reference.q[chosen[BEFORE - 1]]
-    links = [_links(robot, problem.striker, reference.q[k]) for k in chosen]
-    strikes = set(robot.model.supports[_striker(robot, problem.striker).parentJoint])
+    names = problem.strikers
+    links = [_links(robot, names, reference.q[k]) for k in chosen]
+    strikes = {j for name in names for j in robot.model.supports[_striker(robot, name).parentJoint]}
     moved = [j in strikes for _, j in _bones(robot)]
     return Poses(
         time=reference.time[chosen],
         links=np.array(links),
-        strikes=np.array([True, *moved, *[False] * (2 * len(robot.soles))]),
+        strikes=np.array([True] * len(names) + [*moved, *[False] * (2 * len(robot.soles))]),
         contact=BEFORE - 1,
         path=np.array([_place(robot, problem.striker, q) for q in reference.q]),
         point=problem.point,
@@ -66,7 +68,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
 def inverse_mass(problem: ImpactProblem, q: Array) -> Array:
     """J P J' (3, 3) [1/kg] of the striking point, as of `impactopt.kinematics.held.Held`."""
     robot = problem.robot
-    frames = [sole.frame for sole in problem.stance.soles(robot)]
+    frames = problem.stance.constraint_frames(robot)
     return Held.at(robot.model, q, frames, robot.striker(problem.striker).model_frame).inverse_mass()
 
 
@@ -80,12 +82,12 @@ def _striker(robot: Robot, name: str) -> pin.Frame:
     return robot.model.frames[robot.model.getFrameId(robot.striker(name).model_frame)]
 
 
-def _links(robot: Robot, striker: str, q: Array) -> list[Array]:
-    """Ends (2, 3) of each link: to the striking point, between joints, then each sole's two."""
+def _links(robot: Robot, strikers: Sequence[str], q: Array) -> list[Array]:
+    """Ends (2, 3) of each link: to the striking points, between joints, then each sole's two."""
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
-    hand = _striker(robot, striker)
-    ends = [(data.oMi[hand.parentJoint].translation, _point(data, model, hand))]
+    hands = [_striker(robot, name) for name in strikers]
+    ends = [(data.oMi[hand.parentJoint].translation, _point(data, model, hand)) for hand in hands]
     ends += [(data.oMi[a].translation, data.oMi[b].translation) for a, b in _bones(robot)]
     for sole in robot.soles:
         frame = model.getFrameId(sole.frame)

@@ -1,0 +1,71 @@
+"""A second striker that hits the same target at the same time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.contact.targets import FreeMass, RigidWall
+from impactopt.errors import FARTHEST, InputError, check_array, check_name
+from impactopt.problem.objectives import PeakForce, Penetration
+from impactopt.problem.terms import HitCone, HitRegion, Slide
+
+__all__ = ["SecondStriker", "check_second"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SecondStriker:
+    """Another hand that meets the target, at a point of its own.
+
+    Both touch at one instant, are fastest in at one instant, and leave at one instant; each has the contact
+    law to itself, and the target feels the sum. The target moves along the normal and does not turn: a door
+    on rails, a box that is guided, or one that the two forces leave straight.
+
+    Attributes
+    ----------
+    striker : name of the robot's striker.
+    point (3,) [m] : where it meets the target, in the world frame.
+
+    Raises
+    ------
+    InputError : a NaN or a wrong shape.
+    """
+
+    striker: str
+    point: Array
+
+    def __post_init__(self) -> None:
+        check_name("the second striker", self.striker)
+        object.__setattr__(
+            self, "point", check_array("second striker: point [m]", self.point, (3,), most=FARTHEST)
+        )
+
+
+def check_second(problem: Any) -> None:
+    """InputError for a second striker that does not go with the rest of a problem."""
+    p, robot, second = problem, problem.robot, problem.second
+    if second is None:
+        return
+    if not isinstance(second, SecondStriker):
+        raise InputError(f"second must be a SecondStriker, not {second!r}")
+    mine, its = (set(robot.limb(robot.striker(s).model_frame)) for s in (p.striker, second.striker))
+    if not (mine - its and its - mine):
+        raise InputError(
+            f"the second striker {second.striker!r} moves with {p.striker!r}: give one on a limb of its own"
+        )
+    if p.collision != "full":
+        raise InputError(f'two strikers need collision="full", not {p.collision!r}')
+    if not isinstance(p.target, (FreeMass, RigidWall)):
+        raise InputError(
+            f"two strikers hit a FreeMass or a RigidWall, not a {type(p.target).__name__}, which takes one"
+        )
+    for thing in (*p.terms, *p.objectives):
+        if isinstance(thing, (HitCone, HitRegion, Slide, PeakForce, Penetration)) or (
+            getattr(thing, "first_instant", False)
+        ):
+            raise InputError(f"{type(thing).__name__} is about one striker: leave it out, or the second one")

@@ -79,7 +79,7 @@ class Obstacle(Described):
     end: Vector | None = field(
         default=None, metadata=about("end of its axis; left out: the capsule is a sphere", unit="m")
     )
-    radius: float = field(default=0.0, metadata=about("radius of the capsule", unit="m", above=0))
+    radius: float = field(default=0.0, metadata=about("radius of the capsule; of a box 0", unit="m", least=0))
 
     def __post_init__(self) -> None:
         where = f"obstacle {self.name!r}"

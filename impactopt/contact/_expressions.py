@@ -52,7 +52,7 @@ def check_numbers(instance: Any) -> None:
         number = float(check_array(name, getattr(instance, field.name), (), most=MOST))
         if not told.allows(number):
             raise InputError(f"{name}: {number:g}; give a number {told.range}")
-        if 0 < number < 1 / MOST:
+        if 0 < number < 1 / MOST and not told.allows(-1.0):
             zero = "0, or " if told.allows(0.0) else ""
             raise InputError(f"{name}: {number:g}; give {zero}a number of at least {1 / MOST:g}")
 

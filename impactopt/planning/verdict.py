@@ -32,7 +32,8 @@ def second_look(
     open_end = old.status is Status.FAILED or (old.status is Status.ITERATION_LIMIT and not budget.options)
     if budget.solver != "sqp" or not open_end or budget.left == 0:
         return old
-    if old.status is Status.FAILED and max_violation(program, old.x, program.constraints(old.x)) <= VIOLATED:
+    rows = max_violation(program, old.x, program.constraints(old.x))
+    if old.status is Status.FAILED and rows <= VIOLATED < old.max_violation:
         return old  # it has been refused for what is no row
     if report is not None:
         report("our solver ends without a verdict: IPOPT tries once, from the same start")

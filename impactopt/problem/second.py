@@ -39,6 +39,16 @@ class SecondStriker:
     striker: str
     point: Array
 
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, SecondStriker)
+            and self.striker == other.striker
+            and np.array_equal(self.point, other.point)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.striker, self.point.tobytes()))
+
     def __post_init__(self) -> None:
         check_name("the second striker", self.striker)
         object.__setattr__(

@@ -28,6 +28,7 @@ from impactopt.problem.terms import (
     Grip,
     HandOrientation,
     Incidence,
+    Slide,
     TargetSpeed,
 )
 from impactopt.verification.apart import apart_pieces
@@ -42,7 +43,7 @@ __all__ = ["Claims", "Program"]
 
 Array = NDArray[np.float64]
 CLEARANCE, HASTE = 0.02, 0.04  # [m], [m/s] how far the striker keeps off the target's plane
-_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), GearLoad, Grip, HandOrientation, TargetSpeed)
+_KNOWN_TERMS = (*map(type, DEFAULT_TERMS), GearLoad, Grip, HandOrientation, Slide, TargetSpeed)
 _KNOWN_OBJECTIVES = (Impulse, TargetEnergy, PeakForce, Penetration, AngularMomentum, Effort)
 
 
@@ -104,6 +105,7 @@ class Program:
         self._ways()
         self._touch()
         self._clearance()
+        self._slide()
         found, strange = apart_pieces(problem, self.robot, self.nodes(), claims.apart)
         self.rows += found
         self.missing += strange
@@ -207,7 +209,7 @@ class Program:
         axes = np.vstack([p.normal, vt[1:]])
 
         slow = 0.05 + float(p.target.speed_before())
-        for k, (name, point) in enumerate(self._aims()):
+        for k, (name, point) in enumerate(p.contacts):
 
             def value(v: Variables, k: int = k) -> Array:
                 place, fast, _ = self.robot.striking(*self.state_at_contact(v), k)
@@ -222,13 +224,21 @@ class Program:
             ]
             self.rows.append(Piece.of(value, rows))
 
-    def _aims(self) -> list[tuple[str, Array]]:
-        """Strikers and where they hit."""
-        p = self.problem
-        return [(p.striker, p.point), *([] if p.second is None else [(p.second.striker, p.second.point)])]
+    def _slide(self) -> None:
+        """How far across the target the striker is as contact ends."""
+        p, term, begin = self.problem, self.problem.extra(Slide), self.ways[1].at(0.0)
+        if term is None or not term.enabled:
+            return
+        tangents = np.linalg.svd(p.normal.reshape(1, 3))[2][1:]
+
+        def value(v: Variables) -> Array:
+            return tangents @ (self.robot.striking(begin(v)[0], np.zeros(self.robot.ny))[0] - p.point)
+
+        names = ["tangent 1", "tangent 2"]
+        self.rows.append(Piece.of(value, [(term.name, "after contact", names, -term.most, term.most)]))
 
     def _clearance(self) -> None:
-        for k, (striker, point) in enumerate(self._aims()):
+        for k, (striker, point) in enumerate(self.problem.contacts):
             self._clearance_of(k, striker, point)
 
     def _clearance_of(self, k: int, striker: str, point: Array) -> None:

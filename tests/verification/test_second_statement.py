@@ -16,7 +16,7 @@ from impactopt.files.problem_file import load_problem
 from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import GearLoad, TargetSpeed
+from impactopt.problem.terms import GearLoad, Slide, TargetSpeed
 from impactopt.robots.parts import SoftGrip
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.statement import statement_of
@@ -91,6 +91,11 @@ def test_of_a_ball_that_comes_and_is_caught() -> None:
     still = TargetSpeed(least=-0.1, most=0.2)
     ball = FreeMass(mass=0.5, initial_velocity=-3.0)
     check_rows(transcribed(dataclasses.replace(p, target=ball, terms=(*p.terms, still))))
+
+
+def test_of_a_slide_that_is_bounded() -> None:
+    p = arm_problem()
+    check_rows(transcribed(dataclasses.replace(p, terms=(*p.terms, Slide(most=0.02)))))
 
 
 @pytest.mark.parametrize("name", ["strike_holding_on", "push_two_hands"])

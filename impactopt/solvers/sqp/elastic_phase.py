@@ -74,7 +74,7 @@ class ElasticPhase:
         elif problem.sigma:
             problem.sigma, self._began = 0.0, problem.point.max_violation
         else:
-            return Status.INFEASIBLE
+            return self._least(problem)
         problem.mu = max(problem.mu, _AGAIN)
         return None
 
@@ -99,5 +99,10 @@ class ElasticPhase:
                 return end
             return "rows are hard again" if problem.elastic is None else "only the violation counts"
         if is_stationary_violation(problem.program, point.x, point.g, point.jacobian):
-            return Status.INFEASIBLE
+            return self._least(problem)
         return Status.FAILED
+
+    def _least(self, problem: BarrierProblem) -> Status:
+        """The end where the violation is least: a program whose rows are met there is not infeasible."""
+        met = problem.point.max_violation <= self._options.violation_tolerance
+        return Status.FAILED if met else Status.INFEASIBLE

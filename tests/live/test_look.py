@@ -258,6 +258,8 @@ def test_the_page_opens_in_a_browser_and_its_slider_plans(look: LiveLook, arm: S
 def test_the_command_serves_until_ctrl_c(saved: Path) -> None:
     command = [sys.executable, "-m", "impactopt", "show", str(saved), "--live"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # a shell's job in the background ignores Ctrl-C, and so would what the tests start there
+    pipes["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.default_int_handler)
     with subprocess.Popen(command, **pipes) as process:  # type: ignore[call-overload]
         try:
             line = process.stdout.readline()

@@ -79,7 +79,7 @@ class Obstacle(Described):
     end: Vector | None = field(
         default=None, metadata=about("end of its axis; left out: the capsule is a sphere", unit="m")
     )
-    radius: float = field(default=0.0, metadata=about("radius of the capsule; of a box 0", unit="m", least=0))
+    radius: float | None = field(default=None, metadata=about("radius of the capsule", unit="m", above=0))
 
     def __post_init__(self) -> None:
         where = f"obstacle {self.name!r}"
@@ -91,10 +91,10 @@ class Obstacle(Described):
             if value is not None:
                 object.__setattr__(self, key, vector(f"{where}: {key}", value))
         if self.size is not None:
-            if min(self.size) <= 0 or self.radius or self.end is not None:
+            if min(self.size) <= 0 or self.radius is not None or self.end is not None:
                 raise InputError(f"{where}: a box has a size of three lengths > 0 m, no end and no radius")
             return
-        if not 0 < self.radius <= FARTHEST or any(self.rpy) or any(self.position):
+        if self.radius is None or not 0 < self.radius <= FARTHEST or any(self.rpy) or any(self.position):
             raise InputError(
                 f"{where}: a capsule has a radius > 0 m, a start and an end, and no position or rpy"
             )

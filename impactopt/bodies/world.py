@@ -136,7 +136,7 @@ def obstacle_bodies(obstacles: tuple[Obstacle, ...]) -> list[WorldBody]:
             half=o.half,
             place=o.centre,
             rotation=o.rotation,
-            radius=o.radius,
+            radius=o.radius or 0.0,
         )
         for o in obstacles
     ]

@@ -24,6 +24,7 @@ from impactopt.files.problem_file import load_problem, read_problem_file
 from impactopt.kinematics.directions import across
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
+from impactopt.problem.doubts import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.studies.bench.kept import Kept
 from impactopt.studies.bench.planning import DEMO, solved
@@ -164,7 +165,7 @@ def drawn_problem(
 
     Raises
     ------
-    InputError : none of the drawn points can be reached.
+    InputError : none of the drawn points can be reached, or `check` finds all of them hopeless.
     """
     numbers = draw(base, around, rng)
     points = numbers.pop("points")
@@ -176,15 +177,20 @@ def drawn_problem(
         "law": SpringDamper(stiffness=numbers["stiffness_N_m"], damping=numbers["damping_N_s_m"]),
         "swing": replace(base.swing, duration=(numbers["swing_s"],) * 2),
     }
+    why = ""
     for tries, point in enumerate(points, start=1):
         try:
             problem = replace(base, point=point, **changes)
-        except InputError:  # of all that is drawn only a point can be refused
-            if tries == len(points):
-                raise
-        else:
+        except InputError as error:  # of all that is drawn only a point can be refused
+            why = str(error)
+            continue
+        found = hopeless(problem)  # the hand starts beyond the target, or balance does not reach it
+        if not found:
             return problem, {**numbers, "point_m": point.tolist(), "points_drawn": tries}
-    raise AssertionError("TRIES is 0")
+        why = found[0]
+    raise InputError(
+        f"{name}: none of the {len(points)} points drawn makes a sound problem; the last one: {why}"
+    )
 
 
 # ---------------------------------------------------------------- rows

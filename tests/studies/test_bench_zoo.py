@@ -86,7 +86,7 @@ def test_a_point_out_of_reach_is_drawn_again(punch: ImpactProblem) -> None:
     points = draw(punch, around, np.random.default_rng(k))["points"]
     assert problem.point.tolist() == numbers["point_m"] == points[numbers["points_drawn"] - 1].tolist()
     for point in points[: numbers["points_drawn"] - 1]:
-        with pytest.raises(InputError, match="out of (reach|balance)|beyond the target"):
+        with pytest.raises(InputError, match=r"out of (reach|balance)|beyond the target"):
             raise InputError(hopeless(dataclasses.replace(problem, point=point))[0])
     assert not hopeless(problem)
     assert problem.name == "far" and problem.striker == numbers["striker"]

@@ -188,9 +188,7 @@ def drawn_problem(
         if not found:
             return problem, {**numbers, "point_m": point.tolist(), "points_drawn": tries}
         why = found[0]
-    raise InputError(
-        f"{name}: none of the {len(points)} points drawn makes a sound problem; the last one: {why}"
-    )
+    raise InputError(f"{name}: of {len(points)} points none makes a sound problem; the last one: {why}")
 
 
 # ---------------------------------------------------------------- rows

@@ -133,7 +133,8 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
         worst.note(
             f"{prefix} position limit", float(max((r.lower - joints).max(), (joints - r.upper).max())), where
         )
-        if len(polygon):
+        # in contact the hand bears force too: what the coasting reference stands on is nobody's
+        if len(polygon) and (phase != 1 or prefix == "missed"):
             inside = float(margin(polygon, zmp(a["ground"][k : k + 1]))[0])
             worst.note(f"{prefix} ZMP", -inside, where)
     yield from worst.all()

@@ -203,5 +203,7 @@ def test_a_solve_without_a_verdict_gets_another_solvers() -> None:
     assert second_look(budget, t.program, start, given_up).status is Status.SOLVED
     solved = budget.run(t.program, start)
     assert second_look(budget, t.program, start, solved) is solved
-    refused = dataclasses.replace(solved, status=Status.FAILED)
+    short = dataclasses.replace(solved, status=Status.FAILED)
+    assert second_look(budget, t.program, start, short).status is Status.SOLVED  # rows met, no optimum yet
+    refused = dataclasses.replace(short, max_violation=0.1)
     assert second_look(budget, t.program, start, refused) is refused  # its rows are met: no row's fault

@@ -22,6 +22,7 @@ from impactopt.planning.multistart import one_after_the_other
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
+from impactopt.solvers.program import Status
 
 __all__ = ["Neighbour", "SolvedFolder"]
 
@@ -99,7 +100,7 @@ class SolvedFolder:
             before = resumed(record, problem_of(record, near.path, None, None))
             rest = {key: value for key, value in options.items() if key not in start}
             first = solve(problem, start=before, **rest)
-            if first.status.usable or first.status.value == "interrupted":
+            if first.status.usable or first.status is Status.INTERRUPTED:
                 return first, near
         solution = solve(problem, **options)
         if first is not None:

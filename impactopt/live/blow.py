@@ -19,7 +19,7 @@ from impactopt.kinematics.support import margin, support_polygon
 from impactopt.live.drawing import Drawing
 from impactopt.live.motion import Moment
 from impactopt.live.newest import Newest
-from impactopt.live.serving import LOCAL, address_of, ended, served
+from impactopt.live.serving import LOCAL, LivePage, address_of, served
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["Blow", "LiveBlow"]
@@ -41,7 +41,7 @@ class Blow:
     why: str = ""
 
 
-class LiveBlow:
+class LiveBlow(LivePage):
     """A page that is served until it is closed: the robot hits with its hand where that is, along the normal.
 
     problem : its robot, stance, contact law and target; the posture at first reaches its point. What holds
@@ -77,32 +77,17 @@ class LiveBlow:
         self._drawing.watch(mass, problem.point, problem.normal, float(mass[1]))
         self._controls()
         self.blow = Blow()
-        self._newest: Newest[Array, Blow] = Newest(self._strike, self._told)
+        self._newest = Newest(self._strike, self._told)
         self.changed()
 
     def changed(self) -> None:
         """Collide in the posture and at the speed that the sliders say."""
         self._newest.ask(np.array([float(s.value) for s in (self.speed, *self.joints.values())]))
 
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the newest collision; False after so long [s]."""
-        return self._newest.wait(timeout)
-
     def run(self) -> None:
         """Until Ctrl-C."""
         while True:
             time.sleep(1.0)
-
-    def close(self) -> None:
-        """End the page."""
-        self._newest.close(timeout=1.0)
-        ended(self._server)
-
-    def __enter__(self) -> LiveBlow:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _controls(self) -> None:
         gui, robot, c = self._server.gui, self.problem.robot, self.problem.coordinates

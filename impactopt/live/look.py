@@ -14,7 +14,7 @@ from impactopt.live.drawing import Drawing
 from impactopt.live.motion import moment_of
 from impactopt.live.newest import Newest
 from impactopt.live.replanning import Answer, Replanning
-from impactopt.live.serving import LOCAL, address_of, ended, served
+from impactopt.live.serving import LOCAL, LivePage, address_of, served
 from impactopt.live.telling import told_failure, told_plan
 from impactopt.live.wishes import Wish, numbers_of, wish_of
 from impactopt.planning.solution import Solution
@@ -26,7 +26,7 @@ FRAME = 1 / 30  # [s]
 SPEEDS = {"1": 1.0, "1/4": 0.25, "1/20": 0.05}
 
 
-class LiveLook:
+class LiveLook(LivePage):
     """A page that is served until it is closed.
 
     first : the plan to begin with.  host, port : where it is served; 0: a port that is free.
@@ -59,17 +59,13 @@ class LiveLook:
         middle = float(track.places[0, 1:, 1].mean())
         self._drawing.watch(track.mass[0], problem.point, problem.normal, middle)
         self._take(self.answer)
-        self._newest: Newest[Wish, Answer] = Newest(replanning, self._told)
+        self._newest = Newest(replanning, self._told)
 
     def ask(self, wish: Wish) -> None:
         """Plan for this, in place of what was asked for before."""
         self.wish = wish
         self.status.content = "Planning ..."
         self._newest.ask(wish)
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait for the newest plan; False after so long [s]."""
-        return self._newest.wait(timeout)
 
     def run(self) -> None:
         """Play the motion, until Ctrl-C."""
@@ -88,17 +84,6 @@ class LiveLook:
             at = float(self.time.value) + seconds * SPEEDS[self.speed.value]
             self.time.value = 0.0 if at > end else at
             self._draw()
-
-    def close(self) -> None:
-        """End all plans and the page."""
-        self._newest.close(timeout=1.0)
-        ended(self._server)
-
-    def __enter__(self) -> LiveLook:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def _track(self) -> Track:

@@ -6,11 +6,12 @@ import contextlib
 import errno
 import io
 import socket
-from typing import Any
+from typing import Any, TypeVar
 
 from impactopt.errors import InputError, missing_package
+from impactopt.live.newest import Newest
 
-__all__ = ["LOCAL", "address_of", "ended", "served"]
+__all__ = ["LOCAL", "LivePage", "address_of", "served"]
 
 LOCAL = "127.0.0.1"
 
@@ -20,10 +21,30 @@ def address_of(server: Any, host: str) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
-def ended(server: Any) -> None:
-    """Stop it."""
-    with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
-        server.stop()
+Page = TypeVar("Page", bound="LivePage")
+
+
+class LivePage:
+    """A page that answers the newest wish of its watcher, until it is closed."""
+
+    _server: Any
+    _newest: Newest[Any, Any]
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait for the newest answer; False after so long [s]."""
+        return self._newest.wait(timeout)
+
+    def close(self) -> None:
+        """End all work and the page."""
+        self._newest.close(timeout=1.0)
+        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
+            self._server.stop()
+
+    def __enter__(self: Page) -> Page:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def _family(host: str) -> socket.AddressFamily:

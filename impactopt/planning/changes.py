@@ -17,6 +17,8 @@ from impactopt.problem.terms import DEFAULT_TERMS, ContactWrenchCone, Term
 
 __all__ = ["Parameter", "changed", "moved_problem", "parameter_of"]
 
+# what no term changes but that on the world's bodies, which may be switched off
+_BODIES = ("world", "bodies")
 _KEPT = ("coordinates", "start_posture")  # of a problem on the same robot, stance and start
 
 
@@ -27,7 +29,9 @@ def changed(problem: ImpactProblem, **fields: Any) -> ImpactProblem:
     new = object.__new__(type(problem))
     new.__dict__.update({f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)} | fields)
     # before the checks, which need them too
-    new.__dict__.update({name: problem.__dict__[name] for name in _KEPT if name in problem.__dict__})
+    same = fields.keys() <= {"terms"} and new.keep_out.enabled == problem.keep_out.enabled
+    kept = (*_KEPT, *_BODIES) if same else _KEPT
+    new.__dict__.update({name: problem.__dict__[name] for name in kept if name in problem.__dict__})
     if "contact_posture" in problem.__dict__:
         near, point = problem.contact_posture, fields.get("point", problem.point)
         with contextlib.suppress(InputError):  # the checks look for one from the start

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
+from impactopt.planning.changes import changed
 from impactopt.planning.gears import gears_beyond
 from impactopt.planning.multistart import carried, one_after_the_other
 from impactopt.planning.sliding import slides_beyond
@@ -32,7 +33,6 @@ __all__ = ["kept_on_demand", "rows_on_demand", "with_rows"]
 
 Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
-_KNOWN = ("start_posture", "coordinates", "contact_posture", "world", "bodies")  # to both problems, once made
 _KINDS: dict[str, type[Term]] = {snake_case(type(term).__name__): type(term) for term in ON_DEMAND_TERMS}
 
 
@@ -49,9 +49,7 @@ def with_rows(problem: ImpactProblem, names: Iterable[str]) -> ImpactProblem:
     kinds = [_KINDS[name] for name in names if name in _KINDS and problem.extra(_KINDS[name]) is None]
     if not kinds:
         return problem
-    bounded = replace(problem, terms=(*problem.terms, *(problem.term(kind) for kind in kinds)))
-    bounded.__dict__.update({name: problem.__dict__[name] for name in _KNOWN if name in problem.__dict__})
-    return bounded
+    return changed(problem, terms=(*problem.terms, *(problem.term(kind) for kind in kinds)))
 
 
 def kept_on_demand(
@@ -75,7 +73,7 @@ def kept_on_demand(
             break
         said = "; ".join(broken.values())
         if report is not None:
-            report(f"{said}: on with rows of {', '.join(_words(name) for name in broken)}")
+            report(f"{said}: on with rows of {', '.join(_KINDS[name].name for name in broken)}")
         bounded = with_rows(t.problem, broken)
         warm = _program(t, bounded, report)
         found, new = solve(warm, carried(warm, t, result))
@@ -93,21 +91,15 @@ def kept_on_demand(
     return t, result
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def _broken(
     t: Program, result: SolverResult, finer: Callable[[Program, Array], tuple[PlannedCollision, ...]]
 ) -> dict[str, str]:
     """What is broken of terms on demand that have no rows, by name, in words."""
     problem, has, out = t.problem, rows_on_demand(t.problem), dict[str, str]()
-    if problem.second is not None:  # their rows are about one striker
-        return out
     planned: Plan | PlannedStrike = t.decode(result.x)
     for name, kind in _KINDS.items():
         term = problem.term(kind)
-        if name in has or not term.active:
+        if name in has or term not in problem.on_demand:
             continue
         words = ""
         if isinstance(term, GearLoad):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES
-from impactopt.problem.terms import Slide
+from impactopt.problem.terms import ON_DEMAND_TERMS
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
@@ -39,9 +39,8 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
     out |= {"scenarios": [str(s) for s in p.scenarios]} if p.scenarios else {}
     if p.objectives != DEFAULT_OBJECTIVES:
         out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in p.objectives]
-    of_one = (p.gear_load, p.term(Slide))  # about a single striker
-    off = [term.name for term in (p.self_collision, p.keep_out, *of_one) if not term.active]
-    off += [term.name for term in of_one if term.active and p.second is not None]
+    off = [term.name for term in (p.self_collision, p.keep_out) if not term.active]
+    off += [term.name for term in ON_DEMAND_TERMS if p.term(type(term)) not in p.on_demand]
     if off:
         out["off"] = off
     return out

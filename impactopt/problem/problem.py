@@ -298,7 +298,7 @@ class ImpactProblem:
         Raises InputError if none is found: the point is out of reach.
         """
         given = self.coordinates, self.striker, self.point, self.start_posture
-        also = [] if self.second is None else [(self.second.striker, self.second.point)]
+        also = self.contacts[1:]
         if (hand := self.extra(HandOrientation)) is not None:
             direction = self.normal if hand.direction is None else np.array(hand.direction)
             with suppress(InputError):
@@ -309,6 +309,12 @@ class ImpactProblem:
     def active_terms(self) -> tuple[Term, ...]:
         """Its own terms that are not switched off."""
         return tuple(term for term in self.terms if term.active)
+
+    @property
+    def on_demand(self) -> tuple[Term, ...]:
+        """Those of ON_DEMAND_TERMS that hold: they are not switched off, and about one striker."""
+        terms = tuple(self.term(type(term)) for term in ON_DEMAND_TERMS)
+        return tuple(term for term in terms if term.active and self.second is None)
 
     @property
     def gear_load(self) -> GearLoad:

@@ -32,9 +32,8 @@ def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> li
     targets.
     """
     expected, *others = hits
-    ways = [
-        plan.trajectory(step=STEP, hold=STEP, missed=m) for m in (False, True)[: 1 + (plan.abort is not None)]
-    ]
+    motions = (False, True) if plan.abort is not None else (False,)
+    ways = [plan.trajectory(step=STEP, hold=STEP, missed=missed) for missed in motions]
     out = [motion_loads(robot, way, expected) for way in ways]
     still = np.zeros(robot.nv)
     return out + [strike_loads(robot, still, still, hit) for hit in others]

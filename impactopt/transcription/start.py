@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 
 import numpy as np
 import pinocchio as pin
@@ -200,10 +199,11 @@ def _model(t: ContactProgram) -> tuple[str, int]:
 
 def _keys(t: ContactProgram) -> Iterator[tuple[str, str, str, int]]:
     """What a row is, and how many of that name come before it."""
-    seen: defaultdict[tuple[str, str, str], Iterator[int]] = defaultdict(count)
+    seen: Counter[tuple[str, str, str]] = Counter()
     for row in t.program.origins:
         name = row.term, row.place.name, row.component
-        yield *name, next(seen[name])
+        yield *name, seen[name]
+        seen[name] += 1
 
 
 def _finished(t: ContactProgram, x: Array) -> Array:

@@ -92,12 +92,12 @@ class StructuredProgram:
         self._at = None
         self._take_objective(objective, quadratic, linear)
 
-    def _take_objective(self, linked: Affine, quadratic: sp.spmatrix | sp.sparray, linear: Array) -> None:
-        """linked(x) + 1/2 x'Qx + q'x."""
+    def _take_objective(self, affine: Affine, quadratic: sp.spmatrix | sp.sparray, linear: Array) -> None:
+        """affine(x) + 1/2 x'Qx + q'x."""
         self._c = np.zeros(self.n)
-        np.add.at(self._c, linked.cols, linked.vals)
+        np.add.at(self._c, affine.cols, affine.vals)
         self._c += linear
-        self._c0, self._Q = float(linked.const.sum()), sp.csc_array(quadratic)
+        self._c0, self._Q = float(affine.const.sum()), sp.csc_array(quadratic)
 
     def same_numbers(self, other: StructuredProgram) -> bool:
         """Whether bounds, constants, weights and parameters are those of another program, to rounding."""

@@ -46,7 +46,12 @@ def _add_rows(b: Builder, state: ContactState, block: str, number: int) -> None:
             measure=millimetres("away"),
         )
         place = len(b.rows.lower) - 1
-        b.follow(lambda b: b.rows.bound(place, *[b.problem.contacts[number][1]] * 2))
+
+        def follow(b: Builder) -> None:
+            at = b.problem.contacts[number][1]
+            b.rows.bound(place, at, at)
+
+        b.follow(follow)
     b.rows.add(
         term="approach speed",
         place="contact",

@@ -86,8 +86,7 @@ class Blow:
         if scenario is not None:
             self.law, self.target = scenario.numbers(law, target)
             self.fraction, self.margin, self.least = scenario.torque, scenario.cone_margin, 0.0
-        second = problem.second
-        self.points = [problem.point, *([] if second is None else [second.point])]  # of the strikers
+        self.points = [point for _, point in problem.contacts]
         self.phases = len(target.phases)
         self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in range(self.phases)]
         self.typical = np.array(target.typical or (1.0,) * target.n_states)

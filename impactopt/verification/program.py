@@ -203,11 +203,14 @@ class Program:
             for k, s in enumerate(way.nodes)
         }
 
+    @property
+    def _tangents(self) -> Array:
+        """(2, 3) across the normal."""
+        return np.asarray(np.linalg.svd(self.problem.normal.reshape(1, 3))[2][1:])
+
     def _touch(self) -> None:
         p, incidence = self.problem, self.problem.term(Incidence)
-        _, _, vt = np.linalg.svd(p.normal.reshape(1, 3))
-        axes = np.vstack([p.normal, vt[1:]])
-
+        axes = np.vstack([p.normal, self._tangents])
         slow = 0.05 + float(p.target.speed_before())
         for k, (name, point) in enumerate(p.contacts):
 
@@ -229,7 +232,7 @@ class Program:
         p, term, begin = self.problem, self.problem.extra(Slide), self.ways[1].at(0.0)
         if term is None or not term.enabled:
             return
-        tangents = np.linalg.svd(p.normal.reshape(1, 3))[2][1:]
+        tangents = self._tangents
 
         def value(v: Variables) -> Array:
             return tangents @ (self.robot.striking(begin(v)[0], np.zeros(self.robot.ny))[0] - p.point)

@@ -43,7 +43,8 @@ _SCHEMA: Mapping[str, Mapping[str, str]] = {
     "replayed": {**_MOTION, **_HISTORIES, "soles": "s"},
     "collision": {"time": "m", "force": "m", "target_speed": "m", "torque": "p n"}
     | dict.fromkeys(("velocity", "acceleration"), "? p n"),
-    "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "point": "3", "normal": "3", "contact": ""},
+    "pose": {"time": "r", "links": "r l 2 3", "path": "k 3", "normal": "3", "contact": ""}
+    | {"target": "? b c 3", "obstacles": "? o u 3"},
     "history": dict.fromkeys(("iteration", "objective", "max_violation", "kkt"), "i"),
 }
 _TEXTS = ("joints", "replayed_soles", "program_statement")

@@ -8,13 +8,14 @@ import numpy as np
 from matplotlib.figure import FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from scipy.spatial import ConvexHull
 
 from impactopt.files.output import Record
 from impactopt.report.pictures.style import BLACK, BLUE, PAGE, VERMILION, Array, Picture, styled, title
 
-BOX = 0.18  # [m] side of the target
 GAP = 0.12  # [m] between poses
 GREY = "#999999"
+WORLD = {"target": ("#dddddd", "target when contact begins"), "obstacles": ("#f2f2f2", "obstacle")}
 
 
 @styled
@@ -44,8 +45,9 @@ def draw_strobe(figure: FigureBase, record: Record) -> None:
     places = (width + GAP) * np.arange(len(time))
     for k, (place, instant) in enumerate(zip(places, time, strict=True)):
         shift = np.array([place - across, 0.0])
-        corners = _box(a["pose_point"], a["pose_normal"], view) + shift
-        axes.fill(*corners.T, facecolor="#dddddd", edgecolor=GREY, linewidth=0.6, zorder=1)
+        for kind, (face, _) in WORLD.items():
+            for corners in _outlines(record, kind):
+                axes.fill(*(corners + shift).T, facecolor=face, edgecolor=GREY, linewidth=0.6, zorder=1)
         gone = path[a["reference_time"] <= instant] + shift
         axes.plot(*gone.T, color=VERMILION, linewidth=0.8, zorder=2)
         for ends, strikes in zip(links[k], a["pose_strikes"], strict=True):
@@ -63,16 +65,24 @@ def draw_strobe(figure: FigureBase, record: Record) -> None:
     axes.spines["bottom"].set_visible(False)
     axes.grid(False)
     axes.set(xlabel="time [s]; bold: contact begins", ylabel="z [m]")
-    figure.legend(handles=_key(bool(a["pose_strikes"].all())), loc="outside lower center", ncols=4)
+    figure.legend(handles=_key(record), loc="outside lower center", ncols=5)
 
 
-def _key(alone: bool) -> list[Line2D | Patch]:
-    others = [] if alone else [Line2D([], [], color=BLACK, linewidth=1.8, label="the others")]
+def _key(record: Record) -> list[Line2D | Patch]:
+    others = (
+        []
+        if record.arrays["pose_strikes"].all()
+        else [Line2D([], [], color=BLACK, linewidth=1.8, label="the others")]
+    )
     return [
         Line2D([], [], color=BLUE, linewidth=1.8, label="limb that strikes"),
         *others,
         Line2D([], [], color=VERMILION, linewidth=0.8, label="path of the striking point"),
-        Patch(facecolor="#dddddd", edgecolor=GREY, label="target when contact begins"),
+        *[
+            Patch(facecolor=face, edgecolor=GREY, label=label)
+            for kind, (face, label) in WORLD.items()
+            if _outlines(record, kind)
+        ],
     ]
 
 
@@ -100,19 +110,16 @@ def _extent(record: Record) -> tuple[float, float, float]:
 
 
 def _drawn(record: Record) -> Array:
-    """Points (k, 2) [m] of the picture: links, the striking point's way, the target's corners."""
+    """Points (k, 2) [m] of the picture: links, the striking point's way, the world's corners."""
     a = record.arrays
     view, _ = _view(record)
     parts = [a["pose_links"].reshape(-1, 3), a["pose_path"]]
-    box = _box(a["pose_point"], a["pose_normal"], view)
-    return np.concatenate([np.concatenate(parts) @ view.T, box])
+    outlines = [corners for kind in WORLD for corners in _outlines(record, kind)]
+    return np.concatenate([np.concatenate(parts) @ view.T, *outlines])
 
 
-def _box(point: Array, normal: Array, view: Array) -> Array:
-    """Corners (4, 2) [m] of a box whose face is where it is hit."""
-    flat = view @ normal
-    length = float(np.linalg.norm(flat))
-    along = flat / length if length > 1e-9 else np.array([1.0, 0.0])
-    side = np.array([-along[1], along[0]])
-    signs = ((0, -1), (0, 1), (1, 1), (1, -1))
-    return np.array([view @ point + BOX * length * p * along + BOX / 2 * s * side for p, s in signs])
+def _outlines(record: Record, kind: str) -> list[Array]:
+    """Corners (k, 2) [m] of each body of a kind, one after the other about it; none in results of old."""
+    view, _ = _view(record)
+    flat = [corners @ view.T for corners in record.arrays.get(f"pose_{kind}", ())]
+    return [corners[ConvexHull(corners).vertices] for corners in flat]

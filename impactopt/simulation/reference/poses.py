@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.world import WorldBody
 from impactopt.kinematics.held import Held
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
@@ -26,8 +27,9 @@ class Poses:
 
     time (m,) [s]; links (m, l, 2, 3) [m], ends of each link; strikes (l,): whether a link is of the limb that
     strikes; contact: which of the poses is the first in contact; path (k, 3) [m] of the striking point, at
-    the k instants of the reference; point (3,) [m], normal (3,): of the blow; inverse_mass (3, 3) [1/kg] of
-    the striking point at contact.
+    the k instants of the reference; target, obstacles (b, c, 3) [m]: points about each body of the target at
+    contact, and of the user's; normal (3,) of the blow; inverse_mass (3, 3) [1/kg] of the striking point at
+    contact.
     """
 
     time: Array
@@ -35,7 +37,8 @@ class Poses:
     strikes: NDArray[np.bool_]
     contact: int
     path: Array
-    point: Array
+    target: Array
+    obstacles: Array
     normal: Array
     inverse_mass: Array
 
@@ -49,7 +52,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
     # the first of two instants at the same time is the one before the reference jumps
     chosen = np.searchsorted(reference.time, wanted - 1e-9).clip(0, len(reference.time) - 1)
     at_contact = reference.q[chosen[BEFORE - 1]]
-    names = problem.strikers
+    names, seen = problem.strikers, [b for b in problem.world[1:] if not b.core]  # the first is the ground
     links = [_links(robot, names, reference.q[k]) for k in chosen]
     strikes = {j for name in names for j in robot.model.supports[_striker(robot, name).parentJoint]}
     moved = [j in strikes for _, j in _bones(robot)]
@@ -59,7 +62,8 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
         strikes=np.array([True] * len(names) + [*moved, *[False] * (2 * len(robot.soles))]),
         contact=BEFORE - 1,
         path=np.array([_place(robot, problem.striker, q) for q in reference.q]),
-        point=problem.point,
+        target=_corners([b for b in seen if b.of_target]),
+        obstacles=_corners([b for b in seen if not b.of_target]),
         normal=problem.normal,
         inverse_mass=inverse_mass(problem, at_contact),
     )
@@ -106,3 +110,11 @@ def _place(robot: Robot, striker: str, q: Array) -> Array:
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, q)
     return _point(data, model, _striker(robot, striker))
+
+
+def _corners(bodies: Sequence[WorldBody]) -> Array:
+    """Of each body's surface, as many as the one with most has (b, c, 3) [m]."""
+    found = [body.solid.vertices for body in bodies]
+    most = max(map(len, found), default=0)
+    padded = [np.pad(v, ((0, most - len(v)), (0, 0)), mode="edge") for v in found]
+    return np.array(padded).reshape(len(found), most, 3)

@@ -163,6 +163,18 @@ def test_the_strobe_draws_every_pose_and_the_way(punch_record: Record) -> None:
         assert np.isin(links[:, :, 2].ravel(), heights).all()
 
 
+def test_the_strobe_draws_the_target_as_large_as_it_is(biped_plan: Planned, punch_record: Record) -> None:
+    picture = PICTURES["strobe"](punch_record)
+    assert picture is not None
+    (target,) = [body for body in biped_plan.problem.world if body.name == "target"]
+    drawn = [np.asarray(patch.get_xy()) for patch in picture.axes[0].patches]
+    assert len(drawn) == len(punch_record.arrays["pose_time"])
+    for corners in drawn:
+        deep, high = 2 * target.half[2], 2 * target.half[1]
+        np.testing.assert_allclose(np.ptp(corners, axis=0), [deep, high], atol=1e-9)
+        assert corners[:, 1].mean() == pytest.approx(target.place[2], abs=0.5 * high)
+
+
 def test_the_mass_at_the_fist_is_the_collision_models_effective_mass(biped_plan: Planned) -> None:
     """One computed with Pinocchio's mass matrix, the other from our symbolic frozen dynamics."""
     problem, q = biped_plan.problem, biped_plan.trajectory.q[10]

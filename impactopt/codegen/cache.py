@@ -14,6 +14,7 @@ A library that someone else could have written is never loaded: see `impactopt.c
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -22,7 +23,8 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed, wait
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +50,7 @@ from impactopt.codegen.private_files import (
 )
 from impactopt.errors import NoCompilerWarning
 
-__all__ = ["cached", "library_path"]
+__all__ = ["FunctionGroup", "cached", "cached_groups", "library_path"]
 
 Report = Callable[[str], None]
 
@@ -58,6 +60,22 @@ _IN_GRAPHS = frozenset(
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class FunctionGroup:
+    """Functions that are built together and kept as one entry.
+
+    name : for file names and messages.
+    recipe : everything but this package's sources that shapes the functions: numbers, text, arrays, enums,
+        dataclasses, and tuples or mappings of them; for a model, its `model_hash`.
+    build : makes the functions, as graphs or as `NativeCode`; only called when the cache has no valid copy.
+        Derivatives have to be among them: a loaded function cannot be differentiated.
+    """
+
+    name: str
+    recipe: tuple[Any, ...]
+    build: Callable[[], Sequence[Buildable]]
+
+
 def cached(
     name: str,
     recipe: tuple[Any, ...],
@@ -65,49 +83,70 @@ def cached(
     *,
     report: Report | None = None,
 ) -> dict[str, ca.Function]:
+    """The functions of one `FunctionGroup`; see `cached_groups`."""
+    return cached_groups([FunctionGroup(name=name, recipe=recipe, build=build)], report=report)
+
+
+def cached_groups(groups: Sequence[FunctionGroup], *, report: Report | None = None) -> dict[str, ca.Function]:
     """Functions by name: loaded from the cache, or built, compiled and put there.
 
-    Derivatives have to be among the functions that `build` returns: a loaded function cannot be
-    differentiated.
+    While one group is compiled the next is built.
 
-    Parameters
-    ----------
-    name : of the group of functions, for file names and messages.
-    recipe : everything but this package's sources that shapes the functions: numbers, text, arrays, enums,
-        dataclasses, and tuples or mappings of them; for a model, its `model_hash`.
-    build : makes the functions, as graphs or as `NativeCode`; only called when the cache has no valid copy.
     report : told what is going on, one line a call, while functions are compiled.
 
     Returns
     -------
-    The functions by their own names, in `build`'s order. Without a C compiler, or with
-    IMPACTOPT_NO_COMPILER=1 in the environment, they run in CasADi's virtual machine and a NoCompilerWarning
-    says so once a process.
+    The functions by their own names, in the order of the groups and of what `build` makes. Without a C
+    compiler, or with IMPACTOPT_NO_COMPILER=1 in the environment, they run in CasADi's virtual machine and a
+    NoCompilerWarning says so once a process.
     """
     tell = report if report is not None else _ignore
     compiler = find_compiler()
     if compiler is None:
         _warn_no_compiler()
-        return _graphs(_by_name(build()))
-    entry = f"{slug(name)}-{_entry_key(name, recipe, compiler)}"
-
-    def waits() -> None:
-        tell(f"{name}: another process is compiling, waiting")
-
-    def found(directory: Path) -> dict[str, ca.Function]:
-        functions = _load_entry(directory, entry)
-        if functions is None:
-            with locked(directory / f"{entry}.lock", on_wait=waits):
-                functions = _load_entry(directory, entry)
-                if functions is None:
-                    functions = _build_entry(directory, entry, name, build, compiler, tell)
-        return functions
-
+        return {name: f for group in groups for name, f in _graphs(_by_name(group.build())).items()}
     try:
-        return found(usable_directory())
+        return _found(usable_directory(), groups, compiler, tell)
     except UnsafePath as error:
         warn(f"{error}; compiling into a temporary directory, for this process only")
-        return found(temporary_private_directory())
+        return _found(temporary_private_directory(), groups, compiler, tell)
+
+
+def _found(
+    directory: Path, groups: Sequence[FunctionGroup], compiler: Compiler, tell: Report
+) -> dict[str, ca.Function]:
+    """The functions of all groups in a directory, where those that are missing are put."""
+    entries = [f"{slug(g.name)}-{_entry_key(g.name, g.recipe, compiler)}" for g in groups]
+    found = [_load_entry(directory, entry) for entry in entries]
+    if None in found:
+        with contextlib.ExitStack() as held:
+            locks = held.enter_context(contextlib.ExitStack())  # given back when no thread works any more
+            pool = held.enter_context(ThreadPoolExecutor(max_workers=os.cpu_count() or 1))
+            held.callback(pool.shutdown, cancel_futures=True)
+            works: dict[int, _Work] = {}
+
+            def finish() -> None:
+                for k, work in works.items():
+                    found[k] = work.finished()
+                works.clear()
+
+            for k, (group, entry) in enumerate(zip(groups, entries, strict=True)):
+                if found[k] is not None:
+                    continue
+
+                def waits(name: str = group.name) -> None:
+                    finish()  # of two processes none is to wait for what the other holds while it waits
+                    tell(f"{name}: another process is compiling, waiting")
+
+                own = locks.enter_context(contextlib.ExitStack())
+                own.enter_context(locked(directory / f"{entry}.lock", on_wait=waits))
+                found[k] = _load_entry(directory, entry)
+                if found[k] is None:
+                    works[k] = _Work(directory, entry, group, compiler, pool, own, tell)
+                else:
+                    own.close()
+            finish()
+    return {name: f for functions in found if functions is not None for name, f in functions.items()}
 
 
 def library_path(name: str, recipe: tuple[Any, ...], function: str) -> Path | None:
@@ -146,55 +185,75 @@ def _load_entry(directory: Path, entry: str) -> dict[str, ca.Function] | None:
         return None
 
 
-def _build_entry(
-    directory: Path,
-    entry: str,
-    name: str,
-    build: Callable[[], Sequence[Buildable]],
-    compiler: Compiler,
-    tell: Report,
-) -> dict[str, ca.Function]:
-    start = time.monotonic()
-    tell(f"{name}: building the functions")
-    functions = _by_name(build())
-    listing: dict[str, tuple[str, str]] = {}
-    pool = ThreadPoolExecutor(max_workers=os.cpu_count() or 1)
-    try:
-        with tempfile.TemporaryDirectory(dir=directory, prefix="tmp-") as scratch, pool:
-            jobs = {}
+class _Work:
+    """A group that is built, and whose functions are being compiled by a pool's threads."""
+
+    def __init__(
+        self,
+        directory: Path,
+        entry: str,
+        group: FunctionGroup,
+        compiler: Compiler,
+        pool: ThreadPoolExecutor,
+        held: contextlib.ExitStack,
+        tell: Report,
+    ) -> None:
+        """held : what is to be given back when all is done, such as the entry's lock."""
+        self._directory, self._entry, self._name, self._tell = directory, entry, group.name, tell
+        self._start, self._held = time.monotonic(), held
+        tell(f"{group.name}: building the functions")
+        self._functions = _by_name(group.build())
+        self._jobs: dict[Future[tuple[str, str]], str] = {}
+        self._error: Exception | None = None
+        try:
+            scratch = Path(held.enter_context(tempfile.TemporaryDirectory(dir=directory, prefix="tmp-")))
+        except OSError as error:
+            self._error = error
+            return
+        # the longest first, so that the cores finish together; CasADi itself stays in this thread
+        for function in sorted(self._functions.values(), key=longest_body, reverse=True):
+            job = pool.submit(library_of, directory, scratch, *c_code(function), compiler)
+            self._jobs[job] = name_of(function)
+
+    def finished(self) -> dict[str, ca.Function]:
+        """The functions, when all are compiled and in the cache; as CasADi runs them, where one cannot be."""
+        with self._held:
             try:
-                # the longest first, so that the cores finish together; CasADi itself stays in this thread
-                for function in sorted(functions.values(), key=longest_body, reverse=True):
-                    job = pool.submit(library_of, directory, Path(scratch), *c_code(function), compiler)
-                    jobs[job] = name_of(function)
-                for done, job in enumerate(as_completed(jobs), start=1):
-                    listing[jobs[job]] = job.result()
-                    seconds = time.monotonic() - start
-                    tell(f"{name}: compiled {jobs[job]} ({done} of {len(jobs)}, {seconds:.0f} s)")
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
-        ordered = {"functions": {function: listing[function] for function in functions}}
-        put(directory / f"{entry}.json", json.dumps(ordered, indent=1).encode())
-    except (CompileError, OSError) as error:
-        warnings.warn(
-            f"{name}: {error}; its functions run in CasADi's virtual machine or in NumPy, 10 to 100 times "
-            "slower",
-            NoCompilerWarning,
-            stacklevel=4,
-        )
-        return _graphs(functions)
-    try:
-        return {f: ca.external(f, str(directory / listing[f][0])) for f in functions}
-    except RuntimeError as error:
-        said = str(error).strip().splitlines()[-1]
-        warnings.warn(
-            f"{name}: what was compiled cannot be loaded ({said}); its functions run in CasADi's virtual "
-            "machine, 10 to 20 times slower",
-            NoCompilerWarning,
-            stacklevel=4,
-        )
-        return _graphs(functions)
+                listing = self._compiled()
+            except (CompileError, OSError) as error:
+                for job in self._jobs:
+                    job.cancel()
+                wait(self._jobs)
+                return self._uncompiled(
+                    f"{error}; its functions run in CasADi's virtual machine or in NumPy, 10 to 100 times "
+                    "slower"
+                )
+            try:
+                return {f: ca.external(f, str(self._directory / listing[f][0])) for f in self._functions}
+            except RuntimeError as error:
+                said = str(error).strip().splitlines()[-1]
+                return self._uncompiled(
+                    f"what was compiled cannot be loaded ({said}); its functions run in CasADi's virtual "
+                    "machine, 10 to 20 times slower"
+                )
+
+    def _compiled(self) -> dict[str, tuple[str, str]]:
+        """Library and hash of each function, kept as an entry."""
+        if self._error is not None:
+            raise self._error
+        listing: dict[str, tuple[str, str]] = {}
+        for done, job in enumerate(as_completed(self._jobs), start=1):
+            function = self._jobs[job]
+            listing[function] = job.result()
+            seconds = time.monotonic() - self._start
+            self._tell(f"{self._name}: compiled {function} ({done} of {len(self._jobs)}, {seconds:.0f} s)")
+        ordered = {"functions": {function: listing[function] for function in self._functions}}
+        put(self._directory / f"{self._entry}.json", json.dumps(ordered, indent=1).encode())
+        return listing
+
+    def _uncompiled(self, why: str) -> dict[str, ca.Function]:
+        warnings.warn(f"{self._name}: {why}", NoCompilerWarning, stacklevel=6)
+        return _graphs(self._functions)
 
 
 def _by_name(functions: Sequence[Buildable]) -> dict[str, Buildable]:

@@ -7,7 +7,7 @@ serves all pairs of all robots.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ import pinocchio as pin
 import scipy.sparse as sp
 
 from impactopt.bodies.fit import PLANES
-from impactopt.codegen.cache import cached
+from impactopt.codegen.cache import FunctionGroup
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
@@ -217,9 +217,9 @@ def _larger(a: Any, b: Any) -> Any:
     return (a + b + ca.sqrt((a - b) ** 2 + ROUND**2)) / 2
 
 
-def apart_functions(report: Callable[[str], None] | None = None) -> dict[str, Any]:
-    """The compiled functions of all rows: the same for every robot."""
-    out: dict[str, Any] = {}
+def apart_groups() -> list[FunctionGroup]:
+    """What is compiled for all rows: the same for every robot."""
+    out: list[FunctionGroup] = []
     for n in LENGTHS:
         name = f"apart{n}"
 
@@ -227,7 +227,7 @@ def apart_functions(report: Callable[[str], None] | None = None) -> dict[str, An
             b = apart(n)
             return [in_lanes(f, b.lanes) for f in derivative_functions(name, b.z, b.p, b.out, b.through)]
 
-        out |= cached(name, (name,), functions, report=report)
+        out.append(FunctionGroup(name=name, recipe=(name,), build=functions))
     return out
 
 

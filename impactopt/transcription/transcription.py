@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from impactopt.codegen.cache import cached
+from impactopt.codegen.cache import FunctionGroup, cached_groups
 from impactopt.codegen.hashing import model_hash
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription.apart import apart_functions
+from impactopt.transcription.apart import apart_groups
 from impactopt.transcription.at_contact import BodyState, ContactProgram
 from impactopt.transcription.balance import add_balance
 from impactopt.transcription.builder import Builder
@@ -73,7 +73,7 @@ def block_functions(
     target = problem.target
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
-    out: dict[str, Any] = {}
+    groups: list[FunctionGroup] = []
     springs = tuple(np.flatnonzero(robot.passive).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     keys = {"force": (*contact, *second), "first": contact[:1], "coasting": frozen}
@@ -89,8 +89,10 @@ def block_functions(
             found = derivative_functions(name, b.z, b.p, b.out, b.through)
             return [in_lanes(function, b.lanes) for function in found]
 
-        out |= cached(f"{robot.name}-{name}", (name, *recipe, *block.key), functions, report=report)
-    return out | apart_functions(report)
+        groups.append(
+            FunctionGroup(name=f"{robot.name}-{name}", recipe=(name, *recipe, *block.key), build=functions)
+        )
+    return cached_groups([*groups, *apart_groups()], report=report)
 
 
 class Transcription(ContactProgram):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import hashlib
 import json
@@ -10,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +24,7 @@ from support.one_joint import model
 
 from impactopt.codegen import cache as codegen
 from impactopt.codegen import directory, library, private_files
-from impactopt.codegen.cache import cached
+from impactopt.codegen.cache import FunctionGroup, cached, cached_groups
 from impactopt.codegen.compiler import Compiler, find_compiler
 from impactopt.codegen.directory import cache_directory
 from impactopt.codegen.hashing import canonical, model_hash
@@ -217,7 +219,7 @@ def test_cache_directory_follows_the_environment(monkeypatch: pytest.MonkeyPatch
 WORKER = """
 import sys, time
 import casadi as ca
-from impactopt.codegen.cache import cached
+from impactopt.codegen.cache import FunctionGroup, cached, cached_groups
 def build():
     with open(sys.argv[1], "a") as log:
         log.write("built\\n")
@@ -240,6 +242,53 @@ def test_two_processes_at_once_build_once(cache: Path, tmp_path: Path) -> None:
     assert log.read_text() == "built\n"
     assert len(libraries(cache)) == 1
     assert not list(cache.glob("tmp-*")), "no scratch left behind"
+
+
+def sine(name: str, before: Callable[[], object] = lambda: None) -> FunctionGroup:
+    """A group of one function of its own, which does something first when it is built."""
+
+    def build() -> list[ca.Function]:
+        before()
+        x = ca.SX.sym("x")
+        return [ca.Function(name, [x], [ca.sin(len(name) * x)], ["x"], ["y"])]
+
+    return FunctionGroup(name=name, recipe=(), build=build)
+
+
+@needs_compiler
+def test_a_group_is_built_while_another_is_compiled(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    second, run = threading.Event(), Compiler.run
+
+    def patient(self: Compiler, source: Path, library: Path, level: str) -> None:
+        assert second.wait(30), "the second group waits for the first one to be compiled"
+        run(self, source, library, level)
+
+    monkeypatch.setattr(Compiler, "run", patient)
+    functions = cached_groups([sine("one"), sine("others", second.set)])
+    assert [f.class_name() for f in functions.values()] == ["External", "External"]
+    assert [float(f(0.3)) for f in functions.values()] == pytest.approx([np.sin(0.9), np.sin(1.8)])
+
+
+@needs_compiler
+def test_nothing_is_held_while_another_process_is_waited_for(cache: Path) -> None:
+    """Two processes that begin with one group each, and then want the other's, would wait for ever."""
+    one, other = sine("one"), sine("others")
+    cached_groups([other])
+    (listing,) = cache.glob("others-*.json")
+    listing.unlink()
+    theirs = contextlib.ExitStack()
+    theirs.enter_context(private_files.locked(listing.with_suffix(".lock"), on_wait=lambda: None))
+    finished: list[list[str]] = []
+
+    def report(line: str) -> None:
+        if "another process" in line:
+            finished.append([path.name.partition("-")[0] for path in cache.glob("*.json")])
+            with private_files.locked(next(cache.glob("one-*.lock")), on_wait=lambda: finished.append([])):
+                theirs.close()
+
+    functions = cached_groups([one, other], report=report)
+    assert list(functions) == ["one", "others"]
+    assert finished == [["one"]]
 
 
 @needs_compiler

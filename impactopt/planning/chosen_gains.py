@@ -1,0 +1,139 @@
+"""Gains that a plan has chosen: from a program with them as variables to that of a robot that has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.planning.multistart import Budget, carried, one_after_the_other, violations_of
+from impactopt.problem.problem import ImpactProblem
+from impactopt.robots.gains import scaled_gains, with_room
+from impactopt.robots.robot import Robot
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.strike import StrikeTranscription
+from impactopt.transcription.transcription import Transcription, block_functions
+
+__all__ = ["ChosenGains", "roomy", "settled", "with_factors_of"]
+
+Array = NDArray[np.float64]
+Program = TypeVar("Program", Transcription, StrikeTranscription)
+_BARRIER = 1e-7  # of the settled program: its start is a solution
+_AT_BOUND = 1e-3  # of a factor's logarithm
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChosenGains:
+    """What a plan has chosen of a `GainFactor`.
+
+    joints : their names.  factor : on their stiffness; its root is that on their damping.  between : (least,
+    largest) that it might be.  stiffness [N m/rad], damping [N m s/rad] : by joint, as chosen.
+    """
+
+    joints: tuple[str, ...]
+    factor: float
+    between: tuple[float, float]
+    stiffness: dict[str, float]
+    damping: dict[str, float]
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether it might go on if it were let."""
+        return bool(np.abs(np.log(np.array(self.between) / self.factor)).min() < _AT_BOUND)
+
+    def summary(self) -> dict[str, Any]:
+        """As in ``summary.json``."""
+        return {
+            "joints": list(self.joints),
+            "factor": self.factor,
+            "between": list(self.between),
+            "at_bound": self.at_bound,
+            "stiffness_N_m_rad": dict(self.stiffness),
+            "damping_N_m_s_rad": dict(self.damping),
+        }
+
+
+def roomy(problem: ImpactProblem) -> ImpactProblem:
+    """The same for a program that chooses gains: its robot's springs have room for the stiffest."""
+    if not problem.gains:
+        return problem
+    names, each = problem.robot.joint_names, zip(problem.gain_joints, problem.gains, strict=True)
+    largest = {names[k]: gain.factor[1] for joints, gain in each for k in joints}
+    return replace(problem, robot=with_room(problem.robot, largest))
+
+
+def with_factors_of(t: ContactProgram, robot: Robot, start: SolverResult) -> SolverResult:
+    """A start of a program that chooses gains, with those of another robot, where they are in its bounds."""
+    own, x = t.problem.robot, start.x.copy()
+    logs = []
+    for joints, gain in zip(t.problem.gain_joints, t.problem.gains, strict=True):
+        there = np.array([robot.kp[k] / own.kp[k] for k in joints if own.kp[k] > 0])
+        factor = float(np.median(there)) if there.size and np.all(there > 0) else 1.0
+        logs.append(np.log(np.clip(factor, *gain.factor)))
+    t.hit.contact.gains.write(x, logs)
+    return replace(start, x=x)
+
+
+def settled(
+    t: Program, fields: dict[str, Any], budget: Budget, report: Callable[[str], None] | None
+) -> tuple[Program, dict[str, Any]]:
+    """The program of the robot with the gains that a result has chosen, and the fields of its solution.
+
+    Where gains are best, the same motion is best for them as they are: it is solved once more from there, to
+    be so to the last digit. What comes after, such as replays, knows of no choice.
+    """
+    if not t.problem.gains:
+        return t, fields
+    old: SolverResult = fields["result"]
+    factors = np.exp(t.hit.contact.gains.read(old.x)[0])
+    names, robot = t.robot.joint_names, t.robot
+    by_joint = {
+        names[k]: float(f) for f, joints in zip(factors, t.problem.gain_joints, strict=True) for k in joints
+    }
+    problem = replace(t.problem, robot=scaled_gains(robot, by_joint), gains=())
+    chosen = tuple(
+        ChosenGains(
+            joints=tuple(names[k] for k in joints),
+            factor=float(factor),
+            between=gain.factor,
+            stiffness={names[k]: float(problem.robot.kp[k]) for k in joints},
+            damping={names[k]: float(problem.robot.kd[k]) for k in joints},
+        )
+        for factor, joints, gain in zip(factors, t.problem.gain_joints, t.problem.gains, strict=True)
+    )
+    if report is not None:
+        said = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
+        report(f"gains are chosen: {said}; on with these")
+    new = _program(t, problem)
+    result = carried(new, t, old)
+    over = robot.torque_limit / problem.robot.torque_limit  # of a spring it follows from its stiffness
+    new.feedforward.write(result.x, t.feedforward.read(old.x) * over)
+    result = replace(result, x=new.with_lifted(result.x))
+    if old.status.usable and budget.left != 0:
+        polished = budget.run(new.program, result, _BARRIER)
+        if polished.status.usable:
+            result = one_after_the_other(old, polished)
+    return new, {
+        **fields,
+        "problem": problem,
+        "result": result,
+        "violations": violations_of(new, result.x, new.program.constraints(result.x)),
+        "objectives": new.achieved(result.x),
+        "gains": chosen,
+    }
+
+
+def _program(t: Program, problem: ImpactProblem) -> Program:
+    """The program of another robot on the same mesh, with the same rows between bodies."""
+    elements, c = t.hit.elements if t.hit.guarded else (), problem.coordinates
+    functions = block_functions(problem, c, None, elements)
+    new: Program
+    if isinstance(t, StrikeTranscription):
+        new = type(t)(problem, c, functions, elements, t.hit.shares)
+    else:
+        new = Transcription(problem, c, functions, t.nodes, elements, t.hit.shares)
+    return new.with_apart(t.apart_rows) if t.apart_rows else new

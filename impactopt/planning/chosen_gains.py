@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -18,11 +18,11 @@ from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 
-__all__ = ["ChosenGains", "roomy", "settled", "with_factors_of"]
+__all__ = ["ChosenGains", "roomy", "settled", "with_chosen", "with_factors_of"]
 
 Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
-_BARRIER = 1e-7  # of the settled program: its start is a solution
+_BARRIER, _PUSH = 1e-7, 1e-6  # of the settled program, and into its bounds: its start is a solution
 _AT_BOUND = 1e-3  # of a factor's logarithm
 
 
@@ -66,16 +66,34 @@ def roomy(problem: ImpactProblem) -> ImpactProblem:
     return replace(problem, robot=with_room(problem.robot, largest))
 
 
+def with_chosen(problem: ImpactProblem, factors: Sequence[float]) -> ImpactProblem:
+    """A problem whose robot has gains with these factors in place of those that it leaves open; itself if it
+    leaves none.
+    """
+    if not problem.gains:
+        return problem
+    names, each = problem.robot.joint_names, zip(factors, problem.gain_joints, strict=True)
+    by_joint = {names[k]: float(factor) for factor, joints in each for k in joints}
+    return replace(problem, robot=scaled_gains(problem.robot, by_joint), gains=())
+
+
 def with_factors_of(t: ContactProgram, robot: Robot, start: SolverResult) -> SolverResult:
-    """A start of a program that chooses gains, with those of another robot, where they are in its bounds."""
-    own, x = t.problem.robot, start.x.copy()
-    logs = []
+    """A start of a program that chooses gains, with those of the robot that it is of, where bounds let it."""
+    own, logs = t.problem.robot, []
     for joints, gain in zip(t.problem.gain_joints, t.problem.gains, strict=True):
         there = np.array([robot.kp[k] / own.kp[k] for k in joints if own.kp[k] > 0])
         factor = float(np.median(there)) if there.size and np.all(there > 0) else 1.0
         logs.append(np.log(np.clip(factor, *gain.factor)))
-    t.hit.contact.gains.write(x, logs)
-    return replace(start, x=x)
+    start = _in_torques_of(t, robot, start)
+    t.hit.contact.gains.write(start.x, logs)
+    return start
+
+
+def _in_torques_of(t: ContactProgram, robot: Robot, start: SolverResult) -> SolverResult:
+    """A start of a program that is of the same robot but for torque limits, which its torques are over."""
+    x = start.x.copy()
+    t.feedforward.write(x, t.feedforward.read(x) * robot.torque_limit / t.robot.torque_limit)
+    return replace(start, x=t.with_lifted(x))
 
 
 def settled(
@@ -90,11 +108,7 @@ def settled(
         return t, fields
     old: SolverResult = fields["result"]
     factors = np.exp(t.hit.contact.gains.read(old.x)[0])
-    names, robot = t.robot.joint_names, t.robot
-    by_joint = {
-        names[k]: float(f) for f, joints in zip(factors, t.problem.gain_joints, strict=True) for k in joints
-    }
-    problem = replace(t.problem, robot=scaled_gains(robot, by_joint), gains=())
+    names, problem = t.robot.joint_names, with_chosen(t.problem, factors)
     chosen = tuple(
         ChosenGains(
             joints=tuple(names[k] for k in joints),
@@ -109,12 +123,10 @@ def settled(
         said = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
         report(f"gains are chosen: {said}; on with these")
     new = _program(t, problem)
-    result = carried(new, t, old)
-    over = robot.torque_limit / problem.robot.torque_limit  # of a spring it follows from its stiffness
-    new.feedforward.write(result.x, t.feedforward.read(old.x) * over)
-    result = replace(result, x=new.with_lifted(result.x))
+    result = _in_torques_of(new, t.robot, carried(new, t, old))
     if old.status.usable and budget.left != 0:
-        polished = budget.run(new.program, result, _BARRIER)
+        near = {"push": _PUSH, **(budget.options or {})} if budget.solver == "sqp" else budget.options
+        polished = replace(budget, options=near).run(new.program, result, _BARRIER)
         if polished.status.usable:
             result = one_after_the_other(old, polished)
     return new, {

@@ -117,7 +117,8 @@ def _draw_gains(t: ContactProgram, x: Array, noise: float, seed: int) -> None:
     """Gains that are chosen begin as they are given, and in noisy starts anywhere between their bounds."""
     gains = t.hit.contact.gains
     if noise and gains.size:
-        gains.write(x, np.random.default_rng(seed).uniform(*t.layout.bounds(gains)))
+        k = gains.index(0)
+        x[k] = np.random.default_rng(seed).uniform(t.layout.lower[k], t.layout.upper[k])
 
 
 def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array) -> Array:

@@ -164,7 +164,7 @@ def _bounded(
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         own = Refining(refining.budget, refining.margins, other.apart_rows, refining.report)
         done = own.solve(other, start) if to_its_end else own.first(other, start)
-        refining.blocked = own.blocked
+        refining.learn(own)
         return done
 
     def finer(other: Transcription, x: Array) -> tuple[PlannedCollision, ...]:

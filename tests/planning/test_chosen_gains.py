@@ -168,6 +168,22 @@ def test_gains_of_servos_are_chosen_too() -> None:
     np.testing.assert_allclose(free.problem.robot.kd, np.sqrt(found.factor) * arm.robot.kd)
 
 
+def test_two_factors_are_chosen_each_in_its_bounds_and_noisy_starts_draw_them() -> None:
+    gains = (*_open("joint_[1-4]", between=(0.5, 2.0)), *_open("joint_[5-7]", between=(0.2, 0.9)))
+    arm = replace(load_problem("arm7"), gains=gains)
+    t = _program(arm)
+    plain, noisy = (t.hit.contact.gains.read(first_iterate(t, noise=n, seed=1))[0] for n in (0.0, 0.3))
+    np.testing.assert_allclose(np.exp(plain), [1.0, 0.9])
+    assert (
+        np.all(noisy != plain) and np.all(np.exp(noisy) > [0.5, 0.2]) and np.all(np.exp(noisy) < [2.0, 0.9])
+    )
+    strike = optimize_strike(arm)
+    assert strike.status.usable
+    first, second = strike.gains
+    assert first.joints == tuple(f"joint_{k}" for k in range(1, 5)) and 0.5 <= first.factor <= 2.0
+    assert second.joints == tuple(f"joint_{k}" for k in range(5, 8)) and 0.2 <= second.factor <= 0.9
+
+
 def test_a_plan_goes_on_from_one_that_has_chosen(chosen: Solution) -> None:
     """Gains begin where that one has them, with all rows met."""
     problem = roomy(replace(_soft(), gains=_open(HAND)))

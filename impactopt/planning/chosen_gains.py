@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -39,6 +39,18 @@ class ChosenGains:
     between: tuple[float, float]
     stiffness: dict[str, float]
     damping: dict[str, float]
+
+    @classmethod
+    def told(cls, summary: Mapping[str, Any]) -> ChosenGains:
+        """From what its `summary` says."""
+        least, largest = summary["between"]
+        return cls(
+            joints=tuple(summary["joints"]),
+            factor=summary["factor"],
+            between=(least, largest),
+            stiffness=dict(summary["stiffness_N_m_rad"]),
+            damping=dict(summary["damping_N_m_s_rad"]),
+        )
 
     @property
     def at_bound(self) -> bool:

@@ -27,6 +27,7 @@ from impactopt import (
 from impactopt.files.output import record_of, save_record
 from impactopt.files.problem_file import parse_problem_file
 from impactopt.files.replay import problem_of
+from impactopt.files.resume import resumed
 from impactopt.files.verify import verify
 from impactopt.planning.chosen_gains import roomy
 from impactopt.planning.made_again import program_of
@@ -145,6 +146,7 @@ def test_a_file_leaves_gains_open_and_its_result_says_which(tmp_path: Path) -> N
     kept = load_record(tmp_path)
     again = problem_of(kept, tmp_path, None, None)
     assert again.hash == solution.problem.hash
+    assert resumed(kept, again).gains == solution.gains == solution.moved(damping=210.0).gains
     (told,) = kept.summary["gains"]
     assert told["joints"] == [HAND] and told["between"] == list(BETWEEN)
     rows = result_rows(result_columns(kept.summary))

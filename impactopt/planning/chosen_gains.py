@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.planning.multistart import Budget, carried, one_after_the_other, violations_of
+from impactopt.planning.on_demand import program_for
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.gains import scaled_gains, with_room
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.strike import StrikeTranscription
-from impactopt.transcription.transcription import Transcription, block_functions
+from impactopt.transcription.transcription import Transcription
 
 __all__ = ["ChosenGains", "roomy", "settled", "with_chosen", "with_factors_of"]
 
@@ -134,7 +135,7 @@ def settled(
     if report is not None:
         said = "; ".join(f"{', '.join(c.joints)} x {c.factor:.3g}" for c in chosen)
         report(f"gains are chosen: {said}; on with these")
-    new = _program(t, problem)
+    new = program_for(t, problem, None)
     result = _in_torques_of(new, t.robot, carried(new, t, old))
     if old.status.usable and budget.left != 0:
         near = {"push": _PUSH, **(budget.options or {})} if budget.solver == "sqp" else budget.options
@@ -149,15 +150,3 @@ def settled(
         "objectives": new.achieved(result.x),
         "gains": chosen,
     }
-
-
-def _program(t: Program, problem: ImpactProblem) -> Program:
-    """The program of another robot on the same mesh, with the same rows between bodies."""
-    elements, c = t.hit.elements if t.hit.guarded else (), problem.coordinates
-    functions = block_functions(problem, c, None, elements)
-    new: Program
-    if isinstance(t, StrikeTranscription):
-        new = type(t)(problem, c, functions, elements, t.hit.shares)
-    else:
-        new = Transcription(problem, c, functions, t.nodes, elements, t.hit.shares)
-    return new.with_apart(t.apart_rows) if t.apart_rows else new

@@ -239,3 +239,20 @@ def test_contacts_without_time_and_shooting_have_no_gains_to_choose() -> None:
 def test_a_factor_leaves_a_choice(factor: tuple[float, float]) -> None:
     with pytest.raises(InputError, match="factor"):
         GainFactor(joints=("wrist",), factor=factor)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        ("[4.0]", r"\[least, largest\]"),
+        ("[2.0, 1.0]", "less than the second"),
+        ("0.0", "a number > 0"),
+        ('"soft"', "a number > 0"),
+        ("1e4", "0.001 to 1000"),
+        ("[1.0, 1e4]", "least < largest <= 1000"),
+    ],
+)
+def test_a_file_with_a_factor_that_is_none_is_refused(tmp_path: Path, factor: str, words: str) -> None:
+    text = write_problem(replace(_soft(), gains=_open(HAND))).replace("[0.1, 10.0]", factor)
+    with pytest.raises(InputError, match=words):
+        parse_problem_file(text, tmp_path / "soft.toml").build()

@@ -46,10 +46,10 @@ def _contact_duration(value: Any) -> list[float]:
 
 def _factor(value: Any) -> Any:
     """A number > 0, or [least, largest]."""
-    each = value if isinstance(value, list) else [value]
-    if len(each) > 2 or not each or not all(_is_number(x) and 0 < x < np.inf for x in each):
+    pair = value if isinstance(value, list) else [value, value]
+    if len(pair) != 2 or not all(_is_number(x) and 0 < x < np.inf for x in pair):
         raise ValueError(f"{value}; give a number > 0, or [least, largest] for the plan to choose")
-    if isinstance(value, list) and not (len(value) == 2 and value[0] < value[1]):
+    if pair is value and not pair[0] < pair[1]:
         raise ValueError(f"{value}; the first of two has to be less than the second")
     return value
 

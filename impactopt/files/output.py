@@ -24,6 +24,9 @@ from numpy.typing import NDArray
 
 from impactopt.codegen.files import read_plain, write_atomically
 from impactopt.errors import InputError
+from impactopt.files.problem_file.changes import change_data
+from impactopt.files.problem_file.describing import comment_at
+from impactopt.files.problem_file.toml import read_toml, write_toml
 from impactopt.files.record_schema import check_arrays, check_summary
 from impactopt.kinematics.support import support_polygon
 from impactopt.planning.solution import Solution
@@ -121,7 +124,7 @@ def record_of(
     arrays = _scene_arrays(solution.problem)
     parts: dict[str, Any] = {"plan": plan, "swing": plan.swing, "follow": plan.follow}
     parts |= {"collision": solution.collision, "solver": result}
-    summary = _summary(solution, simulation, replay)
+    summary, problem = _summary(solution, simulation, replay), _settled(problem, solution)
     if "note" not in summary:
         parts |= {"reference": solution.trajectory, "pose": poses_of(solution.problem, solution.trajectory)}
         if plan.abort is not None:
@@ -147,8 +150,19 @@ def record_of_strike(
     parts = {"strike": hit, "collision": hit.collision, "solver": solution.result}
     arrays = _scene_arrays(solution.problem) | _parts_arrays(parts, solution.result)
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
-    summary = plain(solution.summary())
+    summary, problem = plain(solution.summary()), _settled(problem, solution)
     return Record(summary=summary, problem=problem, arrays=arrays, problem_path=problem_path)
+
+
+def _settled(problem: str, solution: Solution | StrikeSolution) -> str:
+    """The text of a problem file with the gains that a solution has chosen in the place of their ranges."""
+    if not problem or not solution.gains:
+        return problem
+    data = read_toml(problem)
+    ranges = [k for k, each in enumerate(data["robot"]["gains"]) if isinstance(each["factor"], list)]
+    chosen = {f"robot.gains.{k}.factor": c.factor for k, c in zip(ranges, solution.gains, strict=True)}
+    data = change_data(data, chosen)
+    return write_toml(data, lambda place: comment_at(data, place))
 
 
 def summary_of(solution: Solution | StrikeSolution) -> dict[str, Any]:

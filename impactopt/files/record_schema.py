@@ -118,7 +118,14 @@ _START = {
 _PROBLEM = {
     **dict.fromkeys(("name?", "robot?", "striker?", "target?", "law?", "hash?", "collision?"), _TEXT),
     **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),
-    **dict.fromkeys(("scenarios?", "objectives?", "off?"), ([_TEXT],)),
+    **dict.fromkeys(("scenarios?", "objectives?", "off?", "gains?"), ([_TEXT],)),
+}
+_GAINS = {
+    "joints": ([_TEXT],),
+    "factor": (int, float),
+    "between": ([(int, float)],),
+    "at_bound": (bool,),
+    **dict.fromkeys(("stiffness_N_m_rad", "damping_N_m_s_rad"), _NUMBERS),
 }
 _SCENARIO = {**_BLOW, "name": _TEXT, **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _NUMBER)}
 # of a record with arrays, whole
@@ -155,6 +162,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "versions?": ({"*": _TEXT},),
     "baseline?": ({"*": (str, *_NUMBER, bool, dict, list)},),
     "rows_on_demand?": ([_TEXT],),
+    "gains?": ([(_GAINS,)],),
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
     **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "collision_model?"), _TEXT),
 }

@@ -15,6 +15,7 @@ import numpy as np
 from impactopt.errors import InputError
 from impactopt.files.output import Record, load_record, plain, replay_arrays
 from impactopt.files.problem_file import ProblemFile, parse_problem_file, read_problem_file
+from impactopt.planning.chosen_gains import with_chosen
 from impactopt.planning.gears import gear_caution
 from impactopt.planning.on_demand import with_rows
 from impactopt.problem.problem import ImpactProblem
@@ -137,12 +138,14 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """With the rows on demand that the record's plan needed.
+    """With the rows on demand that the record's plan needed, and the gains that it chose.
 
     given : the file was, and is not the record's own text.
     """
     try:
         problem = file.build()
+        told = record.summary.get("gains", ())
+        problem = with_chosen(problem, [each["factor"] for each in told])
         return with_rows(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from impactopt.files.output import Record
+from impactopt.planning.chosen_gains import ChosenGains
 from impactopt.planning.made_again import planned_by, program_on
 from impactopt.planning.multistart import violations_of
 from impactopt.planning.planner import solve
@@ -90,6 +91,7 @@ def _solution(record: Record, t: Transcription) -> Solution:
         solve_seconds=float(summary["solve_seconds"]),
         violations=violations_of(t, result.x, t.program.constraints(result.x)),
         objectives=t.achieved(result.x),
+        gains=tuple(map(ChosenGains.told, summary.get("gains", ()))),
         statement=str(record.arrays["program_statement"]),
         **planned_by(t, result),
     )

@@ -156,6 +156,7 @@ def _solution(
         solve_seconds=seconds[1],
         violations=violations_of(t, result.x, t.program.constraints(result.x)),
         objectives=t.achieved(result.x),
+        gains=old.gains,
         attempts=(attempt,),
         statement=statement_of(t) if len(t.rows.origins) == t.program.m else old.statement,
         problem=t.problem,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
+from impactopt.planning.chosen_gains import with_factors_of
 from impactopt.planning.multistart import carried
 from impactopt.planning.on_demand import rows_on_demand
 from impactopt.planning.solution import ModelError, Solved
@@ -76,14 +77,16 @@ def carried_start(
     t: ContactProgram, old: Callable[[], ContactProgram], start: Solved, rows: Any
 ) -> SolverResult:
     """What a program starts from that has another model of the collision than a solution, or has rows on
-    demand of its own: that solution.
+    demand of its own, or gains to choose: that solution.
 
     old : makes the solution's program.  rows : between bodies, of the new one.
     """
-    was, now = ((p.collision, p.freezes, rows_on_demand(p)) for p in (start.problem, t.problem))
+    was, now = ((p.collision, p.freezes, rows_on_demand(p), p.gains) for p in (start.problem, t.problem))
     if was == now:
         return start.result
-    return carried(t.with_apart(rows), old().with_apart(start.apart), start.result)
+    new = t.with_apart(rows)
+    found = carried(new, old().with_apart(start.apart), start.result)
+    return with_factors_of(new, start.problem.robot, found) if now[-1] else found
 
 
 def climbed(

@@ -29,7 +29,7 @@ from impactopt.transcription.start import carried_over
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription, block_functions
 
-__all__ = ["kept_on_demand", "rows_on_demand", "with_rows"]
+__all__ = ["kept_on_demand", "program_for", "rows_on_demand", "with_rows"]
 
 Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
@@ -75,12 +75,12 @@ def kept_on_demand(
         if report is not None:
             report(f"{said}: on with rows of {', '.join(_KINDS[name].name for name in broken)}")
         bounded = with_rows(t.problem, broken)
-        warm = _program(t, bounded, report)
+        warm = program_for(t, bounded, report)
         found, new = solve(warm, carried(warm, t, result))
         if not new.status.usable and new.status is not Status.INTERRUPTED:
             origin, start = first
             x0 = start.x if isinstance(start, SolverResult) else start
-            cold = _program(origin.with_apart({}), bounded, report)
+            cold = program_for(origin.with_apart({}), bounded, report)
             none = np.zeros(origin.program.m), np.zeros(origin.layout.n)
             again = solve(cold, carried_over(cold, origin, x0, *none)[0])
             found, new = again[0], one_after_the_other(new, again[1])
@@ -124,13 +124,13 @@ def _loads(
     return []
 
 
-def _program(t: Program, problem: ImpactProblem, report: Callable[[str], None] | None) -> Program:
+def program_for(t: Program, problem: ImpactProblem, report: Callable[[str], None] | None) -> Program:
     """The program of another problem on the same mesh, with the same rows between bodies."""
-    elements = t.hit.elements if t.hit.guarded else ()
-    functions = block_functions(problem, t.coordinates, report, elements)
+    elements, c = t.hit.elements if t.hit.guarded else (), problem.coordinates
+    functions = block_functions(problem, c, report, elements)
     new: Program
     if isinstance(t, StrikeTranscription):
-        new = type(t)(problem, t.coordinates, functions, elements, t.hit.shares)
+        new = type(t)(problem, c, functions, elements, t.hit.shares)
     else:
-        new = Transcription(problem, t.coordinates, functions, t.nodes, elements, t.hit.shares)
+        new = Transcription(problem, c, functions, t.nodes, elements, t.hit.shares)
     return new.with_apart(t.apart_rows) if t.apart_rows else new

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.keeping_apart import Margins, same_bodies
 from impactopt.planning.made_again import planned_by, program_of
 from impactopt.planning.models import carried_start, climbed
@@ -113,7 +114,7 @@ def solve(
         raise InputError(
             f"unknown start {given!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
         )
-    began = time.perf_counter()
+    began, problem = time.perf_counter(), roomy(problem)
     functions = block_functions(problem, problem.coordinates, report, elements)
     budget = budget.started()
     t = Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
@@ -132,6 +133,7 @@ def solve(
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
+    t, fields = settled(t, fields, budget, report)
     result = fields["result"] = with_reason(t, fields["result"])
     return Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
@@ -162,7 +164,7 @@ def _bounded(
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         own = Refining(refining.budget, refining.margins, other.apart_rows, refining.report)
         done = own.solve(other, start) if to_its_end else own.first(other, start)
-        refining.blocked = own.blocked
+        refining.learn(own)
         return done
 
     def finer(other: Transcription, x: Array) -> tuple[PlannedCollision, ...]:

@@ -97,6 +97,10 @@ class Refining:
             self._known = t, x, contact_error(t, x)
         return self._known[2]
 
+    def learn(self, other: Refining) -> None:
+        """Take over what another has found of the last program that it had."""
+        self.blocked, self._known = other.blocked, other._known
+
     def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The program with its first rows between bodies, and its result."""
         if self.margins is not None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.planning.chosen_gains import ChosenGains
 from impactopt.planning.gears import gear_caution
 from impactopt.planning.multistart import Attempt
 from impactopt.planning.on_demand import rows_on_demand
@@ -65,6 +66,7 @@ class Solved:
     elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
         they are finer than the problem asks for; and the share of each phase in the contact's time, where
         something is frozen during contact. Else ().
+    gains : what is chosen of the gains that the problem left open; `problem` has the robot with these.
     held_blow : the blow of a plan in which a nail and a striker stay together; None if they need not.
     """
 
@@ -81,6 +83,7 @@ class Solved:
     apart: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
     shares: Shares = ()
+    gains: tuple[ChosenGains, ...] = ()
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -117,6 +120,7 @@ class Solved:
             "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
             "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),
+            **({"gains": [chosen.summary() for chosen in self.gains]} if self.gains else {}),
             **({} if self.rattle is None else {"caution": str(self.rattle)}),
         }
 

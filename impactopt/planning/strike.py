@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.gears import gear_caution
 from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
@@ -134,6 +135,8 @@ def optimize_strike(
     if method == "shooting":
         if problem.coordinates.hands or problem.second is not None:
             raise InputError('by shooting one hand strikes, and none holds on: take method="collocation"')
+        if problem.gains:
+            raise InputError('by shooting no gains are chosen: take method="collocation", or give them')
         options = _of_shooting(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=start is not None)
@@ -153,7 +156,7 @@ def optimize_strike(
             return optimize_strike(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
 
         return climbed(problem, run, time_limit=time_limit, report=report)
-    began = time.perf_counter()
+    began, problem = time.perf_counter(), roomy(problem)
     if isinstance(start, StrikeSolution):
         problem = with_rows(problem, rows_on_demand(start.problem))
     mesh = (start.elements, start.shares) if isinstance(start, StrikeSolution) else ()
@@ -170,6 +173,7 @@ def optimize_strike(
     if method != "shooting":
         work = partial(_bounded_strike, work, report)
     t, fields = solve_from(t, _starts(t, given, starts, seed), budget, began, work)
+    t, fields = settled(t, fields, budget, report)
     result = fields["result"] = with_reason(t, fields["result"])
     held = held_blow(t, result.x) if result.status.usable else None
     problem = fields["problem"]

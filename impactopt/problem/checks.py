@@ -18,6 +18,7 @@ from impactopt.kinematics.held import Held
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.terms import Grip, Term
 from impactopt.robots.checks import LEG, check_arms
+from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.robot import Robot
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "check_at_rest",
     "check_collision",
     "check_elements",
+    "check_gains",
     "check_hands",
     "check_moves",
     "check_names",
@@ -109,6 +111,29 @@ def check_hands(problem: Any) -> None:
                 f"the hand {hand.name!r} holds on, so it cannot carry the striker {name!r} (both move "
                 f"by {', '.join(robot.joint_names[j] for j in sorted(both))}): hold on with another one"
             )
+
+
+def check_gains(problem: Any) -> None:
+    """InputError for gains that no plan can choose: of a joint twice, too fast, in a contact without time."""
+    if not isinstance(problem.gains, (list, tuple)) or not all(
+        isinstance(gain, GainFactor) for gain in problem.gains
+    ):
+        raise InputError(f"gains must be a tuple of GainFactor, not {problem.gains!r}")
+    object.__setattr__(problem, "gains", tuple(problem.gains))
+    if not problem.gains:
+        return
+    if problem.collision in INSTANT:
+        raise InputError(
+            f"gains act while a contact lasts, and collision={problem.collision!r} has no duration: give "
+            "them, or take another model"
+        )
+    names = problem.robot.joint_names
+    joints = Counter(k for each in problem.gain_joints for k in each)
+    twice = next((names[k] for k, count in joints.items() if count > 1), None)
+    if twice is not None:
+        raise InputError(f"gains: joint {twice!r} is in two of them; give it one factor")
+    largest = {names[k]: g.factor[1] for g in problem.gains for k in g.indices(problem.robot)}
+    scaled_gains(problem.robot, largest)
 
 
 def check_moves(problem: Any) -> None:

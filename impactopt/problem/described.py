@@ -37,6 +37,8 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
     if p.robot.source and p.robot.source.repairs:
         out["inertias"] = [f"repaired: {text}" for text in p.robot.source.repairs]
     out |= {"scenarios": [str(s) for s in p.scenarios]} if p.scenarios else {}
+    if p.gains:
+        out["gains"] = [f"{', '.join(g.joints)}: {g.factor[0]:g} to {g.factor[1]:g} times" for g in p.gains]
     if p.objectives != DEFAULT_OBJECTIVES:
         out["objectives"] = [f"{o.weight:g} x {o.name} [{o.unit}]" for o in p.objectives]
     off = [term.name for term in (p.self_collision, p.keep_out) if not term.active]

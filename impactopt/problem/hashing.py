@@ -27,6 +27,9 @@ def problem_hash(problem: Any) -> str:
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
     second = shape.pop("second")
+    if gains := shape.pop("gains"):
+        each = zip(problem.gain_joints, gains, strict=True)
+        shape["gains"] = sorted((joints, gain.factor) for joints, gain in each)
     if second is not None:
         other = problem.robot.striker(second.striker)
         shape["second"] = (other.frame, other.point, second.point)

@@ -35,6 +35,7 @@ from impactopt.problem.checks import (
     check_at_rest,
     check_collision,
     check_elements,
+    check_gains,
     check_hands,
     check_moves,
     check_names,
@@ -59,6 +60,7 @@ from impactopt.problem.terms import (
     check_known,
     kind_of,
 )
+from impactopt.robots.gains import GainFactor
 from impactopt.robots.robot import Robot
 
 Array = NDArray[np.float64]
@@ -108,6 +110,7 @@ class ImpactProblem:
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
         return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
         they make the optimum unique, and bring the robot back to its start.
+    gains : factors on gains of servos and of springs of soft grips, which the plan chooses.
 
     Raises
     ------
@@ -142,6 +145,7 @@ class ImpactProblem:
     smoothness: float = 1e-5
     wrench_price: float = 1e-3
     return_price: float = 0.1
+    gains: tuple[GainFactor, ...] = ()
     name: str = "impact"
 
     def __repr__(self) -> str:
@@ -160,6 +164,7 @@ class ImpactProblem:
             for scenario in self.scenarios:
                 found.attempt(partial(scenario.numbers, self.law, self.target))
         found.attempt(self._check_world)
+        found.attempt(partial(check_gains, self))
         termed = found.attempt(self._check_terms)
         if termed:
             for term in self.terms:
@@ -243,6 +248,11 @@ class ImpactProblem:
     def frozen(self) -> Effects | None:
         """The effects of a model of the collision with frozen dynamics; None of the others."""
         return {"sdc": Effects(), "sdc-paper": Effects.paper()}.get(self.collision)
+
+    @property
+    def gain_joints(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the joints of each of its `gains`."""
+        return tuple(gain.indices(self.robot) for gain in self.gains)
 
     @property
     def of_drives(self) -> bool:

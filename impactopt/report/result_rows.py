@@ -89,6 +89,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
         ("left uncertain by steps [%]", "step_error_pct", 3),
     ):
         yield _of_replays(number_row(label, [None, *(source.get(key) for source in sources[1:])], digits))
+    yield from _gain_rows(sources)
     yield from _model_rows(sources)
     stands = [None, *(standing(source) for source in sources[1:])]
     yield _of_replays(word_row("stands at the end", stands, no_is_bad=True))
@@ -168,6 +169,17 @@ def target_rows(targets: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
     yield number_row("speed of the target [m/s]", [target.get("speed_m_s") for target in targets], 3)
     yield number_row("driven into the wood [mm]", [target.get("depth_m") for target in targets], 2, scale=1e3)
     yield word_row("the board breaks", [target.get("broken") for target in targets])
+
+
+def _gain_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
+    """Gains that the plan has chosen."""
+    others = (Cell(""),) * (len(sources) - 1)
+    for chosen in sources[0].get("gains") or ():
+        least, largest = chosen["between"]
+        label = f"stiffness chosen, of {least:g} to {largest:g} times"
+        yield Row(label, (Cell(f"{chosen['factor']:.3g}"), *others))
+        first, *more = (f"{joint}: {k:.3g} N m/rad" for joint, k in chosen["stiffness_N_m_rad"].items())
+        yield _of_joints([f"{first}, and {len(more)} more" if more else first, *[""] * len(others)])
 
 
 def _model_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:

@@ -15,7 +15,7 @@ from impactopt.contact.fields import Described, about, abouts
 from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.robots.checks import HEAVIEST, STRONGEST
 
-__all__ = ["MOMENTARY_PEAK", "Actuator", "numbers_of", "with_classes"]
+__all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "numbers_of", "with_classes"]
 
 # of a gear over the joint's torque limit, where nothing better is known: see docs/howto/gears.md
 MOMENTARY_PEAK = 2.0
@@ -125,17 +125,22 @@ def with_classes(
     for pattern, actuator in classes.items():
         if not isinstance(actuator, Actuator):
             raise InputError(f"actuators: of {pattern!r} is {actuator!r}; give an Actuator")
-        fits = [k for k, joint in enumerate(joints) if joint == pattern or fnmatchcase(joint, pattern)]
-        if not fits:
-            raise InputError(
-                f"actuators: no joint is called {pattern!r}{did_you_mean(pattern, joints)}; joints are "
-                f"{', '.join(joints)}"
-            )
-        for k in fits:
+        for k in fitting(pattern, joints, "actuators"):
             out[k] = replace(actuator, armature=None)
             if actuator.armature is not None:
                 model.armature[base + k] = actuator.armature
     return tuple(out)
+
+
+def fitting(pattern: str, joints: Sequence[str], where: str) -> list[int]:
+    """Places of the joints that a name or pattern fits; InputError, which begins with ``where``, if none."""
+    fits = [k for k, joint in enumerate(joints) if joint == pattern or fnmatchcase(joint, pattern)]
+    if not fits:
+        raise InputError(
+            f"{where}: no joint is called {pattern!r}{did_you_mean(pattern, joints)}; joints are "
+            f"{', '.join(joints)}"
+        )
+    return fits
 
 
 def numbers_of(actuators: Iterable[Actuator], name: str) -> NDArray[np.float64]:

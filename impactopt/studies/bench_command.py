@@ -136,6 +136,26 @@ def _machine(
     """What gears cost a blow: each problem with gear limits of 3, 2, 1.5 and 1, and without."""
 
 
+@_command("softness")
+def _softness(
+    problems: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--problem", metavar="NAME", help="A problem's name or file; several times for several."
+        ),
+    ] = None,
+    joints: Annotated[
+        list[str] | None,
+        typer.Option("--joint", metavar="NAME", help="Whose stiffness: a name or pattern; may be repeated."),
+    ] = None,
+    factors: Annotated[
+        list[float] | None,
+        typer.Option("--factor", metavar="FACTOR", help="On the stiffness, such as 0.5; may be repeated."),
+    ] = None,
+) -> None:
+    """What soft grips and soft gains bring: stiffer and stiffer joints, and what a plan chooses."""
+
+
 @_command("models")
 def _models(
     quick: Annotated[bool, typer.Option("--quick", help="The two arms only.")] = False,
@@ -275,6 +295,7 @@ def _all(
         "freezes": drawn,
         "gains": {"quick": True},
         "machine": {"problems": ["arm_planar", "arm7", "chop_arm"]},
+        "softness": {"problems": ["arm7"]},
         "collision": {"quick": True},
         "scaling": {"workers": workers, "quick": True},
         "stability": {"quick": True, **drawn},

@@ -40,6 +40,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "scaling": ("bench", "scaling"),
     "gains": ("bench", "gains"),
     "machine": ("bench", "machine"),
+    "softness": ("bench", "softness"),
     "skip": ("bench", "skip"),
     "sweep_posture_speed": ("sweep", "collision_posture_speed"),
     "sweep_gains": ("sweep", "collision_gains"),

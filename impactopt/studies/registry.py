@@ -27,6 +27,7 @@ BENCHES = {
     "freezes": "freezes",
     "gains": "gains",
     "machine": "machine",
+    "softness": "softness",
     "virtual-base": "virtual_base",
     "collision": "collision",
     "scaling": "scaling",

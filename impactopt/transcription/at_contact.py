@@ -204,7 +204,7 @@ class ContactProgram(ABC):
     # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
         """Rows that these terms bring, those of springs, and the objective."""
-        add_springs(self.builder, self._spring_points())
+        add_springs(self.builder, self._spring_points(), self.hit.contact.gains[0])
         for term in terms:
             if type(term).add_rows is not Term.add_rows and term.active:  # those of others are there
                 term.add_rows(self)

@@ -30,6 +30,7 @@ from impactopt.transcription.contact_blocks import (
     leg_part,
     moved,
 )
+from impactopt.transcription.gain_blocks import Joints, chosen_gains
 
 __all__ = [
     "BlockExpression",
@@ -145,16 +146,20 @@ def link() -> BlockExpression:
     return make_block(list(z), [], out)
 
 
-def spring(c: StanceCoordinates) -> BlockExpression:
+def spring(c: StanceCoordinates, chosen: Joints = ()) -> BlockExpression:
     """Torques of springs and dampers at joints outside the held legs, less what they bear at rest.
 
-    z = y, y', T;  p = angles at rest, stiffness and damping over torque limit (one a joint).
+    z = y, y', T, logarithms of the factors on the gains of the joints of each of ``chosen``;  p = angles at
+        rest, stiffness and damping over torque limit (one a joint).
     """
     m = c.ny - c.base
     y, y1, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("T")
     rest, stiffness, damping = ca.SX.sym("rest", m), ca.SX.sym("k", m), ca.SX.sym("d", m)
-    torque = -stiffness * (y[c.base :] - rest) - damping * y1[c.base :] / T
-    return make_block([y, y1, T], [rest, stiffness, damping], {"torque": torque})
+    logs, own = ca.SX.sym("logs", len(chosen)), {int(joint): k for k, joint in enumerate(c.independent)}
+    here = tuple(tuple(own[joint] for joint in joints if joint in own) for joints in chosen)
+    stiff, damped = chosen_gains(stiffness, damping, logs, here)
+    torque = -stiff * (y[c.base :] - rest) - damped * y1[c.base :] / T
+    return make_block([y, y1, T, logs], [rest, stiffness, damping], {"torque": torque})
 
 
 def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
@@ -190,15 +195,17 @@ def builders(
     freezes: int = 0,
     first: bool = False,
     second: str = "",
+    chosen: Joints = (),
 ) -> dict[str, Callable[[], BlockExpression]]:
     """Block's name -> a function that builds its expression; ``instant``: for an impact without duration;
     ``frozen``: the terms of a model with frozen dynamics, and its freezes on the way; ``first``: whether the
-    first instant of contact is looked at; ``second``: another striker.
+    first instant of contact is looked at; ``second``: another striker; ``chosen``: joints whose gains have a
+    factor each.
 
     That is slow: it is only called when the compiled library is not in the cache.
     """
     hit: dict[str, Callable[[], BlockExpression]] = {
-        "collision": lambda: collision(c, striker, frozen, second),
+        "collision": lambda: collision(c, striker, frozen, second, chosen),
         "force": lambda: force(c, striker, law, target, frozen, second),
     }
     if c.legs:
@@ -223,5 +230,5 @@ def builders(
         **({"impact": lambda: impact(c, striker)} if instant else hit),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
-        **({"spring": lambda: spring(c)} if c.robot.passive.any() else {}),
+        **({"spring": lambda: spring(c, chosen)} if c.robot.passive.any() else {}),
     }

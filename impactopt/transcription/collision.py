@@ -144,7 +144,7 @@ class Collision(ContactNumbers, Collocated):
         y, u0, ff = self.contact.state.y, self.contact.u0[0], self._feedforward()
         coast = [self.coast_legs[i], self.coast_rates[i]]
         hit = [self.legs[i], self.f[i], self.w[i]]
-        return [y, u0, *coast, ff, *self._travel(i), *self._slots(self.u, i, u0), *hit]
+        return [y, u0, *coast, ff, *self._travel(i), *self._slots(self.u, i, u0), *hit, self.contact.gains[0]]
 
     def _of_hand(self, i: int) -> list[Affine]:
         """The slots of the block ``force`` that say where the hand is, and how fast."""

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Group
+
+GAINS = "logarithms of factors on gains"
 
 
 class ContactState(NamedTuple):
@@ -24,10 +28,13 @@ class ContactState(NamedTuple):
 
 
 class Coasting(NamedTuple):
-    """What the robot goes on with: the torques over limit of the feed-forward (n), and the rate (ny) ydot."""
+    """What the robot goes on with: the torques over limit of the feed-forward (n), the rate (ny) ydot, and
+    the logarithms of the factors on its gains, one for each of the problem's `gains`.
+    """
 
     feedforward: Group
     u0: Group
+    gains: Group
 
 
 def add_coasting(b: Builder, rates: dict[str, Any] | None = None) -> Coasting:
@@ -36,7 +43,17 @@ def add_coasting(b: Builder, rates: dict[str, Any] | None = None) -> Coasting:
     return Coasting(
         b.layout.add("feed-forward at contact", 1, b.robot.n, lower=-limit, upper=limit, labels=names),
         b.layout.add("rate at contact", 1, b.ny, labels=b.coordinates.labels, **(rates or {})),
+        _add_gains(b),
     )
+
+
+def _add_gains(b: Builder) -> Group:
+    chosen = b.problem.gains
+    if not chosen:
+        return Group(GAINS, 0, 1, 0, np.zeros(0), ())
+    least, largest = np.log([gain.factor for gain in chosen]).T
+    labels = [", ".join(gain.joints) for gain in chosen]
+    return b.layout.add(GAINS, 1, len(chosen), lower=least, upper=largest, labels=labels)
 
 
 class Contact(NamedTuple):
@@ -45,6 +62,7 @@ class Contact(NamedTuple):
     state: ContactState
     feedforward: Group
     u0: Group
+    gains: Group
 
     def link(
         self,

@@ -17,6 +17,7 @@ from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
+from impactopt.transcription.gain_blocks import Joints, chosen_gains
 
 __all__ = [
     "DEPTH_SCALE",
@@ -76,7 +77,7 @@ def coasting(c: StanceCoordinates, frozen: Effects | None = None) -> BlockExpres
 
 
 def collision(
-    c: StanceCoordinates, striker: str, frozen: Effects | None = None, second: str = ""
+    c: StanceCoordinates, striker: str, frozen: Effects | None = None, second: str = "", chosen: Joints = ()
 ) -> BlockExpression:
     """Equation of motion (6) at one collocation point of the collision.
 
@@ -92,6 +93,7 @@ def collision(
       frozen: y, ydot and legs of the freeze; rates of the reference's legs when its segment began, their
         acceleration, time [s] since; rates of the legs and their lag behind the reference, each with its
         slope; slope of the hand's speed; wrenches that carry the weight, where the model has no bias (nw).
+      last: logarithms of the factors on the gains of ``chosen`` joints.
     p = normal (3), s (place in the phase), 1 in restitution else 0, Kp, Kd, torque limits (n each), weight
         [N], lever [m].
     out = closure [m, rad], base rows, joint rows over torque limit, servo torque over limit; frozen: what the
@@ -104,7 +106,7 @@ def collision(
     T1, T, f = ca.SX.sym("T1"), ca.SX.sym("T"), ca.SX.sym("f", len(strikers))
     normal, s, after = ca.SX.sym("n", 3), ca.SX.sym("s"), ca.SX.sym("after")
     kp, kd, limit = ca.SX.sym("kp", n), ca.SX.sym("kd", n), ca.SX.sym("limit", n)
-    weight, lever = ca.SX.sym("weight"), ca.SX.sym("lever")
+    weight, lever, logs = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("logs", len(chosen))
     t = after * T1 + T * s
     y, ydd = ca.SX.sym("y", ny), ca.SX.sym("ydd", ny)
     through = [(y, y0 + T1 * d1 + T * d), (ydd, u1 / T)]
@@ -139,7 +141,8 @@ def collision(
     driven = np.ones(ny)
     driven[c.base :] -= c.robot.passive[c.independent]  # a spring's rest does not move
     ahead = c.configuration(y0 + driven * u0 * t - y, lag)[c.base :]
-    servo = ff + (kp * ahead + kd * c.configuration(u0 - u, slower)[c.base :]) / limit
+    stiff, damped = chosen_gains(kp, kd, logs, chosen)
+    servo = ff + (stiff * ahead + damped * c.configuration(u0 - u, slower)[c.base :]) / limit
     out = {
         "closure": c.closure(y, legs),
         "base": tau[: c.base] / base_scale(c, weight, lever),
@@ -148,7 +151,7 @@ def collision(
         **slopes,
     }
     z = [y0, u0, *more[: 2 * (frozen is None)], ff, d1, T1, d, T, u, u1, legs, f, w]
-    z += more if frozen is not None else []
+    z += [*(more if frozen is not None else []), logs]
     return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through, lanes=4)
 
 

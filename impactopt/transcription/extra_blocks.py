@@ -43,6 +43,7 @@ def own_blocks(
         freezes=problem.freezes,
         first=problem.first_instant,
         second="" if problem.second is None else problem.second.striker,
+        chosen=problem.gain_joints,
     )
 
 

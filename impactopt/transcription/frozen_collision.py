@@ -185,7 +185,8 @@ class FrozenCollision(Collision):
         carried = [] if self.effects.bias else [self.carried[0] if self.carried.count else Affine.zeros(b.nw)]
         own = [y, u0, self._feedforward(), *self._travel(i), *self._slots(self.u, i, u0), *hit]
         reference = [self.coast_rates[k], bends]
-        return [*own, at.y, at.u, at.legs, *reference, *legs, since, self._hand_slope(i), *carried]
+        more = [*reference, *legs, since, self._hand_slope(i), *carried, self.contact.gains[0]]
+        return [*own, at.y, at.u, at.legs, *more]
 
     def _hand_slope(self, i: int) -> Affine:
         """Of its speed along the normal, which is that of the robot at the beginning of a segment."""

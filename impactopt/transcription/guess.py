@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -188,7 +189,18 @@ def blow(
 
 
 def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
-    """How long each phase of the blow of a point mass [kg] of 1 m/s lasts [s]."""
+    """How long each phase of the blow of a point mass [kg] of 1 m/s lasts [s].
+
+    It is known from the last programs, which mostly are of the same blow.
+    """
+    try:
+        return _natural_durations(law, target, mass)
+    except TypeError:  # a law or a target of one's own that has no hash
+        return _natural_durations.__wrapped__(law, target, mass)
+
+
+@lru_cache(maxsize=64)
+def _natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:
     phases = len(target.phases)
     return blow(law, target, mass, 1.0, np.arange(phases, dtype=np.intp), np.ones(phases)).durations
 

@@ -64,19 +64,21 @@ def follow_springs(motion: MotionPhase, torques: Sequence[Affine]) -> list[Sprin
     ]
 
 
-def add_springs(b: Builder, points: Sequence[SpringPoint]) -> None:
+def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> None:
     """At some points: torque = torque at rest - stiffness x turn - damping x rate.
 
     In contact the servo's own law is that of the spring.
+
+    gains : logarithms of the factors on them that are chosen.
     """
     robot, c = b.robot, b.coordinates
     passive = np.flatnonzero(robot.passive)
     if not passive.size:
         return
     own = c.independent
-    gains = [(gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd)]
-    slots: list[list[Any]] = [[point.y, point.y1, point.T] for point in points]
-    at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], *gains]))
+    given = [(gain / robot.torque_limit)[own] for gain in (robot.kp, robot.kd)]
+    slots: list[list[Any]] = [[point.y, point.y1, point.T, gains] for point in points]
+    at = b.add_block("spring", slots, np.concatenate([b.y0[c.base :], *given]))
     rest, m = start_torque(b)[passive], b.ny - c.base
     which = np.array([int(np.flatnonzero(own == k)[0]) for k in passive])
     names = [robot.joint_names[k] for k in passive]

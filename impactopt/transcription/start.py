@@ -95,6 +95,7 @@ def first_iterate(t: Transcription, *, speed: float = 1.0, noise: float = 0.0, s
         CubicSpline.fit(back, t.follow.breaks, 0.5 * hit.rates, zero, follow_T),
     )
     t.hit.guess(x, hit.y, hit.rates, hit.legs)
+    _draw_gains(t, x, noise, seed)
     return _finished(t, x)
 
 
@@ -108,7 +109,16 @@ def strike_iterate(t: StrikeTranscription, *, speed: float = 1.0, noise: float =
     t.legs.write(x, hit.legs)
     t.w.write(x, static_wrenches(t.coordinates, hit.y, hit.legs))
     t.hit.guess(x, hit.y, hit.rates, hit.legs)
+    _draw_gains(t, x, noise, seed)
     return _finished(t, x)
+
+
+def _draw_gains(t: ContactProgram, x: Array, noise: float, seed: int) -> None:
+    """Gains that are chosen begin as they are given, and in noisy starts anywhere between their bounds."""
+    gains = t.hit.contact.gains
+    if noise and gains.size:
+        k = gains.index(0)
+        x[k] = np.random.default_rng(seed).uniform(t.layout.lower[k], t.layout.upper[k])
 
 
 def iterate_from_strike(t: Transcription, strike: StrikeTranscription, x: Array) -> Array:

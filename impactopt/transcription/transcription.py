@@ -78,6 +78,8 @@ def block_functions(
     second = () if problem.second is None else (problem.second.striker,)
     keys = {"force": (*contact, *second), "first": contact[:1], "coasting": frozen}
     keys |= {"collision": (*frozen, *springs, *second), **dict.fromkeys(SECOND_BLOCKS, second)}
+    if chosen := problem.gain_joints:
+        keys |= {name: (*keys.get(name, ()), chosen) for name in ("collision", "spring")}
     found = {
         name: ExtraBlock(keys.get(name, ()), build)
         for name, build in own_blocks(problem, coordinates, edges).items()

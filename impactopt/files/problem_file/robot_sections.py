@@ -13,6 +13,7 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file.described import section_of
 from impactopt.files.problem_file.section import Section, optional, required
 from impactopt.files.problem_file.values import (
+    Factor,
     Inertia,
     JointNames,
     Pair,
@@ -27,6 +28,7 @@ from impactopt.files.problem_file.values import (
 from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import add_frame, check_count, lock_joints, read_urdf
 from impactopt.robots.checks import check_legs
+from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
@@ -106,6 +108,31 @@ class ActuatorSection(_OfActuator):
         return Actuator(**{name: value for name, value in self.given().items() if name != "joints"})
 
 
+class GainSection(Section):
+    """A factor on the stiffness of some joints; their damping gets its root, so its ratio stays."""
+
+    joints: JointNames = required(
+        "names of joints, or patterns; that of a tool in a soft grip is its name with `_grip` behind"
+    )
+    factor: Factor = required("one number, or [least, largest] for the plan to choose")
+
+    @property
+    def open(self) -> bool:
+        """Whether the plan chooses it."""
+        return isinstance(self.factor, list)
+
+    def build(self) -> Any:
+        """What the plan chooses from; None where nothing is left open."""
+        if not self.open:
+            return None
+        return GainFactor(joints=tuple(self.joints), factor=tuple(self.factor))
+
+    @model_validator(mode="after")
+    def _leaves_a_choice(self) -> GainSection:
+        self.build()
+        return self
+
+
 class RobotSection(Section):
     """A preset with changes, or a URDF or MJCF; files are relative to the problem file.
 
@@ -140,6 +167,7 @@ class RobotSection(Section):
     tools: list[ToolSection] = optional("what the robot holds")
     grips: dict[str, GripSection] = optional("tools that are held softly, by name")
     actuators: list[ActuatorSection] = optional("motors and gears; joints that none names keep the preset's")
+    gains: list[GainSection] = optional("factors on gains of servos, and on springs of soft grips")
     postures: dict[str, dict[str, float]] = optional(
         "named postures: joint angles by joint, the others 0 or the SRDF's [rad]", "postures_rad"
     )
@@ -174,6 +202,8 @@ class RobotSection(Section):
             for section in (self.actuators if options.pop("actuators", None) else ())
             for joint in section.joints
         }
+        given = self.gains if options.pop("gains", None) else []
+        factors = {joint: g.factor for g in given if not g.open for joint in g.joints}
         kind = next((key for key in ("urdf", "mjcf") if key in options), None)
         if kind is not None:
             read = Robot.from_urdf if kind == "urdf" else Robot.from_mjcf
@@ -188,7 +218,12 @@ class RobotSection(Section):
             robot = robot.with_tool(tool)
         for name, grip in grips.items():
             robot = robot.with_grip(name, grip)
-        return robot
+        return scaled_gains(robot, factors) if factors else robot
+
+    @property
+    def choices(self) -> tuple[GainFactor, ...]:
+        """The gains that are left open."""
+        return tuple(section.build() for section in self.gains or () if section.open)
 
     def leg_mistake(self, folder: Path, held: str) -> InputError | None:
         """What is wrong with the legs of the held soles, "both" or one by its name, whatever else is."""
@@ -228,12 +263,15 @@ class RobotSection(Section):
         found: list[tuple[tuple[str, ...], InputError]] = []
         for key, info in type(self).model_fields.items():
             if key in self.model_fields_set - _BARE:
-                wrong = _tried({**bare, key: getattr(self, key)}, folder)
+                wanted = {key, *_AFTER.get(key, ())} & self.model_fields_set
+                wrong = _tried({**bare, **{k: getattr(self, k) for k in wanted}}, folder)
                 found += [((info.alias or key,), wrong)] if wrong else []
         return found or [((), error)]
 
 
 _BARE = {"preset", "urdf", "mjcf", "srdf", "floating", "locked", "inertias"}  # what the other keys are about
+
+_AFTER = {"grips": ("tools",), "gains": ("tools", "grips")}  # keys that speak of what others bring
 
 
 def _tried(keys: dict[str, Any], folder: Path) -> InputError | None:

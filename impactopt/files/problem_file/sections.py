@@ -243,6 +243,8 @@ class File(Section):
             if "contact_duration" in given:
                 given["contact_duration"] = tuple(given["contact_duration"])
             out |= {**given, "collision_elements": tuple(tuple(lengths) for lengths in elements)}
+        if self.robot is not None and self.robot.choices:
+            out["gains"] = self.robot.choices
         if self.target.body is not None:
             out["body"] = self.target.body.build()
         if self.obstacles is not None:

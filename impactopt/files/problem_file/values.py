@@ -44,6 +44,16 @@ def _contact_duration(value: Any) -> list[float]:
     return _duration(value)
 
 
+def _factor(value: Any) -> Any:
+    """A number > 0, or [least, largest]."""
+    pair = value if isinstance(value, list) else [value, value]
+    if len(pair) != 2 or not all(_is_number(x) and 0 < x < np.inf for x in pair):
+        raise ValueError(f"{value}; give a number > 0, or [least, largest] for the plan to choose")
+    if pair is value and not pair[0] < pair[1]:
+        raise ValueError(f"{value}; the first of two has to be less than the second")
+    return value
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
@@ -181,6 +191,7 @@ Margin = Annotated[Any, PlainValidator(any_margin)]
 Posture = Annotated[Any, PlainValidator(_posture)]
 Rotation = Annotated[Any, PlainValidator(_rotation)]
 Inertia = Annotated[Any, PlainValidator(_inertia)]
+Factor = Annotated[Any, PlainValidator(_factor)]
 Duration = Annotated[Any, PlainValidator(_duration)]
 ContactDuration = Annotated[Any, PlainValidator(_contact_duration)]
 Fractions = Annotated[list[Positive], AfterValidator(_fractions)]

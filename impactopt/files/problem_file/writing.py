@@ -72,6 +72,8 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     """A problem as a problem file's data, without what is a default; see `write_problem`."""
     usual: dict[str, Any] = {f.name: f.default_factory for f in fields(ImpactProblem)}
     robot, built = robot_data(problem.robot, Path(folder))
+    if problem.gains:
+        robot["gains"] = [{"joints": list(g.joints), "factor": list(g.factor)} for g in problem.gains]
     named = robot.keys() == {"preset"}
     start = problem.start
     if not isinstance(start, str) or not _equal(built.postures.get(start), problem.start_posture):

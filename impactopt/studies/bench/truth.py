@@ -54,6 +54,8 @@ HELD = (
     ("error %", "impulse_error_pct", 2),
     ("ZMP mm", "zmp_margin_mm", 1),
     ("torque", "torque_ratio", 2),
+    ("gear planned", "gear_planned", 2),
+    ("gear", "gear_held", 2),
     ("force N", "min_normal_force_N", 0),
     ("apart mm", "clearance_mm", 1),
     ("touches", "touches", 0),
@@ -62,6 +64,7 @@ HELD = (
 FREE = (
     ("problem", "problem", 0),
     ("error %", "replay_impulse_error_pct", 2),
+    ("gear", "gear_free", 2),
     ("slip mm", "replay_slip_mm", 1),
     ("lift mm", "replay_lift_collision_mm", 2),
     ("apart mm", "replay_clearance_mm", 1),
@@ -117,6 +120,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
     mesh_touches : pairs that are in each other by the exact meshes of the robot's URDF, looked at every
     millisecond of the plan, the missed blow and the replay (None: it has no meshes).
+    gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}
     try:
@@ -134,6 +138,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
             "impulse_error_pct": held["impulse_error_pct"],
             "zmp_margin_m": min(held.get("zmp_margin_m", {}).values(), default=None),
             "torque_ratio": max(held["torque_ratio"].values()),
+            "gear_planned": told.get("gear_ratio"),
+            "gear_held": held.get("gear_ratio"),
             "min_normal_force_N": held.get("min_normal_force_N"),
         }
     except InputError as error:
@@ -149,6 +155,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         return out
     out |= {
         "replay_impulse_error_pct": free["impulse_error_pct"],
+        "gear_free": free.get("gear_ratio"),
         "replay_slip_mm": free.get("sole_slip_mm"),
         "replay_lift_collision_mm": free.get("sole_lift_collision_mm"),
         "replay_clearance_mm": free["clearance_mm"],

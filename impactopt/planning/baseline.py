@@ -151,7 +151,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     """
     c, r = problem.coordinates, problem.robot
     tau = np.array(pin.rnea(c.model, c.data, q, v, a))
-    limit = problem.term(TorqueLimit).fraction * r.torque_limit
+    limit = problem.term(TorqueLimit).fraction * np.where(r.hinges, 0.0, r.torque_limit)
     if not c.legs:
         return bool(np.all(np.abs(tau) <= limit))
     cone = problem.term(ContactWrenchCone)

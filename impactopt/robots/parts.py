@@ -28,6 +28,9 @@ class Sole:
     polygon : (k, 2) corners [m] in the x-y plane of the frame, counter-clockwise seen from above, convex.
     parent, placement : for a model without that frame: it is added at `placement` (pin.SE3) in the frame
         `parent`.
+    hinge : axis of the frame, "x", "y" or "z", about which the foot turns on the sole, as that of a leg of
+        five joints. Nothing drives it: the sole bears no moment about this axis. It makes a joint, called as
+        the sole with ``_hinge`` behind.
     """
 
     name: str
@@ -35,6 +38,7 @@ class Sole:
     polygon: Array
     parent: str | None = None
     placement: Any = None
+    hinge: str | None = None
 
     def __post_init__(self) -> None:
         polygon = check_array(f"sole {self.name!r}: polygon [m]", self.polygon, (None, 2), most=FARTHEST)
@@ -44,6 +48,13 @@ class Sole:
             raise InputError(f"sole {self.name!r}: give parent and placement together, or neither")
         if self.placement is not None:
             check_array(f"sole {self.name!r}: placement [m]", self.placement.translation, (3,), most=FARTHEST)
+        if self.hinge not in (None, "x", "y", "z"):
+            raise InputError(f'sole {self.name!r}: hinge is {self.hinge!r}; give "x", "y" or "z", or None')
+
+    @property
+    def hinge_joint(self) -> str:
+        """Name of the joint that a hinge makes."""
+        return f"{self.name}_hinge"
 
     @classmethod
     def box(

@@ -16,6 +16,7 @@ from impactopt.errors import Mistakes, check_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
+from impactopt.robots.hinges import with_hinges
 from impactopt.robots.inertias import GIVEN, REPAIRED, check_choice, check_inertias, repair_inertias
 from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
@@ -231,24 +232,23 @@ class Robot:
                 build.add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
         for striker in strikers:
             build.add_striker(model, striker)
+        read = build.read_postures(model, postures or {})
+        numbers: dict[str, Any] = {"torque_limit": limit, "velocity_limit": speed}
+        numbers |= {"lower": lower, "upper": upper, "actuators": drives}
+        numbers |= {"kp": build.per_joint("kp", kp, joints, 30.0 * damping), "kd": damping}
+        model, numbers, read = with_hinges(model, soles, numbers, read)
         robot = cls(
             name=name or model.name,
             model=model,
-            kp=build.per_joint("kp", kp, joints, 30.0 * damping),
-            kd=damping,
-            torque_limit=limit,
-            velocity_limit=speed,
-            lower=lower,
-            upper=upper,
+            **numbers,
             soles=tuple(soles),
             strikers=build.by_name("striker", strikers),
             disable_collisions=build.link_pairs(model, disable_collisions),
             urdf=None if urdf is None else str(urdf),
             mjcf=None if mjcf is None else str(mjcf),
-            actuators=drives,
         )
         build.by_name("sole", soles)
-        return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))
+        return dataclasses.replace(robot, postures={pose: robot.place(q) for pose, q in read.items()})
 
     def __repr__(self) -> str:
         """One line: its model and arrays would fill pages."""
@@ -329,11 +329,23 @@ class Robot:
 
     @property
     def passive(self) -> NDArray[np.bool_]:
-        """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip: it has no
-        gear.
+        """(n,) Whether no motor moves a joint, but a spring and a damper, as that of a soft grip, or nothing,
+        as a sole's hinge.
         """
-        grips = {tool.grip_joint for tool in self.tools if tool.grip is not None}
-        return np.array([name in grips for name in self.joint_names], dtype=bool)
+        return self.sprung | self.hinges
+
+    @property
+    def sprung(self) -> NDArray[np.bool_]:
+        """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip."""
+        return self._among(tool.grip_joint for tool in self.tools if tool.grip is not None)
+
+    @property
+    def hinges(self) -> NDArray[np.bool_]:
+        """(n,) Whether nothing moves a joint, as a sole's hinge."""
+        return self._among(sole.hinge_joint for sole in self.soles if sole.hinge is not None)
+
+    def _among(self, joints: Iterable[str]) -> NDArray[np.bool_]:
+        return np.isin(self.joint_names, list(joints))
 
     def with_actuators(self, actuators: Mapping[str, Actuator]) -> Robot:
         """A copy of the robot with these motors and gears, of joints by name or pattern.
@@ -392,7 +404,3 @@ class Robot:
         q = self.check_configuration(q)
         chosen = self.soles if soles is None else [self.sole(s) if isinstance(s, str) else s for s in soles]
         checks.check_stance(self.model, q, [(sole.name, sole.frame) for sole in chosen], height, tilt)
-
-    def _read_postures(self, given: Mapping[str, Mapping[str, float] | ArrayLike]) -> dict[str, Array]:
-        postures = build.read_postures(self.model, given)
-        return {name: self.place(q) for name, q in postures.items()}

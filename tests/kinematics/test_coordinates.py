@@ -67,6 +67,9 @@ CASES = {
     "g1": lambda: make_case(load_robot("g1"), "half_sitting"),
     "biped": lambda: make_case(biped(), "half_sitting"),
     "biped on its left foot": lambda: make_case(biped(), "half_sitting", 1),
+    "biped on legs of seven": lambda: make_case(biped(7), "half_sitting"),
+    "biped with a waist": lambda: make_case(biped(waist=True), "half_sitting"),
+    "biped on hinged soles": lambda: make_case(biped(5), "half_sitting"),
     "stand-in that holds on": lambda: make_case(load_robot("standin"), "half_sitting", hands=("left_hand",)),
     "arm": lambda: make_case(arm(), "start"),
 }

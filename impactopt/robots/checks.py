@@ -154,21 +154,23 @@ def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
     found, chains = Mistakes(), []
     for name, frame in soles:
         parent = model.frames[check_frame(model, frame, f"sole {name!r}")].parentJoint
-        chains.append([str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1])
+        chains.append(
+            [str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1]
+        )
     for k, ((name, frame), joints) in enumerate(zip(soles, chains, strict=True)):
         others = {joint for other in chains[:k] + chains[k + 1 :] for joint in other}
         own = joints[-LEG:]
         told = f": {', '.join(joints)}" if joints else ""
         if len(joints) == LEG - 1 and not others & set(own):
             found.found.append(
-                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}, and "
-                f"a sole is held in {LEG} directions: say about which axis it may turn on the ground, as by "
-                'hinge = "x" of the sole, its long axis'
+                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}, "
+                f"and a sole is held in {LEG} directions: say about which of its axes the foot may turn on "
+                'the ground, as by hinge = "x", its long axis, where the leg lacks an ankle roll'
             )
         elif len(joints) < LEG:
             found.found.append(
                 f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}; a "
-                f"held sole needs {LEG}, or {LEG - 1} and a hinge"
+                f"held sole needs {LEG} or more, or {LEG - 1} and a hinge"
             )
         elif others & set(own):
             shared = ", ".join(joint for joint in own if joint in others)

@@ -16,11 +16,11 @@ from impactopt.robots.checks import check_frame
 from impactopt.robots.joints import hung, mapped
 from impactopt.robots.parts import Sole
 
-__all__ = ["hinged", "with_hinges"]
+__all__ = ["check_sole", "hinged", "inside", "with_hinges"]
 
 Array = NDArray[np.float64]
 SHARE = 0.5  # of the foot's mass that goes with the sole
-REACH, SPEED = 0.5, 20.0  # [rad], [rad/s]: no bounds of a strike
+SPEED = 20.0  # [rad/s]: no bound of a strike
 LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are told in
 
 
@@ -35,16 +35,20 @@ def hinged(model: pin.Model, soles: Sequence[Sole]) -> pin.Model:
         if sole.hinge is None:
             continue
         if sole.hinge_joint in build.joint_names(model):
-            raise InputError(f"sole {sole.name!r}: the robot has a joint {sole.hinge_joint!r}; rename the sole")
+            raise InputError(
+                f"sole {sole.name!r}: the robot has a joint {sole.hinge_joint!r} already; rename the sole"
+            )
         at = check_frame(model, sole.frame, f"sole {sole.name!r}")
         foot, place = int(model.frames[at].parentJoint), model.frames[at].placement
         if foot == 0:
-            raise InputError(f"sole {sole.name!r}: no joint moves the frame {sole.frame!r}, so it has no hinge")
+            raise InputError(
+                f"sole {sole.name!r}: no joint moves its frame {sole.frame!r}, so leave out the hinge"
+            )
         place, whole = pin.SE3(place), pin.Inertia(model.inertias[foot])  # they outlive their model
         model = model.copy()
         model.inertias[foot] = _part(whole, 1 - SHARE)
         turn, mark = pin.SE3(_to_axis("xyz".index(sole.hinge)), np.zeros(3)), f"sole:{sole.name}"
-        joint, body = (sole.hinge_joint, torque, SPEED, REACH), place.actInv(_part(whole, SHARE))
+        joint, body = (sole.hinge_joint, torque, SPEED, sole.hinge_range), place.actInv(_part(whole, SHARE))
         model = hung(model, sole.frame, turn, joint, mark, body)
         moved, its = model.frames[model.getFrameId(sole.frame)], model.getFrameId(mark)
         moved.parentJoint, moved.placement = model.frames[its].parentJoint, model.frames[its].placement
@@ -56,14 +60,34 @@ def with_hinges(
     model: pin.Model, soles: Sequence[Sole], numbers: dict[str, Any], postures: dict[str, Array]
 ) -> tuple[pin.Model, dict[str, Any], dict[str, Array]]:
     """As `hinged`, with numbers by joint, drives and postures of all joints."""
-    whole = hinged(model, soles)
-    own = {"kp": 0.0, "kd": 0.0, "torque_limit": hinge_torque(model), "velocity_limit": SPEED}
-    own |= {"lower": -REACH, "upper": REACH, "actuators": Actuator()}
-    old, new = build.joint_names(model), build.joint_names(whole)
-    for key, values in numbers.items():
-        known = dict(zip(old, values, strict=True))
-        numbers[key] = [known.get(name, own[key]) for name in new]
+    whole, torque = hinged(model, soles), hinge_torque(model)
+    known: dict[str, dict[str, Any]] = {}
+    for sole in soles:
+        own = {"kp": 0.0, "kd": 0.0, "torque_limit": torque, "velocity_limit": SPEED}
+        own |= {"lower": -sole.hinge_range, "upper": sole.hinge_range, "actuators": Actuator()}
+        known[sole.hinge_joint] = own
+    for k, joint in enumerate(build.joint_names(model)):
+        known[joint] = {key: values[k] for key, values in numbers.items()}
+    numbers = {key: [known[joint][key] for joint in build.joint_names(whole)] for key in numbers}
     return whole, numbers, {name: mapped(model, whole, q) for name, q in postures.items()}
+
+
+def check_sole(model: pin.Model, sole: Sole) -> None:
+    """InputError for a sole whose frame or hinge the model has not."""
+    check_frame(model, sole.frame, f"sole {sole.name!r}")
+    if sole.hinge is not None and sole.hinge_joint not in build.joint_names(model):
+        raise InputError(
+            f"sole {sole.name!r} has a hinge, and the model no joint for it: give the sole to "
+            "Robot.from_urdf, from_mjcf or from_model, which make one"
+        )
+
+
+def inside(robot: Any, margin: float) -> tuple[Array, Array]:
+    """(n,) lower and upper position limits [rad] of a `Robot`, less a margin; of hinges, whose range is small,
+    less a quarter of it.
+    """
+    less = np.where(robot.hinges, np.minimum(margin, (robot.upper - robot.lower) / 8), margin)
+    return robot.lower + less, robot.upper - less
 
 
 def hinge_torque(model: pin.Model) -> float:

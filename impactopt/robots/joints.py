@@ -26,7 +26,8 @@ def hung(
     frame that moves with it, and is where `frame` is at zero.  body : pin.Inertia that moves so, in `mark`.
     """
     name, torque, speed, reach = joint
-    one, back, bounds = pin.Model(), placement.inverse(), [np.array([x]) for x in (torque, speed, -reach, reach)]
+    one, back = pin.Model(), placement.inverse()
+    bounds = [np.array([x]) for x in (torque, speed, -reach, reach)]
     index = one.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), name, *bounds)
     one.appendBodyToJoint(index, body, back)
     one.addFrame(pin.Frame(mark, index, 0, back, pin.FrameType.BODY))

@@ -357,7 +357,7 @@ def complete_reference(
     """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6).
 
     y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
-    as little as it takes to balance the base, and hinges of soles; legs (nl,) starts their inverse kinematics.
+    as little as it takes to balance the base and hinges of soles; legs (nl,) starts their inverse kinematics.
     """
     c, robot = problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()

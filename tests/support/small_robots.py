@@ -42,11 +42,11 @@ MOTORS = {
 }
 
 
-def biped(legs: int = 6, *, waist: bool = False) -> Robot:
+def biped(legs: int = 6, *, waist: bool = False, hinge: str | None = "x") -> Robot:
     """A 40 kg biped: two legs of six joints on box soles and an arm of three; 21 velocities.
 
-    legs : 7: one more in each hip; 5: no ankle roll, and soles on a hinge.  waist : two joints from the trunk
-    to the hips.
+    legs : 7: one more in each hip; 5: no ankle roll.  hinge : of soles on legs of five.  waist : two joints
+    from the trunk to the hips.
     """
     model = pin.Model()
     model.name = "small biped"
@@ -85,10 +85,8 @@ def biped(legs: int = 6, *, waist: bool = False) -> Robot:
     _mark(model, parent, (0.3, 0.0, 0.0), "fist")
     names = list(model.names)[2:]
     angles = {f"{side} {name}": angle for side in ("left", "right") for name, angle in HALF_SITTING.items()}
-    hinge = "x" if legs == 5 else None
-    soles = [
-        Sole.box(name=s, frame=f"{s} sole", length=0.22, width=0.12, hinge=hinge) for s in ("left", "right")
-    ]
+    size: dict[str, Any] = {"length": 0.22, "width": 0.12, "hinge": hinge if legs == 5 else None}
+    soles = [Sole.box(name=side, frame=f"{side} sole", **size) for side in ("left", "right")]
     return Robot.from_model(
         model,
         armature=0.05,

@@ -83,8 +83,8 @@ def check_sole(model: pin.Model, sole: Sole) -> None:
 
 
 def inside(robot: Any, margin: float) -> tuple[Array, Array]:
-    """(n,) lower and upper position limits [rad] of a `Robot`, less a margin; of hinges, whose range is small,
-    less a quarter of it.
+    """(n,) lower and upper position limits [rad] of a `Robot`, less a margin; of hinges, whose range is
+    small, less a quarter of it.
     """
     less = np.where(robot.hinges, np.minimum(margin, (robot.upper - robot.lower) / 8), margin)
     return robot.lower + less, robot.upper - less

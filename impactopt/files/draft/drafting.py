@@ -213,7 +213,7 @@ def _frames(robot: Robot) -> Iterator[str]:
     model = robot.model
     for joint in range(1, model.njoints):
         of = [f for f in model.frames if f.parentJoint == joint and f.type != pin.FrameType.JOINT]
-        names = [str(f.name) for f in of if not str(f.name).startswith("striker:")]
+        names = [str(f.name) for f in of if not str(f.name).startswith(("striker:", "sole:"))]
         if names:
             yield f"#   {model.names[joint]}: {', '.join(names)}"
 
@@ -221,7 +221,8 @@ def _frames(robot: Robot) -> Iterator[str]:
 def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
     """What a user should know before the first plan."""
     stands = "on two legs" if drafted.legs else "on a fixed base"
-    yield f"{robot.name}: {robot.n} joints, {stands}; {data['problem']['striker']!r} strikes"
+    joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
+    yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
     across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
     if across:
         yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"

@@ -87,12 +87,12 @@ class StanceCoordinates:
                 "floating=False)"
             )
         check_legs(self.model, [(sole.name, sole.frame) for sole in soles])
-        for sole in robot.soles:
-            if sole.hinge is not None and sole not in soles:
-                raise InputError(
-                    f"sole {sole.name!r} turns on a hinge that nothing drives, so it cannot be lifted: stand "
-                    "on both soles"
-                )
+        lifted = [sole.name for sole in robot.soles if sole.hinge is not None and sole not in soles]
+        if lifted:
+            raise InputError(
+                f"sole {lifted[0]!r} turns on a hinge that nothing drives, so it cannot be lifted: stand on "
+                "both soles"
+            )
         check_arms(robot, [sole.frame for sole in soles], [(hand.name, hand.model_frame) for hand in hands])
         pin.framesForwardKinematics(self.model, self.data, posture)
         self.legs: list[Leg] = []

@@ -63,7 +63,7 @@ def with_hinges(
     whole, torque = hinged(model, soles), hinge_torque(model)
     known: dict[str, dict[str, Any]] = {}
     for sole in soles:
-        own = {"kp": 0.0, "kd": 0.0, "torque_limit": torque, "velocity_limit": SPEED}
+        own: dict[str, Any] = {"kp": 0.0, "kd": 0.0, "torque_limit": torque, "velocity_limit": SPEED}
         own |= {"lower": -sole.hinge_range, "upper": sole.hinge_range, "actuators": Actuator()}
         known[sole.hinge_joint] = own
     for k, joint in enumerate(build.joint_names(model)):

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
+from impactopt.robots.hinges import check_held
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 
@@ -102,6 +103,8 @@ class StanceCoordinates:
         ):
             chain = np.array(robot.limb(frame), dtype=np.intp)
             placement = self.data.oMf[self.model.getFrameId(frame)].copy()
+            if sole is not None:
+                check_held(self.model, sole, posture, self.base + chain[-LEG:])
             order = elimination_order(self._leg_samples(frame, chain, posture))
             self.legs.append(Leg(name, sole, frame, chain[-LEG:], chain[:-LEG], order, placement))
         self.hands = [leg for leg in self.legs if leg.sole is None]

@@ -16,11 +16,12 @@ from impactopt.robots.checks import check_frame
 from impactopt.robots.joints import hung, mapped
 from impactopt.robots.parts import Sole
 
-__all__ = ["check_sole", "hinged", "inside", "with_hinges"]
+__all__ = ["check_held", "check_sole", "hinged", "inside", "with_hinges"]
 
 Array = NDArray[np.float64]
 SHARE = 0.5  # of the foot's mass that goes with the sole
 SPEED = 20.0  # [rad/s]: no bound of a strike
+SINGULAR = 1e-3  # a leg's Jacobian's least singular value [m], at least
 LEVER = 0.1  # [m] by which the weight makes the torque that numbers of a hinge are told in
 
 
@@ -79,6 +80,17 @@ def check_sole(model: pin.Model, sole: Sole) -> None:
         raise InputError(
             f"sole {sole.name!r} has a hinge, and the model no joint for it: give the sole to "
             "Robot.from_urdf, from_mjcf or from_model, which make one"
+        )
+
+
+def check_held(model: pin.Model, sole: Sole, q: Array, columns: Any) -> None:
+    """InputError where the joints of these columns of v, the sole's hinge among them, cannot hold it at q."""
+    frame = model.getFrameId(sole.frame)
+    jac = pin.computeFrameJacobian(model, model.createData(), q, frame, pin.LOCAL)[:, columns]
+    if sole.hinge is not None and np.linalg.svd(jac, compute_uv=False)[-1] < SINGULAR:
+        raise InputError(
+            f"sole {sole.name!r} cannot be held: its hinge about {sole.hinge} turns as joints of its leg do; "
+            "give the axis that they lack, or a posture with bent knees"
         )
 
 

@@ -384,6 +384,12 @@ def test_held_legs_share_no_joint() -> None:
         StanceCoordinates(robot, (robot.soles[0], robot.soles[0]), robot.posture("half_sitting"))
 
 
+def test_a_hinge_turns_about_an_axis_that_the_leg_lacks() -> None:
+    robot = biped(5, hinge="y")
+    with pytest.raises(InputError, match="'left' cannot be held: its hinge about y turns as"):
+        StanceCoordinates(robot, robot.soles, robot.posture("half_sitting"))
+
+
 def test_a_sole_on_a_hinge_is_not_lifted() -> None:
     robot = biped(5)
     with pytest.raises(InputError, match=r"'right' turns on a hinge .* stand on both"):

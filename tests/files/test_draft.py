@@ -114,6 +114,30 @@ def test_toes_are_locked(tmp_path: Path) -> None:
     assert set(read_toml(_drafted(tmp_path, text).text)["robot"]["locked_rad"]) == {"left_toe", "right_toe"}
 
 
+def test_arms_that_hang_from_a_spine_are_no_legs(tmp_path: Path) -> None:
+    parts = [
+        urdfs.link("pelvis", 5.0, (0.2, 0.2, 0.1), (0.0, 0.0, 0.0)),
+        urdfs.link("chest", 5.0, (0.2, 0.3, 0.2), (0.0, 0.0, 0.1)),
+        urdfs.joint("spine", "pelvis", "chest", "0 0 1", (0.0, 0.0, 0.05), (-1.0, 1.0)),
+    ]
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        parent, chain = (
+            "chest",
+            (
+                ("shoulder_pitch", "0 1 0", (0.0, y, 0.2), 0.05),
+                ("shoulder_roll", "1 0 0", (0.0, 0.0, 0.0), 0.3),
+                ("elbow", "0 1 0", (0.0, 0.0, -0.3), 0.3),
+            ),
+        )
+        for name, axis, at, long in chain:
+            child = f"{side}_{name}_link"
+            parts += [urdfs.link(child, 1.0, (0.06, 0.06, long), (0.0, 0.0, -long / 2))]
+            parts += [urdfs.joint(f"{side}_{name}", parent, child, axis, at, (-2.0, 2.0))]
+            parent = child
+    data = read_toml(_drafted(tmp_path, urdfs.robot("chest", *parts)).text)
+    assert data["robot"]["floating"] is False and "soles" not in data["robot"]
+
+
 def test_fingers_and_wheels_are_locked_and_a_cart_is_bolted(tmp_path: Path) -> None:
     data = read_toml(_drafted(tmp_path, urdfs.arm(wheels=True)).text)
     assert set(data["robot"]["locked_rad"]) == {"slide_0", "slide_1", "drive_0", "drive_1"}

@@ -104,7 +104,7 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     feet = (
         limb
         for limb in limbs_of(model)
-        if len(limb.own) > 1 and not _is_head(model, limb) and not _named(model, limb, _ARMS)
+        if len(limb.own) > 1 and not _is_head(model, limb) and not _on_a_spine(model, limb)
     )
     found = tuple(limb for limb in feet if heights(limb.tip).min() < lowest + FLAT * tall)
     return found if len(found) > 1 else ()  # an arm that hangs is no leg
@@ -154,6 +154,11 @@ def renumbered(limb: Limb, old: pin.Model, new: pin.Model) -> Limb:
 
 def _is_head(model: pin.Model, limb: Limb) -> bool:
     return _named(model, limb, _HEADS)
+
+
+def _on_a_spine(model: pin.Model, limb: Limb) -> bool:
+    """Whether it is an arm of an upper body, where a waist would be above legs."""
+    return limb.own != limb.path and _named(model, limb, _ARMS)
 
 
 def _named(model: pin.Model, limb: Limb, names: re.Pattern[str]) -> bool:

@@ -9,8 +9,8 @@ the sole's constraint
 with V and A the twist and the acceleration that the coordinates alone would give the sole.  Both sides are
 written in the base's own frame, where J_leg depends on the joints between base and sole only.
 
-A hand that holds on is one more sole: the last six joints of its arm are its leg, and those between base and
-arm, such as the waist's, are coordinates as before.
+A chain of more than six joints is held by its last six. Those before them are coordinates as the others: the
+first of a leg of seven, a waist that leads to both legs. A hand that holds on is one more sole.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
+from impactopt.robots.hinges import check_held
 from impactopt.robots.rigid_body import RigidBody
 from impactopt.robots.robot import Robot, Sole, Striker
 
@@ -34,16 +35,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Leg:
-    """One held sole with the joints between it and the base; or a held hand, with the last six of its arm.
+    """One held sole, or hand, with the last six joints of the chain from the base to it.
 
-    sole : None of a hand.  frame : that is held.  joints : (6,) into the robot's joints.  placement : pin.SE3
-    of the frame in the world.
+    sole : None of a hand.  frame : that is held.  joints : (6,) into the robot's joints.  before : (k,) those
+    between base and them.  placement : pin.SE3 of the frame in the world.
     """
 
     name: str
     sole: Sole | None
     frame: str
     joints: Index
+    before: Index
     order: tuple[Index, Index]
     placement: Any
 
@@ -66,6 +68,7 @@ class StanceCoordinates:
     ny, nl : number of independent coordinates, and of dependent leg joints (6 a held sole or hand).
     soles, legs, hands : held soles; legs of soles and, after them, of hands; the legs of hands alone.
     independent : (ny - 6 or ny,) indices of the independent joints among the robot's joints.
+    undriven : indices in v of what no motor moves but the soles' wrenches: the base, and soles' hinges.
     labels : names of the independent coordinates.
     start : (ny,) those of the posture.
     """
@@ -85,6 +88,12 @@ class StanceCoordinates:
                 "floating=False)"
             )
         check_legs(self.model, [(sole.name, sole.frame) for sole in soles])
+        lifted = [sole.name for sole in robot.soles if sole.hinge is not None and sole not in soles]
+        if lifted:
+            raise InputError(
+                f"sole {lifted[0]!r} turns on a hinge that nothing drives, so it cannot be lifted: stand on "
+                "both soles"
+            )
         check_arms(robot, [sole.frame for sole in soles], [(hand.name, hand.model_frame) for hand in hands])
         pin.framesForwardKinematics(self.model, self.data, posture)
         self.legs: list[Leg] = []
@@ -92,15 +101,17 @@ class StanceCoordinates:
             *((sole.name, sole, sole.frame) for sole in soles),
             *((hand.name, None, hand.model_frame) for hand in hands),
         ):
-            chain = robot.limb(frame)
-            joints = np.array(chain[-LEG:], dtype=np.intp)
+            chain = np.array(robot.limb(frame), dtype=np.intp)
             placement = self.data.oMf[self.model.getFrameId(frame)].copy()
-            order = elimination_order(self._leg_samples(frame, np.array(chain, dtype=np.intp), posture))
-            self.legs.append(Leg(name, sole, frame, joints, order, placement))
+            if sole is not None:
+                check_held(self.model, sole, posture, self.base + chain[-LEG:])
+            order = elimination_order(self._leg_samples(frame, chain, posture))
+            self.legs.append(Leg(name, sole, frame, chain[-LEG:], chain[:-LEG], order, placement))
         self.hands = [leg for leg in self.legs if leg.sole is None]
         held = {int(j) for leg in self.legs for j in leg.joints}
         self.dependent = np.array([j for leg in self.legs for j in leg.joints], dtype=np.intp)
         self.independent = np.array([j for j in range(robot.n) if j not in held], dtype=np.intp)
+        self.undriven = np.append(np.arange(self.base), self.base + np.flatnonzero(robot.hinges))
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         base_labels = ["base x", "base y", "base z", "base roll", "base pitch", "base yaw"][: self.base]
         self.labels = (*base_labels, *(robot.joint_names[j] for j in self.independent))
@@ -151,7 +162,8 @@ class StanceCoordinates:
         self._sole = []
         for leg in self.legs:
             rotation, point = rb.frame(leg.frame)
-            jac = rb.jacobian(leg.frame)[:, [self.base + int(j) for j in self._moves(leg)]]
+            moved = [self.base + int(j) for j in (*leg.before, *leg.joints)]
+            jac = rb.jacobian(leg.frame)[:, moved]
             twist = rb.frame_velocity(leg.frame, rb.v)
             acc = rb.frame_acceleration(leg.frame, rb.v, rb.a)
             self._sole.append(
@@ -171,13 +183,9 @@ class StanceCoordinates:
         """q of the "rpy" coordinates (nv,) from y (ny,) and the leg joints (nl,), SX."""
         return self._embed(y[: self.base], y[self.base :], legs)
 
-    def _moves(self, leg: Leg) -> Index:
-        """The joints (6 or more) between base and leg's end: the leg's own last."""
-        return np.array(self.robot.limb(leg.frame), dtype=np.intp)
-
     def _sole_terms(self, k: int, y: Any, legs: Any, v: Any, a: Any) -> Any:
         """Rotation, point, Jacobian of the leg's own joints, twist and acceleration of sole k in the base's
-        own frame; and the Jacobian of the joints before them, which a hand has.
+        own frame; and the Jacobian of the joints before them.
         """
         q = self._embed(ca.SX.zeros(self.base), y[self.base :], legs)
         rotation, point, jac, twist, acc = self._sole[k](q, v, a)
@@ -291,7 +299,7 @@ class StanceCoordinates:
             base = base + ca.vertcat(f, n + ca.cross(point, f))
             leg_tau.append(ca.mtimes(jac.T, ca.vertcat(f, n)))
             tau = ca.mtimes(before.T, ca.vertcat(f, n))
-            for i, j in enumerate(self._moves(leg)[:-LEG]):
+            for i, j in enumerate(leg.before):
                 others[j] = others[j] + tau[i]
         of_independent = ca.vertcat(ca.SX(0, 1), *[others[j] for j in self.independent])
         return self._embed(base, of_independent, ca.vertcat(*leg_tau))

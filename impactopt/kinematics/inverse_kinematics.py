@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.directions import across
+from impactopt.robots.hinges import inside
 
 Array = NDArray[np.float64]
 TURNING, WISH = 100, 0.1  # steps that also turn the hand, and how much that is damped
@@ -46,7 +47,7 @@ def inverse_kinematics(
     data = model.createData()
     aims = [(striker, point), *also]
     hands = [(model.getFrameId(f"striker:{name}"), point) for name, point in aims]
-    lower, upper = robot.lower + margin, robot.upper - margin
+    lower, upper = inside(robot, margin)
     # a continuous joint takes two numbers of q, and has no limits
     joints = list(model.joints)[-robot.n :]
     limited = np.array([k for k, j in enumerate(joints) if j.nq == 1], dtype=np.intp)

@@ -24,6 +24,7 @@ from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.wrench_cone import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
+from impactopt.robots.hinges import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
 from impactopt.transcription.plan import Trajectory, complete_reference
 from impactopt.transcription.start import strike_rates
@@ -126,7 +127,7 @@ def _profile(
 def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) -> bool:
     """Whether the reach keeps the limits, with no contact, at ``nodes`` instants of each way."""
     c, r = problem.coordinates, problem.robot
-    margin = problem.term(PositionLimit).margin
+    lower, upper = inside(r, problem.term(PositionLimit).margin)
     legs0 = c.split(problem.start_posture)[1]
     for duration, ends in _phases(problem, there, speed):
         y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
@@ -136,7 +137,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
         except InputError:  # a leg too short for the base's way
             return False
         joints, rates = q[:, -r.n :], v[:, -r.n :]
-        if (joints < r.lower + margin).any() or (joints > r.upper - margin).any():
+        if (joints < lower).any() or (joints > upper).any():
             return False
         if (np.abs(rates) > problem.term(VelocityLimit).fraction * r.velocity_limit).any():
             return False
@@ -151,7 +152,7 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
     """
     c, r = problem.coordinates, problem.robot
     tau = np.array(pin.rnea(c.model, c.data, q, v, a))
-    limit = problem.term(TorqueLimit).fraction * r.torque_limit
+    limit = problem.term(TorqueLimit).fraction * np.where(r.hinges, 0.0, r.torque_limit)
     if not c.legs:
         return bool(np.all(np.abs(tau) <= limit))
     cone = problem.term(ContactWrenchCone)

@@ -33,10 +33,11 @@ def hopeless(problem: ImpactProblem) -> list[str]:
 
 def doubts(robot: Robot) -> list[str]:
     """What a robot's numbers lack that a blow depends on."""
-    without = [joint for joint, a in zip(robot.joint_names, robot.armature, strict=True) if a == 0]
+    driven = zip(robot.joint_names, robot.armature, robot.passive, strict=True)
+    without = [joint for joint, a, passive in driven if a == 0 and not passive]
     if not without:
         return []
-    which = "no joint has" if len(without) == robot.n else f"{', '.join(without)}: no"
+    which = "no joint has" if len(without) == robot.n - np.sum(robot.passive) else f"{', '.join(without)}: no"
     return [
         f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too light "
         "and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, by joint"

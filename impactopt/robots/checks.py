@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 # time. Light wrists without armature reach 1e5.
 MAX_SERVO_RATE = 3e4
 HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool, a rotor: a ship
-LEG = 6  # joints of a leg whose sole is held: as many as the sole has directions
+LEG = 6  # joints that hold a sole: as many as it has directions
 STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
 
 
@@ -148,23 +148,36 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
 
 
 def check_legs(model: pin.Model, soles: Sequence[tuple[str, str]]) -> None:
-    """InputError with all held soles, (name, frame) each, that are on no leg of their own of six joints."""
-    found, legs = Mistakes(), []
+    """InputError with all held soles, (name, frame) each, that are on no leg of their own: its last six
+    joints, which move no other held sole.
+    """
+    found, chains = Mistakes(), []
     for name, frame in soles:
         parent = model.frames[check_frame(model, frame, f"sole {name!r}")].parentJoint
-        joints = [str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1]
-        legs.append(set(joints))
-        if len(joints) != LEG:
-            told = f": {', '.join(joints)}" if joints else ""
+        chains.append(
+            [str(model.names[j]) for j in model.supports[parent] if j > 0 and model.joints[j].nv == 1]
+        )
+    for k, ((name, frame), joints) in enumerate(zip(soles, chains, strict=True)):
+        others = {joint for other in chains[:k] + chains[k + 1 :] for joint in other}
+        own = joints[-LEG:]
+        told = f": {', '.join(joints)}" if joints else ""
+        if len(joints) == LEG - 1 and not others & set(own):
+            found.found.append(
+                f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}, "
+                f"and a sole is held in {LEG} directions: say about which of its axes the foot may turn on "
+                'the ground, as by hinge = "x", its long axis, where the leg lacks an ankle roll'
+            )
+        elif len(joints) < LEG:
             found.found.append(
                 f"the leg of sole {name!r} has {len(joints)} joints between the base and {frame!r}{told}; a "
-                f"held sole needs exactly {LEG} (lock the others with `locked=`)"
+                f"held sole needs {LEG} or more, or {LEG - 1} and a hinge"
             )
-    shared = sorted(set.union(set(), *(a & b for k, a in enumerate(legs) for b in legs[:k])))
-    if shared and not found.found:
-        found.found.append(
-            f"the held soles' legs share joints, {', '.join(shared)}: their motion is not independent"
-        )
+        elif others & set(own):
+            shared = ", ".join(joint for joint in own if joint in others)
+            found.found.append(
+                f"the held soles' legs share joints: of the last {LEG} that lead to sole {name!r}, {shared} "
+                "move another held sole too; each leg needs as many of its own"
+            )
     found.raise_if_any("the stance")
 
 
@@ -189,7 +202,7 @@ def check_arms(robot: Any, soles: Sequence[str], hands: Sequence[tuple[str, str]
                 f"hand {name!r} cannot hold on: of the last {LEG} joints that lead to it, {shared} move "
                 "something else that is held; give a hand on an arm of its own"
             )
-        elif np.any(robot.passive[list(arm)]):
+        elif np.any(robot.sprung[list(arm)]):
             found.found.append(f"hand {name!r} cannot hold on by a soft grip: give the hand, not its tool")
     found.raise_if_any("the stance")
 

@@ -15,6 +15,7 @@ from impactopt.robots import checks
 from impactopt.robots.checks import HEAVIEST
 
 Array = NDArray[np.float64]
+WIDEST = 0.5  # [rad] that a hinge of a sole may turn
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,6 +29,9 @@ class Sole:
     polygon : (k, 2) corners [m] in the x-y plane of the frame, counter-clockwise seen from above, convex.
     parent, placement : for a model without that frame: it is added at `placement` (pin.SE3) in the frame
         `parent`.
+    hinge : axis of the frame, "x", "y" or "z", about which the foot turns on the sole, as that of a leg of
+        five joints. Nothing drives it: the sole bears no moment about this axis. It makes a joint, called as
+        the sole with ``_hinge`` behind.  hinge_range [rad] : how far a plan may turn it either way.
     """
 
     name: str
@@ -35,6 +39,8 @@ class Sole:
     polygon: Array
     parent: str | None = None
     placement: Any = None
+    hinge: str | None = None
+    hinge_range: float = 0.005
 
     def __post_init__(self) -> None:
         polygon = check_array(f"sole {self.name!r}: polygon [m]", self.polygon, (None, 2), most=FARTHEST)
@@ -44,6 +50,18 @@ class Sole:
             raise InputError(f"sole {self.name!r}: give parent and placement together, or neither")
         if self.placement is not None:
             check_array(f"sole {self.name!r}: placement [m]", self.placement.translation, (3,), most=FARTHEST)
+        if self.hinge not in (None, "x", "y", "z"):
+            raise InputError(f'sole {self.name!r}: hinge is {self.hinge!r}; give "x", "y" or "z", or None')
+        if not 0 < check_array(f"sole {self.name!r}: hinge_range [rad]", self.hinge_range, ()) <= WIDEST:
+            raise InputError(
+                f"sole {self.name!r}: hinge_range is {self.hinge_range:g} rad; give a number > 0, at most "
+                f"{WIDEST:g}"
+            )
+
+    @property
+    def hinge_joint(self) -> str:
+        """Name of the joint that a hinge makes."""
+        return f"{self.name}_hinge"
 
     @classmethod
     def box(

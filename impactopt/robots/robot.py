@@ -16,6 +16,7 @@ from impactopt.errors import Mistakes, check_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
+from impactopt.robots.hinges import check_sole, with_hinges
 from impactopt.robots.inertias import GIVEN, REPAIRED, check_choice, check_inertias, repair_inertias
 from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
@@ -36,7 +37,7 @@ class Robot:
     Attributes
     ----------
     name : of the robot.
-    model : pin.Model with locked joints removed, armature set, and an OP_FRAME per striker and added sole.
+    model : pin.Model without locked joints, with armature and an OP_FRAME per striker and added sole.
     kp, kd : (n,) servo stiffness [N m/rad] and damping [N m s/rad].
     torque_limit, velocity_limit : (n,) [N m], [rad/s], largest magnitudes.
     lower, upper : (n,) position limits [rad]; infinite for a continuous joint.
@@ -90,7 +91,7 @@ class Robot:
         object.__setattr__(self, "actuators", tuple(self.actuators) or (Actuator(),) * self.n)
         checks.check_actuators(self.joint_names, self.actuators)
         for sole in self.soles:
-            checks.check_frame(self.model, sole.frame, f"sole {sole.name!r}")
+            check_sole(self.model, sole)
         for striker in self.strikers.values():
             checks.check_frame(
                 self.model, striker.model_frame, f"striker {striker.name!r} (see Robot.with_striker)"
@@ -231,24 +232,22 @@ class Robot:
                 build.add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
         for striker in strikers:
             build.add_striker(model, striker)
+        numbers: dict[str, Any] = {"torque_limit": limit, "velocity_limit": speed, "lower": lower}
+        stiffness = build.per_joint("kp", kp, joints, 30.0 * damping)
+        numbers |= {"upper": upper, "kp": stiffness, "kd": damping, "actuators": drives}
+        read = build.read_postures(model, postures or {})
+        model, numbers, read = with_hinges(model, soles, numbers, read)
         robot = cls(
             name=name or model.name,
             model=model,
-            kp=build.per_joint("kp", kp, joints, 30.0 * damping),
-            kd=damping,
-            torque_limit=limit,
-            velocity_limit=speed,
-            lower=lower,
-            upper=upper,
-            soles=tuple(soles),
+            **numbers,
+            soles=tuple(build.by_name("sole", soles).values()),
             strikers=build.by_name("striker", strikers),
             disable_collisions=build.link_pairs(model, disable_collisions),
             urdf=None if urdf is None else str(urdf),
             mjcf=None if mjcf is None else str(mjcf),
-            actuators=drives,
         )
-        build.by_name("sole", soles)
-        return dataclasses.replace(robot, postures=robot._read_postures(postures or {}))
+        return dataclasses.replace(robot, postures={pose: robot.place(q) for pose, q in read.items()})
 
     def __repr__(self) -> str:
         """One line: its model and arrays would fill pages."""
@@ -329,11 +328,18 @@ class Robot:
 
     @property
     def passive(self) -> NDArray[np.bool_]:
-        """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip: it has no
-        gear.
-        """
-        grips = {tool.grip_joint for tool in self.tools if tool.grip is not None}
-        return np.array([name in grips for name in self.joint_names], dtype=bool)
+        """(n,) Whether no motor moves a joint: it is `sprung`, or one of the `hinges`."""
+        return self.sprung | self.hinges
+
+    @property
+    def sprung(self) -> NDArray[np.bool_]:
+        """(n,) Whether nothing but a spring and a damper moves a joint, as that of a soft grip."""
+        return np.isin(self.joint_names, [tool.grip_joint for tool in self.tools if tool.grip is not None])
+
+    @property
+    def hinges(self) -> NDArray[np.bool_]:
+        """(n,) Whether nothing moves a joint, as a sole's hinge."""
+        return np.isin(self.joint_names, [sole.hinge_joint for sole in self.soles if sole.hinge is not None])
 
     def with_actuators(self, actuators: Mapping[str, Actuator]) -> Robot:
         """A copy of the robot with these motors and gears, of joints by name or pattern.
@@ -392,7 +398,3 @@ class Robot:
         q = self.check_configuration(q)
         chosen = self.soles if soles is None else [self.sole(s) if isinstance(s, str) else s for s in soles]
         checks.check_stance(self.model, q, [(sole.name, sole.frame) for sole in chosen], height, tilt)
-
-    def _read_postures(self, given: Mapping[str, Mapping[str, float] | ArrayLike]) -> dict[str, Array]:
-        postures = build.read_postures(self.model, given)
-        return {name: self.place(q) for name, q in postures.items()}

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.robots import build, checks
 from impactopt.robots.actuators import Actuator
+from impactopt.robots.joints import hung, mapped
 from impactopt.robots.parts import SoftGrip, Tool
 
-__all__ = ["grip_limits", "holding", "holding_softly", "let_go", "mapped", "with_tool", "without"]
+__all__ = ["grip_limits", "holding", "holding_softly", "let_go", "with_tool", "without"]
 
 Array = NDArray[np.float64]
 GRIP_SPEED = 60.0  # [rad/s] of a tool in a soft grip; no bound of a blow
@@ -110,26 +111,14 @@ def let_go(model: pin.Model, tool: Tool) -> pin.Model:
 
 
 def _hung(model: pin.Model, tool: Tool, body: Any) -> pin.Model:
-    """The model with one more joint, a soft grip's; joints are in depth-first order, as Pinocchio has to have
-    them.
-    """
+    """The model with one more joint, a soft grip's."""
     grip: Any = tool.grip
     if tool.grip_joint in build.joint_names(model):
         raise InputError(
             f"tool {tool.name!r}: the robot has a joint {tool.grip_joint!r} already; rename the tool"
         )
-    held, back = pin.Model(), grip.placement.inverse()
-    bounds = [np.array([x]) for x in (*grip_limits(grip), -grip.range, grip.range)]
-    joint = held.addJoint(0, pin.JointModelRZ(), pin.SE3.Identity(), tool.grip_joint, *bounds)
-    held.appendBodyToJoint(joint, body, back)
-    held.addFrame(pin.Frame(tool.own_frame, joint, 0, back, pin.FrameType.BODY))
-    held.gravity = model.gravity
-    whole = pin.appendModel(model, held, checks.check_frame(model, tool.frame, "tool"), grip.placement)
-    whole.name = model.name
-    for name, old in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):  # it leaves them behind
-        at = whole.joints[whole.getJointId(name)].idx_v
-        whole.armature[at : at + old.nv] = model.armature[old.idx_v : old.idx_v + old.nv]
-    return whole
+    joint = (tool.grip_joint, *grip_limits(grip), grip.range)
+    return hung(model, tool.frame, grip.placement, joint, tool.own_frame, body)
 
 
 def grip_limits(grip: SoftGrip) -> tuple[float, float]:
@@ -137,12 +126,3 @@ def grip_limits(grip: SoftGrip) -> tuple[float, float]:
     speed [rad/s].
     """
     return grip.stiffness * grip.range + grip.damping * GRIP_SPEED, GRIP_SPEED
-
-
-def mapped(old: pin.Model, new: pin.Model, q: Array) -> Array:
-    """A configuration of a model with fewer joints: the others are at zero."""
-    out = pin.neutral(new)
-    for name, joint in zip(list(old.names)[1:], list(old.joints)[1:], strict=True):
-        at = new.joints[new.getJointId(name)].idx_q
-        out[at : at + joint.nq] = q[joint.idx_q : joint.idx_q + joint.nq]
-    return out

@@ -28,7 +28,7 @@ from impactopt.transcription.layout import Affine, Array, Group, Layout
 from impactopt.transcription.objective import Prices, Quantity, assemble, quantities
 from impactopt.transcription.rows import Index, Measure, Place, Rows
 from impactopt.transcription.shot import Shot
-from impactopt.transcription.springs import SpringPoint, add_springs
+from impactopt.transcription.springs import SpringPoint, add_hinges, add_springs
 from impactopt.transcription.structured import StructuredProgram
 
 Program = TypeVar("Program", bound="ContactProgram")
@@ -203,8 +203,10 @@ class ContactProgram(ABC):
 
     # ------------------------------------------------------------------ the program
     def _finish(self, terms: tuple[Term, ...], objectives: tuple[Objective, ...]) -> None:
-        """Rows that these terms bring, those of springs, and the objective."""
+        """Rows that these terms bring, those of springs and hinges, and the objective."""
         add_springs(self.builder, self._spring_points(), self.hit.contact.gains[0])
+        if self.builder.robot.hinges.any():
+            add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         for term in terms:
             if type(term).add_rows is not Term.add_rows and term.active:  # those of others are there
                 term.add_rows(self)

@@ -230,5 +230,5 @@ def builders(
         **({"impact": lambda: impact(c, striker)} if instant else hit),
         "link": link,
         **({"balance": lambda: balance(c, edges)} if c.legs else {}),
-        **({"spring": lambda: spring(c, chosen)} if c.robot.passive.any() else {}),
+        **({"spring": lambda: spring(c, chosen)} if c.robot.sprung.any() else {}),
     }

@@ -139,7 +139,7 @@ def collision(
         slopes = {"legs": r1 - T * leg_part(c, a), "lag": lag1 - T * slower}
         slopes["hand"] = faster - T * ca.dot(normal, tip)
     driven = np.ones(ny)
-    driven[c.base :] -= c.robot.passive[c.independent]  # a spring's rest does not move
+    driven[c.base :] -= c.robot.sprung[c.independent]  # a spring's rest does not move
     ahead = c.configuration(y0 + driven * u0 * t - y, lag)[c.base :]
     stiff, damped = chosen_gains(kp, kd, logs, chosen)
     servo = ff + (stiff * ahead + damped * c.configuration(u0 - u, slower)[c.base :]) / limit

@@ -18,6 +18,7 @@ from impactopt.problem.terms import (
     VelocityLimit,
 )
 from impactopt.problem.terms.grip import WRENCH
+from impactopt.robots.hinges import inside
 from impactopt.transcription.rows import Measure
 
 GRAVITY = 9.81
@@ -47,7 +48,7 @@ class Limits:
         self.balance, self.incidence = p.term(Balance), p.term(Incidence)
         self.extension = p.term(LegExtension)
         self.weight = GRAVITY * float(sum(i.mass for i in r.model.inertias))
-        lower, upper = r.lower + self.position.margin, r.upper - self.position.margin
+        lower, upper = inside(r, self.position.margin)
         box, y0 = BASE_BOX[: c.base], c.split(p.start_posture)[0]
         self.y_lower = np.concatenate([y0[: c.base] - box, lower[c.independent]])
         self.y_upper = np.concatenate([y0[: c.base] + box, upper[c.independent]])

@@ -357,7 +357,7 @@ def complete_reference(
     """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6).
 
     y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
-    as little as it takes to balance the base; legs (nl,) starts their inverse kinematics.
+    as little as it takes to balance the base and hinges of soles; legs (nl,) starts their inverse kinematics.
     """
     c, robot = problem.coordinates, problem.robot
     model, data = robot.model, robot.model.createData()
@@ -372,8 +372,8 @@ def complete_reference(
         tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
         if c.legs:
             jac, place = c.sole_jacobians(q[k])
-            base = jac[:, :6].T / scale
-            miss = tau[:6] - jac[:, :6].T @ wrench[k]
+            base = jac[:, c.undriven].T / scale
+            miss = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
             w = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / scale
             tau = tau - jac.T @ w
             ground[k] = _about_origin(place[: len(c.soles)], w)

@@ -1,4 +1,6 @@
-"""Rows of joints that a spring and a damper move: the torque that the motion needs is that of the two."""
+"""Rows of joints that no motor moves: of a spring and a damper, the torque that the motion needs is that of
+the two; of a sole's hinge it is none.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from impactopt.transcription.layout import Affine, add
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.rows import Place, percent
 
-__all__ = ["SpringPoint", "add_springs", "follow_springs", "swing_springs"]
+__all__ = ["SpringPoint", "add_hinges", "add_springs", "follow_springs", "swing_springs"]
 
 SIMPSON = (1 / 6, 4 / 6, 1 / 6)
 
@@ -72,7 +74,7 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
     gains : logarithms of the factors on them that are chosen.
     """
     robot, c = b.robot, b.coordinates
-    passive = np.flatnonzero(robot.passive)
+    passive = np.flatnonzero(robot.sprung)
     if not passive.size:
         return
     own = c.independent
@@ -91,5 +93,23 @@ def add_springs(b: Builder, points: Sequence[SpringPoint], gains: Affine) -> Non
             affine=point.torque[passive] * -1.0,
             lower=-rest,
             upper=-rest,
+            measure=percent("of its limit off"),
+        )
+
+
+def add_hinges(b: Builder, points: Sequence[tuple[Place, Affine]]) -> None:
+    """At places with these torques over limit (n,): those of soles' hinges are zero.
+
+    In contact the servo's own law is that: feed-forward and gains are zero.
+    """
+    free = np.flatnonzero(b.robot.hinges)
+    for place, torque in points:
+        b.rows.add(
+            term="hinge of a sole",
+            place=place,
+            components=[b.robot.joint_names[k] for k in free],
+            affine=torque[free],
+            lower=0.0,
+            upper=0.0,
             measure=percent("of its limit off"),
         )

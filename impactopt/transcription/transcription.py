@@ -65,7 +65,7 @@ def block_functions(
         tuple(
             (leg.frame, tuple(np.round(leg.placement.homogeneous.ravel(), 12))) for leg in coordinates.legs
         ),
-        tuple(np.round(coordinates.start, 12)) if coordinates.hands else (),
+        tuple(np.round(coordinates.start, 12)) if any(leg.before.size for leg in coordinates.legs) else (),
         tuple(tuple(o.tolist()) for leg in coordinates.legs for o in leg.order),
         problem.striker,
         edges,
@@ -74,7 +74,7 @@ def block_functions(
     frozen = () if problem.frozen is None else (problem.frozen,)
     contact = (problem.law.formula(), target.formula(), typical_state(target), *frozen[:1])
     groups: list[FunctionGroup] = []
-    springs = tuple(np.flatnonzero(robot.passive).tolist())
+    springs = tuple(np.flatnonzero(robot.sprung).tolist())
     second = () if problem.second is None else (problem.second.striker,)
     keys = {"force": (*contact, *second), "first": contact[:1], "coasting": frozen}
     keys |= {"collision": (*frozen, *springs, *second), **dict.fromkeys(SECOND_BLOCKS, second)}
@@ -277,7 +277,7 @@ class Transcription(ContactProgram):
         return list(zip(places, slots, strict=True))
 
     def _spring_points(self) -> list[SpringPoint]:
-        if not self.robot.passive.any():
+        if not self.robot.sprung.any():
             return []
         first = len(self.swing.nodes)
         out = swing_springs(self.builder, self.swing, self.torques[:first])

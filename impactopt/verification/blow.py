@@ -208,7 +208,7 @@ class Blow:
             return out
 
         # a spring's rest does not move
-        driven = np.concatenate([np.ones(robot.base), np.where(r.passive, 0.0, 1.0)[robot.independent]])
+        driven = np.concatenate([np.ones(robot.base), np.where(r.sprung, 0.0, 1.0)[robot.independent]])
         lifted = self.torque(i) if self.torque(i) in self.lifted else None
 
         def value(v: Variables) -> Array:

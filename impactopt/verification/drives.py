@@ -81,6 +81,7 @@ class Drives:
             self.missing.append("drives whose torques are no variables")
             return
         self.rows += spring_pieces(moves.robot, moves.ways, self._torque)
+        self.rows += hinge_pieces(moves.robot, moves.ways, self._torque)
         rows, self.worth = effort_pieces(p, moves.robot, moves.ways, self._torque)
         self.rows += rows
         if gears:
@@ -233,7 +234,7 @@ def spring_pieces(
     torque : of a node, by its number; -1: the start.
     """
     r = robot.robot
-    passive = np.flatnonzero(r.passive)
+    passive = np.flatnonzero(r.sprung)
     if not passive.size:
         return []
     names = [r.joint_names[k] for k in passive]
@@ -274,6 +275,22 @@ def spring_pieces(
             if ends and (not way.swings or k == len(way.nodes) - 1):
                 out.append(piece(way, way.place(float(s)), [(1.0, float(s), k)]))
     return out
+
+
+def hinge_pieces(
+    robot: RobotMotion, ways: Sequence[Way], torque: Callable[[Way, int], Callable[[Variables], Array]]
+) -> list[Piece]:
+    """Hinges of soles bear no torque, at all nodes."""
+    free = np.flatnonzero(robot.robot.hinges)
+    if not free.size:
+        return []
+    names = [robot.robot.joint_names[k] for k in free]
+
+    def piece(way: Way, k: int, s: float) -> Piece:
+        borne = torque(way, k)
+        return Piece.of(lambda v: borne(v)[free], [("hinge of a sole", way.place(s), names, 0.0, 0.0)])
+
+    return [piece(way, k, float(s)) for way in ways for k, s in enumerate(way.nodes)]
 
 
 def _timed(name: str, price: float, v: Variables) -> Array:

@@ -22,6 +22,7 @@ from impactopt.problem.terms import (
     VelocityLimit,
 )
 from impactopt.problem.terms.grip import WRENCH
+from impactopt.robots.hinges import inside
 from impactopt.verification.robot_motion import RobotMotion
 from impactopt.verification.variables import Piece, Variables
 
@@ -40,8 +41,7 @@ class Limits:
         self.torque, self.velocity = problem.term(TorqueLimit), problem.term(VelocityLimit)
         self.cone, self.extension = problem.term(ContactWrenchCone), problem.term(LegExtension)
         self.grip = problem.extra(Grip)
-        margin = problem.term(PositionLimit).margin
-        lower, upper = r.lower + margin, r.upper - margin
+        lower, upper = inside(r, problem.term(PositionLimit).margin)
         box = BASE_BOX[: robot.base]
         self.y = (
             np.concatenate([robot.y0[: robot.base] - box, lower[robot.independent]]),

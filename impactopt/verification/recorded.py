@@ -129,10 +129,9 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
         worst.note(f"{prefix} torque limit", float(np.abs(demand).max() - 1), where)
         fast = np.abs(a["v"][k][-n:]) / r.velocity_limit
         worst.note(f"{prefix} velocity limit", float(fast.max() - 1), where)
-        joints = angles[k]
-        worst.note(
-            f"{prefix} position limit", float(max((r.lower - joints).max(), (joints - r.upper).max())), where
-        )
+        # in contact the reference coasts, and hinges follow none: rows bound how far they turn there
+        outside = np.maximum(r.lower - angles[k], angles[k] - r.upper)[~(r.hinges & (phase == 1))]
+        worst.note(f"{prefix} position limit", float(outside.max()), where)
         # in contact the hand bears force too: what the coasting reference stands on is nobody's
         if len(polygon) and (phase != 1 or prefix == "missed"):
             inside = float(margin(polygon, zmp(a["ground"][k : k + 1]))[0])

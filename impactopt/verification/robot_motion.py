@@ -25,6 +25,7 @@ class RobotMotion:
     Attributes
     ----------
     ny, nl, n, base : numbers of coordinates, leg joints, joints, and the base's coordinates (6 or 0).
+    undriven : indices in v of the base and of soles' hinges.
     y0 (ny,), legs0 (nl,) : the start posture.  weight : of the robot [N].
     soles : what is held, each with its leg, frame, joints in v, and placement: soles first, then hands.
     wrench_scale (6 a sole), base_scale (base,) : weight, and weight x lever for moments [N, N m].
@@ -48,6 +49,7 @@ class RobotMotion:
         # those that stand; the others are hands that hold on
         self.standing = len(held.soles)
         self.independent, self.dependent = held.independent, held.dependent
+        self.undriven = held.undriven
         self.ny, self.nl = self.base + len(self.independent), len(self.dependent)
         self.labels, self.leg_labels = held.labels, held.leg_labels
         self.y0, self.legs0 = self.split(problem.start_posture)
@@ -199,9 +201,9 @@ class RobotMotion:
         tau = self.torque(q, still, still, np.zeros(6 * len(self.soles)))
         if self.soles:
             self.look(q)
-            whole = np.vstack([jac[:, :6] for jac in self._jacobians])
+            whole = np.vstack([jac[:, self.undriven] for jac in self._jacobians])
             cost = np.tile([1.0, 1, 1, 10, 10, 10], len(self.soles))
-            w = np.linalg.lstsq(whole.T / cost, tau[:6], rcond=None)[0] / cost
+            w = np.linalg.lstsq(whole.T / cost, tau[self.undriven], rcond=None)[0] / cost
             self.relieve(tau, q, w)
         return np.asarray(tau[self.base :])
 

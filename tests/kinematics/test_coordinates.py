@@ -67,6 +67,9 @@ CASES = {
     "g1": lambda: make_case(load_robot("g1"), "half_sitting"),
     "biped": lambda: make_case(biped(), "half_sitting"),
     "biped on its left foot": lambda: make_case(biped(), "half_sitting", 1),
+    "biped on legs of seven": lambda: make_case(biped(7), "half_sitting"),
+    "biped with a waist": lambda: make_case(biped(waist=True), "half_sitting"),
+    "biped on hinged soles": lambda: make_case(biped(5), "half_sitting"),
     "stand-in that holds on": lambda: make_case(load_robot("standin"), "half_sitting", hands=("left_hand",)),
     "arm": lambda: make_case(arm(), "start"),
 }
@@ -352,14 +355,27 @@ def test_a_free_flyer_needs_a_sole() -> None:
         StanceCoordinates(robot, (), robot.posture("half_sitting"))
 
 
-def test_a_held_leg_needs_six_joints() -> None:
-    full = biped()
-    ankle = full.model.getJointId("left ankle roll")
-    model = pin.buildReducedModel(full.model, [ankle], full.posture("half_sitting"))
-    limits = {"torque_limit": 100.0, "velocity_limit": 5.0, "position_limit": np.tile([-2.0, 2.0], (14, 1))}
-    robot = Robot.from_model(model, soles=full.soles, postures={"zero": {}}, **limits)
-    with pytest.raises(InputError, match=r"sole 'left' has 5 joints.*exactly 6"):
-        StanceCoordinates(robot, robot.soles, robot.posture("zero"))
+def reduced(*joints: str, waist: bool = False) -> Robot:
+    """The biped without some joints."""
+    full = biped(waist=waist)
+    locked = [full.model.getJointId(name) for name in joints]
+    model = pin.buildReducedModel(full.model, locked, full.posture("half_sitting"))
+    n = full.n - len(joints)
+    limits = {"torque_limit": 100.0, "velocity_limit": 5.0, "position_limit": np.tile([-2.0, 2.0], (n, 1))}
+    return Robot.from_model(model, soles=full.soles, postures={"zero": {}}, **limits)
+
+
+def test_a_leg_with_too_few_joints_is_told_what_it_lacks() -> None:
+    for robot, told in (
+        (biped(5, hinge=None), r"sole 'left' has 5 joints.*left knee.*hinge = \"x\""),
+        (
+            reduced("left ankle roll", "left hip yaw"),
+            r"sole 'left' has 4 joints.*needs 6 or more, or 5 and a",
+        ),
+        (reduced("left ankle roll", waist=True), r"of the last 6 that lead to sole 'left', waist pitch move"),
+    ):
+        with pytest.raises(InputError, match=told):
+            StanceCoordinates(robot, robot.soles, next(iter(robot.postures.values())))
 
 
 def test_held_legs_share_no_joint() -> None:
@@ -368,7 +384,30 @@ def test_held_legs_share_no_joint() -> None:
         StanceCoordinates(robot, (robot.soles[0], robot.soles[0]), robot.posture("half_sitting"))
 
 
+def test_a_hinge_turns_about_an_axis_that_the_leg_lacks() -> None:
+    robot = biped(5, hinge="y")
+    with pytest.raises(InputError, match="'left' cannot be held: its hinge about y turns as"):
+        StanceCoordinates(robot, robot.soles, robot.posture("half_sitting"))
+
+
+def test_a_sole_on_a_hinge_is_not_lifted() -> None:
+    robot = biped(5)
+    with pytest.raises(InputError, match=r"'right' turns on a hinge .* stand on both"):
+        StanceCoordinates(robot, robot.soles[:1], robot.posture("half_sitting"))
+
+
 # ---- statics and reach, which stand on the coordinates
+
+
+def test_hinges_bear_nothing_at_rest() -> None:
+    c = (case := made("biped on hinged soles")).c
+    y, legs = c.split(case.posture)
+    w = static_wrenches(c, y, legs)
+    jac, _ = c.sole_jacobians(case.posture)
+    tau = np.array(pin.computeGeneralizedGravity(c.model, c.data, case.posture)) - jac.T @ w
+    assert np.abs(tau[c.undriven]).max() < 1e-9 and len(c.undriven) == 8
+    # the hinge is on the sole's own x, and half of a foot hangs on it
+    assert np.abs(w[[3, 9]]).max() < 0.5 and min(w[[2, 8]]) > 100
 
 
 def test_static_wrenches_carry_the_robot(standing: Case) -> None:
@@ -396,8 +435,9 @@ def test_a_reached_posture_has_the_point_the_soles_and_the_limits(case: Case) ->
         gap = leg.placement.actInv(data.oMf[model.getFrameId(leg.frame)])
         assert np.abs(pin.log6(gap).vector).max() < 1e-7
     angles = robot.joint_positions(q)
-    assert (angles >= robot.lower + 0.02 - 1e-9).all()
-    assert (angles <= robot.upper - 0.02 + 1e-9).all()
+    margin = np.where(robot.hinges, 0.00125, 0.02)  # a quarter of a hinge's range
+    assert (angles >= robot.lower + margin - 1e-9).all()
+    assert (angles <= robot.upper - margin + 1e-9).all()
 
 
 def test_reach_keeps_away_from_limits_where_it_could_stay() -> None:

@@ -20,6 +20,7 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.terms import KeepOut, SelfCollision, Term
+from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
@@ -40,8 +41,8 @@ OPTIONS: dict[str, Any] = {"tol": 1e-4}  # of IPOPT, on the biped
 BODILESS: tuple[Term, ...] = (SelfCollision(enabled=False), KeepOut(enabled=False))
 
 
-def biped_problem() -> ImpactProblem:
-    robot = biped()
+def biped_problem(robot: Robot | None = None) -> ImpactProblem:
+    robot = robot or biped()
     return ImpactProblem(
         robot=robot,
         striker="fist",

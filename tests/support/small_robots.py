@@ -42,8 +42,12 @@ MOTORS = {
 }
 
 
-def biped() -> Robot:
-    """A 40 kg biped: two legs of six joints on box soles and an arm of three; 21 velocities."""
+def biped(legs: int = 6, *, waist: bool = False, hinge: str | None = "x") -> Robot:
+    """A 40 kg biped: two legs of six joints on box soles and an arm of three; 21 velocities.
+
+    legs : 7: one more in each hip; 5: no ankle roll.  hinge : of soles on legs of five.  waist : two joints
+    from the trunk to the hips.
+    """
     model = pin.Model()
     model.name = "small biped"
     trunk = _body(22.0, 0.2, 0.3, 0.5, at=(0.01, -0.01, 0.25))
@@ -57,11 +61,20 @@ def biped() -> Robot:
         ("ankle pitch", y, (0.0, 0.0, -0.35), _body(0.4, 0.08, 0.08, 0.08)),
         ("ankle roll", x, (0.0, 0.0, -0.01), _body(1.0, 0.2, 0.1, 0.05, at=(0.03, 0.0, -0.03))),
     ]
+    foot = (0.02, 0.0, -0.06)
+    if legs == 7:
+        leg.insert(0, ("hip tilt", y, leg[0][2], _body(0.5, 0.1, 0.1, 0.1)))
+        leg[1] = (*leg[1][:2], (0.0, 0.0, -0.02), leg[1][3])
+    elif legs == 5:
+        foot, leg[4:] = (0.02, 0.0, -0.07), [(*leg[4][:3], leg[5][3])]
+    hips = root
+    for name, kind in (("waist yaw", z), ("waist pitch", y)) if waist else ():
+        hips = _add(model, hips, kind, (0.0, 0.0, 0.0), name, _body(1.0, 0.1, 0.2, 0.1))
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        parent = root
+        parent = hips
         for name, kind, (a, b, c), body in leg:
             parent = _add(model, parent, kind, (a, sign * b, c), f"{side} {name}", body)
-        _mark(model, parent, (0.02, 0.0, -0.06), f"{side} sole")
+        _mark(model, parent, foot, f"{side} sole")
     parent = root
     for name, kind, at, body in (
         ("shoulder pitch", y, (0.0, -0.2, 0.45), _body(1.0, 0.1, 0.1, 0.1)),
@@ -72,7 +85,8 @@ def biped() -> Robot:
     _mark(model, parent, (0.3, 0.0, 0.0), "fist")
     names = list(model.names)[2:]
     angles = {f"{side} {name}": angle for side in ("left", "right") for name, angle in HALF_SITTING.items()}
-    soles = [Sole.box(name=s, frame=f"{s} sole", length=0.22, width=0.12) for s in ("left", "right")]
+    size: dict[str, Any] = {"length": 0.22, "width": 0.12, "hinge": hinge if legs == 5 else None}
+    soles = [Sole.box(name=side, frame=f"{side} sole", **size) for side in ("left", "right")]
     return Robot.from_model(
         model,
         armature=0.05,

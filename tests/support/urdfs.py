@@ -9,6 +9,7 @@ SOLE = (0.2, 0.1)  # [m] of the biped's feet
 ANKLE = 0.08  # [m] above the ground
 
 _LEG = (
+    ("hip_tilt", "0 1 0", (0.0, 0.1, 0.0), (-0.5, 0.5), 0.05),
     ("hip_yaw", "0 0 1", (0.0, 0.1, 0.0), (-0.8, 0.8), 0.05),
     ("hip_roll", "1 0 0", (0.0, 0.0, -0.05), (-0.6, 0.6), 0.05),
     ("hip_pitch", "0 1 0", (0.0, 0.0, 0.0), (-1.8, 0.8), 0.3),
@@ -62,25 +63,38 @@ def robot(name: str, *parts: str) -> str:
 
 
 def biped(
-    *, legs: int = 6, behind: bool = False, moments: str = "", effort: float = 80.0, pairs: int = 1
+    *,
+    legs: int = 6,
+    without: str = "",
+    waist: bool = False,
+    behind: bool = False,
+    moments: str = "",
+    effort: float = 80.0,
+    pairs: int = 1,
 ) -> str:
     """Two legs of so many joints with box feet, and two arms of three.
 
+    without : one of these joints.  waist : one more joint, from the trunk to both legs.
     behind : its root looks along -x.  moments : of the right elbow's link.  effort : of all joints [N m].
     pairs : of legs, one behind the other.
     """
     sign = -1.0 if behind else 1.0
     parts = [link("trunk", 15.0, (0.2, 0.3, 0.5), (0.0, 0.0, 0.25))]
+    if waist:
+        parts += [link("hips", 2.0, (0.2, 0.2, 0.1), (0.0, 0.0, 0.0))]
+        parts += [joint("waist", "trunk", "hips", "0 0 1", (0.0, 0.0, 0.0), (-1.0, 1.0), effort=effort)]
     for pair in range(pairs):
         for side, out in (("left", sign), ("right", -sign)):
-            parent = "trunk"
+            parent = first = "hips" if waist else "trunk"
             mark = f"{side}_{pair}" if pairs > 1 else side
             for name, axis, (x, y, z), limits, long in _LEG[len(_LEG) - legs :]:
+                if name == without:
+                    continue
                 child = f"{mark}_{name}_link"
                 turn = " ".join(str(sign * float(a)) for a in axis.split())
-                place = (x - 0.4 * pair, out * 0.1 if parent == "trunk" else out * y, z)
+                place = (x - 0.4 * pair, out * 0.1 if parent == first else out * y, z)
                 size, at, mass = (0.08, 0.08, max(long, 0.06)), (0.0, 0.0, -long / 2), 1.0 + 5 * long
-                if name == "ankle_roll":
+                if name == ("ankle_roll" if without != "ankle_roll" else "ankle_pitch"):
                     size, at, mass = (*SOLE, 0.04), (0.04 * sign, 0.0, -ANKLE + 0.02), 1.0
                 parts += [link(child, mass, size, at)]
                 parts += [joint(f"{mark}_{name}", parent, child, turn, place, limits, effort=effort)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.files.draft.aim import WAYS, Arm, aims, ready
 from impactopt.files.draft.guesses import DOUBT, ROTOR
+from impactopt.files.draft.limbs import renumbered
 from impactopt.files.draft.postures import half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
 from impactopt.files.draft.soles import find_soles, find_striker, sides
@@ -59,7 +60,9 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False) -> Draft:
         soles, forward = find_soles(model, drafted.legs, drafted.pieces)
     arms, strikers = _arms(drafted)
     robot = drafted.made(soles=soles, strikers=strikers)
-    q = half_sitting(robot, drafted.legs, soles, forward) if soles else rested(robot)
+    legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
+    arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
+    q = half_sitting(robot, legs, soles, forward) if soles else rested(robot)
     q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
     data = _data(drafted, robot, soles, strikers, q, folder)
     data = _aimed(data, robot, arms[0], q, way, folder)
@@ -102,8 +105,8 @@ def _data(
     if soles:
         keys["soles"] = [sole_data(sole) for sole in soles]
     keys["strikers"] = [striker_data(striker) for striker in strikers]
-    angles = zip(robot.joint_names, robot.joint_positions(q), strict=True)
-    keys["postures_rad"] = {START: {joint: round(float(angle), 5) for joint, angle in angles}}
+    angles = zip(robot.joint_names, robot.joint_positions(q), robot.hinges, strict=True)
+    keys["postures_rad"] = {START: {joint: round(float(x), 5) for joint, x, hinge in angles if not hinge}}
     mass = sum(float(body.mass) for body in robot.model.inertias)
     data: dict[str, Any] = {
         "problem": {"name": f"first strike of {robot.name}", "start": START},
@@ -210,7 +213,7 @@ def _frames(robot: Robot) -> Iterator[str]:
     model = robot.model
     for joint in range(1, model.njoints):
         of = [f for f in model.frames if f.parentJoint == joint and f.type != pin.FrameType.JOINT]
-        names = [str(f.name) for f in of if not str(f.name).startswith("striker:")]
+        names = [str(f.name) for f in of if not str(f.name).startswith(("striker:", "sole:"))]
         if names:
             yield f"#   {model.names[joint]}: {', '.join(names)}"
 
@@ -218,10 +221,17 @@ def _frames(robot: Robot) -> Iterator[str]:
 def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[str]:
     """What a user should know before the first plan."""
     stands = "on two legs" if drafted.legs else "on a fixed base"
-    yield f"{robot.name}: {robot.n} joints, {stands}; {data['problem']['striker']!r} strikes"
+    joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
+    yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
     across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
     if across:
         yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"
+    for sole in robot.soles:
+        if sole.hinge is not None:
+            yield (
+                f"five joints hold sole {sole.name!r}: the foot may turn on it about {sole.hinge}, by "
+                f"{sole.hinge_range:g} rad, and it bears no moment about that axis"
+            )
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
     for key, what in (

@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.pieces import Piece
 from impactopt.robots.build import is_floating
+from impactopt.robots.checks import LEG
 
-__all__ = ["Limb", "arms_of", "legs_of", "limbs_of", "to_lock"]
+__all__ = ["Limb", "arms_of", "legs_of", "limbs_of", "renumbered", "to_lock", "toes", "unshared"]
 
 Array = NDArray[np.float64]
 _FINGERS = re.compile(r"finger|thumb|gripper|jaw|claw|knuckle|(?<![a-z])eyes?(?![a-z])", re.IGNORECASE)
 _WHEELS = re.compile(r"wheel|caster|roller", re.IGNORECASE)
+_ARMS = re.compile(r"shoulder|elbow|wrist", re.IGNORECASE)
 _HEADS = re.compile(r"head|neck|eye|camera|face", re.IGNORECASE)
 LIGHT, SHORT = 0.03, 0.25  # of the robot's mass, and [m]: a finger's and all beyond it at most
 FLAT = 0.05  # of the robot's height: how far apart the lowest points of its feet may be
+TOE = 0.03  # [m] from an ankle to a toe's joint at least; half of it: how much higher its foot may end
 ABOVE = 0.1  # of that height: how much higher than the feet the root link ends
 
 
@@ -98,7 +101,11 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     root = float(heights(1).min())
     if root < lowest + ABOVE * tall:
         return ()
-    feet = (limb for limb in limbs_of(model) if len(limb.own) > 1 and not _is_head(model, limb))
+    feet = (
+        limb
+        for limb in limbs_of(model)
+        if len(limb.own) > 1 and not _is_head(model, limb) and not _on_a_spine(model, limb)
+    )
     found = tuple(limb for limb in feet if heights(limb.tip).min() < lowest + FLAT * tall)
     return found if len(found) > 1 else ()  # an arm that hangs is no leg
 
@@ -110,8 +117,52 @@ def arms_of(model: pin.Model, legs: tuple[Limb, ...]) -> tuple[Limb, ...]:
     return tuple(limb for limb in long if len(limb.own) > 1) or tuple(long)
 
 
+def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Piece, ...]]) -> list[str]:
+    """Names of joints that end a leg beyond the sixth, on a link that stands on the ground itself."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+
+    def low(joint: int) -> float:
+        found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
+        return float(np.concatenate(found).min() + data.oMi[joint].translation[2]) if found else np.inf
+
+    out = []
+    for own in map(list, unshared(legs)):
+        while len(own) > LEG:
+            foot, toe = own[-2:]
+            ahead = float(np.linalg.norm((data.oMi[toe].translation - data.oMi[foot].translation)[:2]))
+            if ahead < TOE or low(foot) > low(toe) + TOE / 2:
+                break
+            out.append(str(model.names[own.pop()]))
+    return out
+
+
+def unshared(legs: tuple[Limb, ...]) -> list[tuple[int, ...]]:
+    """Of each leg the joints that lead to no other one."""
+    others = [{j for other in legs if other is not leg for j in other.path} for leg in legs]
+    return [tuple(j for j in leg.path if j not in of) for leg, of in zip(legs, others, strict=True)]
+
+
+def renumbered(limb: Limb, old: pin.Model, new: pin.Model) -> Limb:
+    """The same joints, by name, in a model that has more."""
+
+    def at(joints: tuple[int, ...]) -> tuple[int, ...]:
+        return tuple(int(new.getJointId(old.names[j])) for j in joints)
+
+    return Limb(path=at(limb.path), own=at(limb.own))
+
+
 def _is_head(model: pin.Model, limb: Limb) -> bool:
-    return any(_HEADS.search(str(model.names[j])) for j in limb.own)
+    return _named(model, limb, _HEADS)
+
+
+def _on_a_spine(model: pin.Model, limb: Limb) -> bool:
+    """Whether it is an arm of an upper body, where a waist would be above legs."""
+    return limb.own != limb.path and _named(model, limb, _ARMS)
+
+
+def _named(model: pin.Model, limb: Limb, names: re.Pattern[str]) -> bool:
+    return any(names.search(str(model.names[j])) for j in limb.own)
 
 
 def _children(model: pin.Model) -> dict[int, list[int]]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from impactopt.errors import InputError
-from impactopt.files.draft.limbs import Limb
+from impactopt.files.draft.limbs import Limb, unshared
+from impactopt.robots.checks import LEG
 from impactopt.robots.robot import Robot, Sole
 
 __all__ = ["arm_length", "bend_arm", "half_sitting", "rested", "shoulder"]
@@ -39,16 +40,17 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     pin.framesForwardKinematics(model, data, neutral)
     turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
     straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
-    hips = [np.array(data.oMi[leg.own[0]].translation) for leg in legs]
+    chains = unshared(tuple(legs))
+    hips = [np.array(data.oMi[own[0]].translation) for own in chains]
     aside = [float(spot @ turn[:, 1]) for spot in straight]
-    length = float(np.mean([_path(robot, leg, leg.own[1:]) for leg in legs]))
+    length = float(np.mean([_path(robot, own[1:]) for own in chains]))
     height = min(float(spot[2]) for spot in straight) + BENT * length
     ahead = float(np.mean([hip @ forward for hip in hips]))
     rng, q = np.random.default_rng(0), neutral
     for _ in range(4):  # feet go where the weight is
-        for leg, sole, out in zip(legs, soles, aside, strict=True):
+        for own, sole, out in zip(chains, soles, aside, strict=True):
             spot = ahead * turn[:, 0] + out * turn[:, 1] + height * turn[:, 2]
-            q = _leg(robot, leg, sole, pin.SE3(turn, spot), q, forward, rng)
+            q = _leg(robot, own, sole, pin.SE3(turn, spot), q, forward, rng)
         centre = np.array(pin.centerOfMass(model, data, q))
         pin.framesForwardKinematics(model, data, q)
         middles = [
@@ -111,7 +113,7 @@ def shoulder(robot: Robot, arm: Limb, q: Array) -> Array:
 def arm_length(robot: Robot, arm: Limb, striker: str) -> float:
     """From the shoulder to the striking point, stretched out [m]."""
     frame = robot.model.frames[robot.model.getFrameId(f"striker:{striker}")]
-    beyond = _path(robot, arm, arm.own[_upper(robot, arm) + 1 :])
+    beyond = _path(robot, arm.own[_upper(robot, arm) + 1 :])
     return beyond + float(np.linalg.norm(frame.placement.translation))
 
 
@@ -122,11 +124,20 @@ def _upper(robot: Robot, arm: Limb) -> int:
 
 
 def _leg(
-    robot: Robot, leg: Limb, sole: Sole, goal: object, q: Array, forward: Array, rng: np.random.Generator
+    robot: Robot,
+    joints: Sequence[int],
+    sole: Sole,
+    goal: object,
+    q: Array,
+    forward: Array,
+    rng: np.random.Generator,
 ) -> Array:
-    """The configuration with a leg's sole at its goal, a pin.SE3, and its knee as far ahead as may be."""
+    """The configuration with a leg's sole at its goal, a pin.SE3, and its knee as far ahead as may be.
+
+    joints : of the leg; its last six move, or as many as there are.
+    """
     model, data = robot.model, robot.model.createData()
-    fid, own = model.getFrameId(sole.frame), _rows(robot, leg.path)
+    fid, own = model.getFrameId(sole.frame), _rows(robot, joints[-LEG:])
     low, high = _limits(robot, own)
     now = robot.joint_positions(q)[own]
     best, nearest = None, np.inf
@@ -145,11 +156,11 @@ def _leg(
         nearest = min(nearest, off)
         if off > 1e-7:
             continue
-        knee = max(float(data.oMi[j].translation @ forward) for j in leg.own)
+        knee = max(float(data.oMi[j].translation @ forward) for j in joints)
         if best is None or knee > best[0] + 1e-4:
             best = knee, found.x
     if best is None:
-        names = [model.names[j] for j in leg.path]
+        names = [model.names[j] for j in joints]
         raise InputError(
             f"no posture with level soles is found for the leg {', '.join(map(str, names))}: the best one is"
             f" {nearest:.2g} off; give postures by hand (docs/howto/robot.md)"
@@ -185,5 +196,5 @@ def _set(robot: Robot, q: Array, own: NDArray[np.intp], angles: Array) -> Array:
     return out
 
 
-def _path(robot: Robot, limb: Limb, joints: Sequence[int]) -> float:
+def _path(robot: Robot, joints: Sequence[int]) -> float:
     return sum(float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in joints)

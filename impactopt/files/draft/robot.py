@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.pieces import Piece, pieces_of
 from impactopt.errors import InputError
 from impactopt.files.draft.guesses import Drives, guess_drives
-from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock
+from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared
 from impactopt.robots.build import is_floating, lock_joints, read_urdf
 from impactopt.robots.checks import LEG
 from impactopt.robots.inertias import REPAIRED, check_inertias
@@ -68,9 +68,9 @@ def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
     found = _made(path, mjcf, floats, locked)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
     if legs:
-        extra = _check_legs(found.robot, legs)
-        if extra:
-            locked = {**locked, **extra}
+        _check_legs(found.robot, legs)
+        extra = dict.fromkeys(toes(found.robot.model, legs, found.pieces), "a toe")
+        locked = {**locked, **extra}
         carrying = {str(found.robot.model.names[j]) for leg in legs for j in leg.path} - extra.keys()
         if extra or carrying & found.drives.torque.keys():
             found = _made(path, mjcf, True, locked, carrying)
@@ -141,22 +141,15 @@ def _rest(model: pin.Model, name: str) -> float:
     return float(np.clip(0.0, low, high)) if low <= high else 0.0
 
 
-def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> dict[str, str]:
-    """Joints beyond the sixth of a leg, to lock; InputError for legs that no plan can hold."""
+def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:
+    """InputError for legs that no plan can hold."""
     model = robot.model
-    told = "; ".join(", ".join(str(model.names[j]) for j in leg.path) for leg in legs)
-    counts = sorted({len(leg.path) for leg in legs})
-    of = " or ".join(str(count) for count in counts)
-    if len(legs) != 2 or counts[0] < LEG:
+    own = unshared(legs)
+    told = "; ".join(", ".join(str(model.names[j]) for j in joints) for joints in own)
+    of = " or ".join(str(count) for count in sorted({len(joints) for joints in own}))
+    if len(legs) != 2 or min(map(len, own)) < LEG - 1:
         raise InputError(
-            f"{robot.name!r} has {len(legs)} legs of {of} joints each ({told}), and impactopt plans for "
-            f"robots on two legs of {LEG} joints, which hold a sole in all its {LEG} directions, or on a "
-            "fixed base"
+            f"{robot.name!r} has {len(legs)} legs of {of} joints of their own each ({told}), and impactopt "
+            f"plans for robots on two legs of {LEG} or more, which hold a sole in all its {LEG} directions, "
+            f"on two of {LEG - 1}, whose soles turn about one axis, or on a fixed base"
         )
-    shared = set(legs[0].path) & set(legs[1].path)
-    if shared:
-        raise InputError(
-            f"the legs of {robot.name!r} share {', '.join(str(model.names[j]) for j in sorted(shared))}: "
-            f"each needs {LEG} joints of its own from the root link on"
-        )
-    return {str(model.names[j]): "beyond the sixth of a leg" for leg in legs for j in leg.path[LEG:]}

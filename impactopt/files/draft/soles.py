@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull
 
 from impactopt.bodies.pieces import Piece
 from impactopt.errors import InputError
-from impactopt.files.draft.limbs import Limb
+from impactopt.files.draft.limbs import Limb, unshared
+from impactopt.robots.checks import LEG
 from impactopt.robots.parts import Sole, Striker
 
 __all__ = ["find_soles", "find_striker", "sides"]
@@ -23,7 +24,9 @@ STEEP = np.cos(np.radians(40))  # least cosine between a sole and the ground in 
 CORNERS = 8  # of a polygon at most
 SMALLEST = 2e-3  # [m2] of a sole
 AHEAD = 0.01  # [m] of a foot's middle ahead of its ankle that says which way is forward
-KNEE, BENDS = 3, 0.2  # of a leg's six joints; [rad] of its range more to one side than to the other, twice
+BENDS = 0.2  # [rad] of a knee's range more to one side than to the other, twice
+NEAR, FAR, DRAWN = 0.4, 0.3, 40  # [rad] about zero, [m]: postures in which axes of hinges are compared
+HELD = 5e-3  # of a leg with a hinge: its Jacobian's least singular value, moments by FAR, at least
 STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
 
 
@@ -34,7 +37,7 @@ def find_soles(
 
     Raises
     ------
-    InputError : a foot without a flat face.
+    InputError : a foot without a flat face; a leg of five joints that no hinge completes.
     """
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
@@ -56,7 +59,7 @@ def find_soles(
         ahead += middle * [1.0, 1.0, 0.0]
     forward = _forward(model, data, legs, ahead)
     soles = []
-    for name, leg, (up, low, flat) in zip(names, legs, flats, strict=True):
+    for name, leg, own, (up, low, flat) in zip(names, legs, unshared(tuple(legs)), flats, strict=True):
         x = data.oMi[leg.tip].rotation.T @ forward
         x = _unit(x - up * (up @ x))
         place = pin.SE3(np.column_stack([x, np.cross(up, x), up]), low * up)
@@ -75,6 +78,7 @@ def find_soles(
                 polygon=polygon,
                 parent=parent,
                 placement=_neat(above.inverse() * place),
+                hinge=None if len(own) >= LEG else _hinge(model, leg, own, place),
             )
         )
     return soles, forward
@@ -84,13 +88,18 @@ def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> 
     """The way forward (3,): knees bend the feet back; else where the feet's middles are, feet (3,) [m]."""
     back = np.zeros(3)
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    for leg in legs:
-        knee = model.joints[leg.path[KNEE]]
+    for leg, own in zip(legs, unshared(tuple(legs)), strict=True):
+        hip, ankle = data.oMi[own[0]].translation, data.oMi[leg.tip].translation
+
+        def room(j: int, hip: Array = hip, ankle: Array = ankle) -> float:
+            at = data.oMi[j].translation
+            return min(float(np.linalg.norm(at - hip)), float(np.linalg.norm(at - ankle)))
+
+        bend = max(own, key=room)
+        knee = model.joints[bend]
         low, high = model.lowerPositionLimit[knee.idx_q], model.upperPositionLimit[knee.idx_q]
-        axis = np.array(pin.getJointJacobian(model, data, leg.path[KNEE], pin.LOCAL_WORLD_ALIGNED))[
-            3:, knee.idx_v
-        ]
-        shin = data.oMi[leg.tip].translation - data.oMi[leg.path[KNEE]].translation
+        jac = np.array(pin.getJointJacobian(model, data, bend, pin.LOCAL_WORLD_ALIGNED))
+        axis, shin = jac[3:, knee.idx_v], ankle - data.oMi[bend].translation
         if knee.nq == 1 and abs(low + high) > BENDS:
             back += np.sign(low + high) * np.cross(axis, shin) * [1.0, 1.0, 0.0]
     for way in (-back, feet):
@@ -98,6 +107,30 @@ def _forward(model: pin.Model, data: Any, legs: Sequence[Limb], feet: Array) -> 
             k = int(np.argmax(np.abs(way)))
             return np.asarray(np.eye(3)[k] * np.sign(way[k]))
     return np.array([1.0, 0.0, 0.0])
+
+
+def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
+    """The axis of a sole, at a placement in its joint, about which a leg of these joints lacks a turn."""
+    data, rng = model.createData(), np.random.default_rng(0)
+    low, high = np.maximum(model.lowerPositionLimit, -NEAR), np.minimum(model.upperPositionLimit, NEAR)
+    columns, scale = [model.joints[j].idx_v for j in own], np.repeat([1 / FAR, 1.0], 3)[:, None]
+    worth: dict[str, list[float]] = {axis: [] for axis in "xyz"}
+    for _ in range(DRAWN):
+        q = pin.neutral(model)
+        for j in own:
+            at = model.joints[j].idx_q
+            q[at] = rng.uniform(low[at], max(low[at], high[at])) if model.joints[j].nq == 1 else q[at]
+        jac = place.actionInverse @ pin.computeJointJacobian(model, data, q, leg.tip)[:, columns]
+        for k, axis in enumerate("xyz"):
+            whole = np.column_stack([jac, np.eye(6)[3 + k]]) * scale
+            worth[axis].append(float(np.linalg.svd(whole, compute_uv=False)[-1]))
+    best = max(worth, key=lambda axis: float(np.quantile(worth[axis], 0.1)))
+    if np.quantile(worth[best], 0.5) < HELD:
+        raise InputError(
+            f"the leg {', '.join(str(model.names[j]) for j in own)} cannot hold its sole, about whichever "
+            "axis the foot may turn on it: two of its joints do the same"
+        )
+    return best
 
 
 def find_striker(

@@ -29,6 +29,7 @@ from impactopt.robots.actuators import Actuator
 from impactopt.robots.build import add_frame, check_count, lock_joints, read_urdf
 from impactopt.robots.checks import check_legs
 from impactopt.robots.gains import GainFactor, scaled_gains
+from impactopt.robots.hinges import hinged
 from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
@@ -48,10 +49,20 @@ class SoleSection(Section):
     position: Vector = optional("position of a new frame in its parent [m]", "position_m")
     rotation: Rotation = optional("rotation of a new frame in its parent: a matrix by rows; left out: none")
 
+    hinge: Literal["x", "y", "z"] = optional(
+        "axis of the frame about which the foot may turn on the sole, where five joints hold it: the sole "
+        "bears no moment about it"
+    )
+    hinge_range: Positive = optional(
+        "how far a plan may turn the foot so, either way; left out: 0.005 [rad]", "hinge_range_rad"
+    )
+
     @model_validator(mode="after")
     def _placed_on_a_parent(self) -> SoleSection:
         if "parent" not in self.model_fields_set and {"position", "rotation"} & self.model_fields_set:
             raise ValueError("position_m and rotation place a new frame: name its parent")
+        if "hinge_range" in self.model_fields_set and "hinge" not in self.model_fields_set:
+            raise ValueError("hinge_range_rad is of a hinge: name its axis")
         return self
 
     def build(self) -> Any:
@@ -234,6 +245,7 @@ class RobotSection(Section):
             for sole in built:
                 if sole.parent is not None:
                     add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")
+            model = hinged(model, built)
         except (InputError, AttributeError):
             return None  # it has no soles, or something else is wrong, which others tell
         try:

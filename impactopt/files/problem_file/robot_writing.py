@@ -156,6 +156,8 @@ def sole_data(sole: Sole) -> dict[str, Any]:
         data |= {"parent": sole.parent, "position_m": sole.placement.translation.tolist()}
         rotation = sole.placement.rotation
         data |= {} if np.array_equal(rotation, np.eye(3)) else {"rotation": rotation.tolist()}
+    if sole.hinge is not None:
+        data |= {"hinge": sole.hinge, "hinge_range_rad": float(sole.hinge_range)}
     return data
 
 

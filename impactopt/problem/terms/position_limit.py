@@ -13,7 +13,8 @@ from impactopt.problem.terms.base import Term
 class PositionLimit(Term):
     """Joints stay inside their limits of position.
 
-    Everywhere: it holds on the spline's control points; for the legs at the nodes.
+    Everywhere: it holds on the spline's control points; for the legs at the nodes. Hinges of soles, whose
+    range is small, keep a quarter of it at most.
     """
 
     name: ClassVar[str] = "position limit"

@@ -122,7 +122,7 @@ class WholeBodyController:
         w, hand, swing = s.hand_bandwidth, held.hand * self.steered, held.hand * (1.0 - self.steered)
         away = aim.hand[0] - held.hand_place - swing @ off
         weight = s.hand if self.target.before else 0.0
-        if self.target.bounced and self.passive.any() and not recovers:
+        if self.target.bounced and self.robot.sprung.any() and not recovers:
             # a tool swings on in a soft grip, and would touch again
             weight, away = s.hand, away - s.draw_back * self.scene.normal
         wanted = aim.hand[2] - swing @ aim.a + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)

@@ -89,7 +89,7 @@ def _row(
     def changed(problem: ImpactProblem) -> ImpactProblem:
         robot = problem.robot
         problem = replace(problem, gains=())  # a file may leave others open
-        soft = [name for name, passive in zip(robot.joint_names, robot.passive, strict=True) if passive]
+        soft = [name for name, passive in zip(robot.joint_names, robot.sprung, strict=True) if passive]
         names = joints or tuple(soft) or ("*",)
         if factor is None:
             return replace(problem, gains=(GainFactor(joints=names, factor=(given[0], given[-1])),))
@@ -101,8 +101,8 @@ def _row(
         (chosen,) = solution.gains
         out |= {"factor": chosen.factor, "at_bound": chosen.at_bound}
     robot = solution.problem.robot
-    if robot.passive.sum() == 1:
-        out["stiffness_N_m_rad"] = float(robot.kp[np.flatnonzero(robot.passive)[0]])
+    if robot.sprung.sum() == 1:
+        out["stiffness_N_m_rad"] = float(robot.kp[np.flatnonzero(robot.sprung)[0]])
     return out | (_found(solution) if solution.status.usable else {})
 
 

@@ -25,16 +25,17 @@ from impactopt.solvers.sqp.run import Run, Task
 _HALVINGS = 12  # of a step
 _ARMIJO = 1e-4
 _NEAR = 1e-2  # violation below which the objective may lead
-_TRIED, _SHORTER, _LEAST = 0.1, 0.2, 1e-4  # part of a step; of the radius after a refused one; its least
+_SHORTER, _LEAST = 0.2, 1e-4  # of the radius after a refused step; its least
+_REACHED = 2.0  # times the step that was taken, after a shortened one: the radius
 _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a radius
 _ROUNDING = 1e-11
 # radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
-_PATIENCE = 40  # iterations without less violation
+_PATIENCE = 40  # iterations without less violation, or a better objective
+_BETTER = 1e-3  # of an objective
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
 _BACK = 3  # steps back to the equalities, of a trial point
-_WIDER = 3.0  # times that radius near points that meet the rows
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
 
@@ -54,6 +55,7 @@ class Taken:
     for_objective: bool
     solved: Solved
     label: str
+    foreseen: bool = False
 
 
 class ReducedRun(Run):
@@ -91,7 +93,7 @@ class ReducedRun(Run):
         return status
 
     def _iterate(self) -> Status:
-        note, least, since = "start", np.inf, self.report.iterations
+        note, least, best, since = "start", np.inf, np.inf, self.report.iterations
         while True:
             try:
                 self._reduction.load(self.point)
@@ -105,8 +107,10 @@ class ReducedRun(Run):
                 return Status.INTERRUPTED
             if self.report.iterations > self.options.max_iterations:
                 return Status.ITERATION_LIMIT
-            if self.point.violation < 0.9 * least or not self._excess():
-                least, since = self.point.violation, self.report.iterations
+            f, h = self.point.objective, self.point.violation
+            lower = self._start is None and f < best - _BETTER * (1.0 + abs(best))
+            if h < 0.9 * least or lower or not self._excess():
+                least, best, since = min(least, h), min(best, f), self.report.iterations
             elif self.report.iterations > since + _PATIENCE:
                 return Status.FAILED
             found = self._advance(self.report.iterations)
@@ -155,7 +159,8 @@ class ReducedRun(Run):
             trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
             verdict = self._judge(trial, length, solved, model)
             if verdict is not None:
-                return Taken(trial, length, verdict, solved, "")
+                relief, hoped = self.point.violation - trial.violation, self.point.violation - solved.linear_violation
+                return Taken(trial, length, verdict, solved, "", relief > 0.7 * hoped)
             if attempt == 0 and trial.finite and self.options.second_order_correction:
                 bent = trial.g - self.point.jacobian @ (trial.x - self.point.x)
                 again = self._solve(model, bent)
@@ -200,7 +205,8 @@ class ReducedRun(Run):
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None
-        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - _GAIN * h
+        worth = f <= before.objective + self._price * (before.violation - h)
+        less = (worth and h <= (1 - 1e-5) * before.violation) or f <= before.objective - _GAIN * h
         met = h <= self.options.violation_tolerance and f <= before.objective + noise
         return False if less or met else None
 
@@ -226,17 +232,17 @@ class ReducedRun(Run):
                 self._begin_anew()
         self._trust(taken)
         rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
-        words = f"step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
+        words = f"R {self._radius:.2g} P {self._price:.0f} step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
         return words if self._start is None else f"{words}, violation only"
 
     def _trust(self, taken: Taken) -> None:
         """Longer steps where full ones are taken, shorter ones where these are shortened."""
-        widest = self._widest * (_WIDER if self.point.violation < _NEAR else 1.0)
+        wide = self.point.violation < _NEAR if self._start is None else taken.foreseen
+        widest = self.options.radius if wide else self._widest
         if taken.length == 1.0:
-            self._radius = min(2.0 * self._radius, widest)
+            self._radius = min(2.0 * self._radius, max(widest, self._radius))
         else:
-            least = 0.5 * self._radius if taken.length < _TRIED else self._radius
-            self._radius = min(max(least, 1e-3), widest)
+            self._radius = min(max(_REACHED * taken.length * taken.solved.longest, 1e-3), self._radius)
 
     def _give_way(self) -> Status | None:
         """Where no step is taken: only the violation counts from now on; or it is the end."""
@@ -269,7 +275,8 @@ class ReducedRun(Run):
         """Rows that stay elastic, and cost all that they can, cost more."""
         rows = self._reduction.rows
         largest = float(np.max(np.abs(solved.y[rows]) / self.program.weights[rows], initial=0.0))
-        if self._excess() and self._price < 1.5 * largest and k >= self._raised + _DEARER:
+        narrow = solved.longest > 0.99 * self._radius and self._radius < self._widest
+        if self._excess() and not narrow and self._price < 1.5 * largest and k >= self._raised + _DEARER:
             self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
 
     # ------------------------------------------------------------------ how good it is

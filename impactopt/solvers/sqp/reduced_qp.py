@@ -25,7 +25,8 @@ _LARGEST, _CAREFUL = 1e4, 0.8
 @dataclass(frozen=True)
 class Solved:
     """A step d (n,); multipliers y (m,) and z (n,) of all but the equalities; what the linearized rows are
-    off by; rows of the QP, and those elastic; iterations of its solver."""
+    off by; rows of the QP, and those elastic; iterations of its solver; largest entry of the step that keeps
+    the equalities."""
 
     d: Vector
     y: Vector
@@ -34,6 +35,7 @@ class Solved:
     rows: int
     elastic: int
     iterations: int
+    longest: float
 
 
 class ReducedQP:
@@ -115,7 +117,7 @@ class ReducedQP:
         d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
         y[rows], z[bounded] = unit[: rows.size] / scale, unit[rows.size :]
         linear = float(p.weights @ row_violations(p, g + point.jacobian @ d))
-        return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations)
+        return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations, float(np.abs(guess).max()))
 
 
 def _elastic(

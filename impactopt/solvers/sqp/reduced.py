@@ -110,7 +110,8 @@ class ReducedRun(Run):
             f, h = self.point.objective, self.point.violation
             lower = self._start is None and f < best - _BETTER * (1.0 + abs(best))
             if h < 0.9 * least or lower or not self._excess():
-                least, best, since = min(least, h), min(best, f), self.report.iterations
+                best = f if h < 0.9 * least else min(best, f)
+                least, since = min(least, h), self.report.iterations
             elif self.report.iterations > since + _PATIENCE:
                 return Status.FAILED
             found = self._advance(self.report.iterations)
@@ -232,7 +233,7 @@ class ReducedRun(Run):
                 self._begin_anew()
         self._trust(taken)
         rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
-        words = f"R {self._radius:.2g} P {self._price:.0f} step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
+        words = f"R {self._radius:.2g} P {self._price:.0f} Y {self._largest:.0f} step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
         return words if self._start is None else f"{words}, violation only"
 
     def _trust(self, taken: Taken) -> None:
@@ -275,7 +276,8 @@ class ReducedRun(Run):
         """Rows that stay elastic, and cost all that they can, cost more."""
         rows = self._reduction.rows
         largest = float(np.max(np.abs(solved.y[rows]) / self.program.weights[rows], initial=0.0))
-        narrow = solved.longest > 0.99 * self._radius and self._radius < self._widest
+        narrow = solved.longest > 0.99 * self._radius and self._radius < self.options.radius
+        self._largest = largest
         if self._excess() and not narrow and self._price < 1.5 * largest and k >= self._raised + _DEARER:
             self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
 

@@ -17,6 +17,8 @@ _NEAR = 0.02  # unit rows with less room than this are in the QP from the start
 _MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
 _SLACK_CURVATURE = 1e-4  # of the price
 _ACTIVE = 1e-4  # multiplier of a unit row that holds
+_SOFT = 1e-9  # violation where t = 0 of rows that may stay violated
+_BEYOND = 0.5  # of the way that a row can change inside the radius: what is violated by more is given up
 # parts of the radius that a step towards the equalities may be long: it is shortened with the rest, but where
 # only the violation counts
 _LARGEST, _CAREFUL = 1e4, 0.8
@@ -89,11 +91,18 @@ class ReducedQP:
         lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
         upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
         prices = price * np.concatenate([(p.weights * norms)[rows], np.ones(bounded.size)])
+        off = np.maximum(lower, -upper)
+        every = self._rows(point, np.flatnonzero(off > _SOFT))
+        lost = np.zeros(lower.size, dtype=bool)
+        lost[off > _SOFT] = off[off > _SOFT] > _BEYOND * radius * np.abs(every).sum(axis=1)
+        lost |= (np.abs(self._unit) > 0.99 * prices) & (off > _SOFT)
         working = (np.abs(self._unit) > 1e-9) | (np.minimum(-lower, upper) < _NEAR)
-        slope, unit, iterations = model.slope(d0), self._unit, 0
+        slope0, unit, iterations = model.slope(d0), self._unit, 0
         guess = np.zeros(T.shape[1])
         for _ in range(_ROUNDS):
-            which = np.flatnonzero(working)
+            which, given_up = np.flatnonzero(working & ~lost), np.flatnonzero(lost)
+            dear = np.where(lower > 0, -prices, prices)[given_up]
+            slope = slope0 + self._rows(point, given_up).T @ dear
             qp = _elastic(
                 model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which]
             )
@@ -106,11 +115,15 @@ class ReducedQP:
             guess = found.x[: T.shape[1]]
             step = T @ guess
             unit = np.zeros(lower.size)
-            unit[which] = found.y
+            unit[which], unit[given_up] = found.y, dear
             values = np.concatenate([(point.jacobian @ step)[rows] / scale, step[bounded]])
-            missed = np.where(working, 0.0, np.maximum(lower - values, values - upper))
-            if missed.max(initial=0.0) <= _MISSED:
+            beyond = np.maximum(lower - values, values - upper)
+            back = lost & (beyond < -_MISSED)
+            missed = np.where(working | lost, 0.0, beyond)
+            if missed.max(initial=0.0) <= _MISSED and not back.any():
                 break
+            lost &= ~back
+            working |= back
             worst = np.argsort(-missed)[: max(_MORE, missed.size // 10)]
             working[worst[missed[worst] > 0]] = True
         self._unit = unit
@@ -124,7 +137,7 @@ def _elastic(
     B: Matrix, c: Vector, A: Matrix, lower: Vector, upper: Vector, radius: float, prices: Vector
 ) -> QuadraticProgram:
     """The QP in (t, s), s >= 0 at a price: A t + s >= lower where t = 0 is below, A t - s <= upper above."""
-    below, above = np.flatnonzero(lower > 1e-9), np.flatnonzero(upper < -1e-9)
+    below, above = np.flatnonzero(lower > _SOFT), np.flatnonzero(upper < -_SOFT)
     elastic = np.concatenate([below, above])
     k, n = elastic.size, c.size
     box = np.full(n, radius)

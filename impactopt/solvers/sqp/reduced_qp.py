@@ -106,8 +106,13 @@ class ReducedQP:
             qp = _elastic(
                 model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which]
             )
-            room = np.zeros(qp.n - guess.size)
-            start = np.concatenate([guess, room]), unit[which], np.zeros(qp.n)
+            soft = np.concatenate([which[lower[which] > _SOFT], which[upper[which] < -_SOFT]])
+            held = np.minimum(np.abs(unit[soft]) - prices[soft], 0.0)  # of slacks that are zero
+            start = (
+                np.concatenate([guess, np.zeros(soft.size)]),
+                unit[which],
+                np.concatenate([np.zeros(guess.size), held]),
+            )
             found = self._solver.solve(qp, start=start, time_limit=time_limit)
             iterations += found.iterations
             if not found.usable:

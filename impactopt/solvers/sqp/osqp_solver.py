@@ -39,7 +39,7 @@ class OsqpSolver:
         *,
         tolerance: float = 1e-6,
         eps: float = 1e-6,
-        stages: tuple[int, ...] = (100, 500, 1000, 2000, 4000, 8000),
+        stages: tuple[int, ...] = (200, 500, 1000, 2000, 4000, 8000),
     ):
         """Tolerance as above; eps: OSQP's; stages: its iterations before the 1st, 2nd, ... try to finish."""
         self.tolerance = tolerance

@@ -13,7 +13,8 @@ from impactopt.solvers.sqp.qp import QPSolver, QuadraticProgram
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel
 from impactopt.solvers.sqp.reduction import Reduction
 
-_NEAR = 0.02  # unit rows with less room than this are in the QP from the start
+# part of the way that a row can change, within which it is in the QP from the start; rows for each direction
+_NEAR, _NEAREST = 0.1, 2
 _MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
 _SLACK_CURVATURE = 1e-4  # of the price
 _ACTIVE = 1e-4  # multiplier of a unit row that holds
@@ -50,6 +51,7 @@ class ReducedQP:
 
     def __init__(self, program: TimedProgram, reduction: Reduction, solver: QPSolver):
         self._program, self._reduction, self._solver = program, reduction, solver
+        self._at: Point | None = None
         self.start_from(np.zeros(program.m), np.zeros(program.n))
 
     def start_from(self, y: Vector, z: Vector) -> None:
@@ -59,16 +61,17 @@ class ReducedQP:
 
     def active(self, point: Point) -> Matrix:
         """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
-        return self._rows(point, np.flatnonzero(np.abs(self._unit) > _ACTIVE))
+        return self._rows(point)[np.flatnonzero(np.abs(self._unit) > _ACTIVE)]
 
-    def _rows(self, point: Point, which: np.ndarray) -> Matrix:
-        """Rows (k, r) of these numbers: of the rows that are not eliminated, then of the bounds."""
-        reduction, T = self._reduction, self._reduction.T
-        count = reduction.rows.size
-        rows = reduction.rows[which[which < count]]
-        own = sp.diags_array(1.0 / point.row_norms[rows]) @ (point.jacobian.tocsr()[rows] @ T)
-        bounds = T[reduction.bounded[which[which >= count] - count]]
-        return sp.vstack([own, bounds]) if reduction.sparse else np.vstack([own, bounds])
+    def _rows(self, point: Point) -> Matrix:
+        """Unit rows (k, r): those that are not eliminated, then of the bounds."""
+        if self._at is not point:
+            reduction, T = self._reduction, self._reduction.T
+            unit = sp.diags_array(1.0 / point.row_norms[reduction.rows])
+            own, bounds = unit @ (point.jacobian.tocsr()[reduction.rows] @ T), T[reduction.bounded]
+            self._at = point
+            self._every = sp.vstack([own, bounds], "csr") if reduction.sparse else np.vstack([own, bounds])
+        return self._every
 
     def solve(
         self,
@@ -91,25 +94,28 @@ class ReducedQP:
         lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
         upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
         prices = price * np.concatenate([(p.weights * norms)[rows], np.ones(bounded.size)])
+        every = self._rows(point)
+        reach = radius * abs(every).sum(axis=1)  # how much a row can change
         off = np.maximum(lower, -upper)
-        every = self._rows(point, np.flatnonzero(off > _SOFT))
-        lost = np.zeros(lower.size, dtype=bool)
-        lost[off > _SOFT] = off[off > _SOFT] > _BEYOND * radius * np.abs(every).sum(axis=1)
-        lost |= (np.abs(self._unit) > 0.99 * prices) & (off > _SOFT)
-        working = (np.abs(self._unit) > 1e-9) | (np.minimum(-lower, upper) < _NEAR)
+        soft = off > _SOFT
+        lost = soft & ((off > _BEYOND * reach) | (np.abs(self._unit) > 0.99 * prices))
+        late = np.argsort(-off / np.maximum(reach, 1e-12))[_NEAREST * T.shape[1] :]
+        working = off > -_NEAR * reach
+        working[late] = False
+        working |= np.abs(self._unit) > 1e-9
         slope0, unit, iterations = model.slope(d0), self._unit, 0
         guess = np.zeros(T.shape[1])
         for _ in range(_ROUNDS):
             which, given_up = np.flatnonzero(working & ~lost), np.flatnonzero(lost)
             dear = np.where(lower > 0, -prices, prices)[given_up]
-            slope = slope0 + self._rows(point, given_up).T @ dear
+            slope = slope0 + every[given_up].T @ dear
             qp = _elastic(
-                model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which]
+                model.B, slope, every[which], lower[which], upper[which], radius, prices[which]
             )
-            soft = np.concatenate([which[lower[which] > _SOFT], which[upper[which] < -_SOFT]])
-            held = np.minimum(np.abs(unit[soft]) - prices[soft], 0.0)  # of slacks that are zero
+            priced = np.concatenate([which[lower[which] > _SOFT], which[upper[which] < -_SOFT]])
+            held = np.minimum(np.abs(unit[priced]) - prices[priced], 0.0)  # of slacks that are zero
             start = (
-                np.concatenate([guess, np.zeros(soft.size)]),
+                np.concatenate([guess, np.zeros(priced.size)]),
                 unit[which],
                 np.concatenate([np.zeros(guess.size), held]),
             )
@@ -123,7 +129,7 @@ class ReducedQP:
             unit[which], unit[given_up] = found.y, dear
             values = np.concatenate([(point.jacobian @ step)[rows] / scale, step[bounded]])
             beyond = np.maximum(lower - values, values - upper)
-            back = lost & (beyond < -_MISSED)
+            back = lost & (np.where(lower > 0, lower - values, values - upper) < -_MISSED)
             missed = np.where(working | lost, 0.0, beyond)
             if missed.max(initial=0.0) <= _MISSED and not back.any():
                 break

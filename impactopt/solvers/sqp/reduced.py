@@ -80,6 +80,12 @@ class ReducedRun(Run):
         self._reduction = Reduction(self.program, start.jacobian, self._determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
+        try:
+            return self._attempts(start, y, z)
+        finally:
+            self._reduction.release()
+
+    def _attempts(self, start: Point, y: Vector, z: Vector) -> Status:
         status = Status.INFEASIBLE
         for wide, careful in _ATTEMPTS:
             self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []

@@ -32,7 +32,8 @@ _ROUNDING = 1e-11
 # radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
-_PATIENCE = 40  # iterations without less violation, or a better objective
+_CLOSE = 0.1  # violation of a start from which there is one way only
+_PATIENCE, _SOON = 40, 20  # iterations without less violation, or a better objective; where only it counts
 _BETTER = 1e-3  # of an objective
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
 _BACK = 3  # steps back to the equalities, of a trial point
@@ -87,7 +88,8 @@ class ReducedRun(Run):
 
     def _attempts(self, start: Point, y: Vector, z: Vector) -> Status:
         status = Status.INFEASIBLE
-        for wide, careful in _ATTEMPTS:
+        far = start.violation > _CLOSE
+        for wide, careful in _ATTEMPTS if far else _ATTEMPTS[:1]:
             self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []
             self._qp.start_from(y, z)
             self._qp.careful, self._widest = careful, wide * self.options.radius
@@ -118,8 +120,10 @@ class ReducedRun(Run):
             if h < 0.9 * least or lower or not self._excess():
                 best = f if h < 0.9 * least else min(best, f)
                 least, since = min(least, h), self.report.iterations
-            elif self.report.iterations > since + _PATIENCE:
-                return Status.FAILED
+            elif self.report.iterations > since + (_PATIENCE if self._start is None else _SOON):
+                if self._give_way() is not None:
+                    return Status.FAILED
+                least, best, since = np.inf, np.inf, self.report.iterations
             found = self._advance(self.report.iterations)
             if isinstance(found, Status):
                 return found

@@ -27,14 +27,15 @@ _ARMIJO = 1e-4
 _NEAR = 1e-2  # violation below which the objective may lead
 _SHORTER, _LEAST = 0.2, 1e-4  # of the radius after a refused step; its least
 _REACHED = 2.0  # times the step that was taken, after a shortened one: the radius
+_FORESEEN = 0.7  # of the relief that a QP promises: the radius may grow
 _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a radius
 _ROUNDING = 1e-11
 # radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
 _CLOSE = 0.1  # violation of a start from which there is one way only
-_PATIENCE, _SOON = 40, 20  # iterations without less violation, or a better objective; where only it counts
-_BETTER = 1e-3  # of an objective
+_PATIENCE = 40  # iterations without less violation, or a better objective
+_LESS, _BETTER = 0.97, 1e-3  # of a violation, of an objective
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
 _BACK = 3  # steps back to the equalities, of a trial point
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
@@ -49,7 +50,8 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Taken:
-    """A point that the search took: after which part of the step; whether for the objective's sake."""
+    """A point that the search took: after which part of the step; whether for the objective's sake; whether
+    the violation fell as the QP foresaw."""
 
     point: Point
     length: float
@@ -117,10 +119,10 @@ class ReducedRun(Run):
                 return Status.ITERATION_LIMIT
             f, h = self.point.objective, self.point.violation
             lower = self._start is None and f < best - _BETTER * (1.0 + abs(best))
-            if h < 0.9 * least or lower or not self._excess():
-                best = f if h < 0.9 * least else min(best, f)
+            if h < _LESS * least or lower or not self._excess():
+                best = f if h < _LESS * least else min(best, f)
                 least, since = min(least, h), self.report.iterations
-            elif self.report.iterations > since + (_PATIENCE if self._start is None else _SOON):
+            elif self.report.iterations > since + _PATIENCE:
                 if self._give_way() is not None:
                     return Status.FAILED
                 least, best, since = np.inf, np.inf, self.report.iterations
@@ -170,8 +172,9 @@ class ReducedRun(Run):
             trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
             verdict = self._judge(trial, length, solved, model)
             if verdict is not None:
-                relief, hoped = self.point.violation - trial.violation, self.point.violation - solved.linear_violation
-                return Taken(trial, length, verdict, solved, "", relief > 0.7 * hoped)
+                relief = self.point.violation - trial.violation
+                hoped = self.point.violation - solved.linear_violation
+                return Taken(trial, length, verdict, solved, "", relief > _FORESEEN * hoped)
             if attempt == 0 and trial.finite and self.options.second_order_correction:
                 bent = trial.g - self.point.jacobian @ (trial.x - self.point.x)
                 again = self._solve(model, bent)
@@ -216,6 +219,7 @@ class ReducedRun(Run):
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None
+        # a QP trades the objective for violations at the price; what its steps bring is not to cost more
         worth = f <= before.objective + self._price * (before.violation - h)
         less = (worth and h <= (1 - 1e-5) * before.violation) or f <= before.objective - _GAIN * h
         met = h <= self.options.violation_tolerance and f <= before.objective + noise
@@ -243,17 +247,20 @@ class ReducedRun(Run):
                 self._begin_anew()
         self._trust(taken)
         rows = f"rows {taken.solved.rows} ({taken.solved.elastic} elastic)"
-        words = f"R {self._radius:.2g} P {self._price:.0f} Y {self._largest:.0f} step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
+        words = f"step {taken.length:.2g}, {rows}, QP {taken.solved.iterations}{taken.label}"
         return words if self._start is None else f"{words}, violation only"
 
     def _trust(self, taken: Taken) -> None:
-        """Longer steps where full ones are taken, shorter ones where these are shortened."""
-        wide = self.point.violation < _NEAR if self._start is None else taken.foreseen
-        widest = self.options.radius if wide else self._widest
+        """Longer steps where full ones are taken, beyond the widest where the rows are nearly met or do as
+        foreseen; after a shortened step little more than what was taken.
+        """
         if taken.length == 1.0:
+            wide = self.point.violation < _NEAR if self._start is None else taken.foreseen
+            widest = self.options.radius if wide else self._widest
             self._radius = min(2.0 * self._radius, max(widest, self._radius))
         else:
-            self._radius = min(max(_REACHED * taken.length * taken.solved.longest, 1e-3), self._radius)
+            taken_length = taken.length * taken.solved.longest
+            self._radius = min(max(_REACHED * taken_length, 1e-3), self._radius)
 
     def _give_way(self) -> Status | None:
         """Where no step is taken: only the violation counts from now on; or it is the end."""
@@ -283,11 +290,11 @@ class ReducedRun(Run):
         self.y = self._reduction.add_multipliers(self.y, dual)
 
     def _settle_price(self, k: int, solved: Solved) -> None:
-        """Rows that stay elastic, and cost all that they can, cost more."""
+        """Rows that stay elastic, and cost all that they can, cost more: not where the radius is too small to
+        meet them, as there they would at any price."""
         rows = self._reduction.rows
         largest = float(np.max(np.abs(solved.y[rows]) / self.program.weights[rows], initial=0.0))
         narrow = solved.longest > 0.99 * self._radius and self._radius < self.options.radius
-        self._largest = largest
         if self._excess() and not narrow and self._price < 1.5 * largest and k >= self._raised + _DEARER:
             self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
 

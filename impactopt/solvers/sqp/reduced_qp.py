@@ -109,9 +109,7 @@ class ReducedQP:
             which, given_up = np.flatnonzero(working & ~lost), np.flatnonzero(lost)
             dear = np.where(lower > 0, -prices, prices)[given_up]
             slope = slope0 + every[given_up].T @ dear
-            qp = _elastic(
-                model.B, slope, every[which], lower[which], upper[which], radius, prices[which]
-            )
+            qp = _elastic(model.B, slope, every[which], lower[which], upper[which], radius, prices[which])
             priced = np.concatenate([which[lower[which] > _SOFT], which[upper[which] < -_SOFT]])
             held = np.minimum(np.abs(unit[priced]) - prices[priced], 0.0)  # of slacks that are zero
             start = (

@@ -65,7 +65,7 @@ class Reduction:
         none = np.zeros(0, dtype=np.intp)
         self.gone: Index = self._equations[np.concatenate([none, *[e.rows.ravel() for e in found]])]
         self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in found]])
-        self._order_gone = np.argsort(np.argsort(self.gone))
+        self._place = np.argsort(np.argsort(self.gone))
         self._level = program.g_lower
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
         here = np.ones(program.m, dtype=bool)
@@ -83,7 +83,7 @@ class Reduction:
             _structures.popitem(last=False)
 
     def load(self, point: Point) -> None:
-        """Take the Jacobian at a point.
+        """Take the Jacobian at a point, by the interior-point method's elimination.
 
         Raises
         ------
@@ -132,7 +132,8 @@ class Reduction:
             of_left[self._order] = np.linalg.lstsq(self._R, target, rcond=None)[0]
             y[self.left] = of_left
             dual = dual + self._of_left.T @ of_left
-        y[self.gone] = self._condenser.multipliers(dual, np.zeros(len(self._condenser.left)))[self._order_gone]
+        of_gone = self._condenser.multipliers(dual, np.zeros(len(self._condenser.left)))
+        y[self.gone] = of_gone[self._place]
         return y
 
     @property

@@ -229,7 +229,7 @@ class Condenser:
         return self.expand(np.zeros(self.free.size))
 
     def expand_basis(self, Z: np.ndarray) -> None:
-        """Steps of the eliminated variables for those of the free ones, each a column of Z (n, k), in place."""
+        """Steps of eliminated variables for those of the free ones, each a column of Z (n, k), in place."""
         for a in reversed(self._stages):
             Z[a.e] = -(a.X.swapaxes(1, 2) @ Z[a.c])
 

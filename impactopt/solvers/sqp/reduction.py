@@ -58,9 +58,9 @@ class Reduction:
         equations = self._of_equations(jacobian)
         self._empty = sp.csc_array((program.n, program.n))
         self._key = _key(equations, determined)
-        self._found, self._condenser = _structures.pop(self._key, None) or _structure(
-            equations, self._empty, every, determined
-        )
+        if self._key not in _structures:
+            _structures[self._key] = _structure(equations, self._empty, every, determined)
+        self._found, self._condenser = _structures.pop(self._key)
         found = self._found
         none = np.zeros(0, dtype=np.intp)
         self.gone: Index = self._equations[np.concatenate([none, *[e.rows.ravel() for e in found]])]

@@ -69,6 +69,7 @@ class ReducedRun(Run):
         self._determined, self._filter = determined, list[Pair]()
         self._radius = self._widest = self.options.radius
         self._price, self._raised = self.options.price, 0
+        self._patient = False
         self._start: float | None = None  # of a phase in which only the violation counts: where it began
 
     def iterate(self) -> Status:
@@ -94,6 +95,7 @@ class ReducedRun(Run):
         for wide, careful in _ATTEMPTS if far else _ATTEMPTS[:1]:
             self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []
             self._qp.start_from(y, z)
+            self._patient = (wide, careful) == _ATTEMPTS[-1]  # the last way may creep
             self._qp.careful, self._widest = careful, wide * self.options.radius
             self._price, self._raised = self.options.price, self.report.iterations
             self._begin_anew()
@@ -122,7 +124,7 @@ class ReducedRun(Run):
             if h < _LESS * least or lower or not self._excess():
                 best = f if h < _LESS * least else min(best, f)
                 least, since = min(least, h), self.report.iterations
-            elif self.report.iterations > since + _PATIENCE:
+            elif self.report.iterations > since + _PATIENCE and not self._patient:
                 if self._give_way() is not None:
                     return Status.FAILED
                 least, best, since = np.inf, np.inf, self.report.iterations

@@ -8,11 +8,15 @@ import pytest
 import scipy.sparse as sp
 from support.textbook import INF, Textbook, assert_optimal
 
+import impactopt.solvers.sqp.reduced_qp as reduced_qp_module
 import impactopt.solvers.sqp.reduction as reduction_module
 from impactopt.files.problem_file.names import problem_file
 from impactopt.solvers.program import Determined, Status
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.solvers.sqp.point import TimedProgram
+from impactopt.solvers.sqp.qp_solvers import make_qp_solver
+from impactopt.solvers.sqp.reduced_hessian import make_model
+from impactopt.solvers.sqp.reduced_qp import ReducedQP, Solved
 from impactopt.solvers.sqp.reduction import Reduction
 from impactopt.studies.bench.attempts import judged
 from impactopt.studies.bench.solve import planning_program, strike_program
@@ -147,3 +151,40 @@ def test_multipliers_of_equalities_make_the_gradient_zero_where_they_can() -> No
     left = point.gradient + point.jacobian.T @ y
     np.testing.assert_allclose(left[[1, 2]], 0, atol=1e-12)
     np.testing.assert_allclose(reduction.T.T @ left, reduction.T.T @ point.gradient, atol=1e-12)
+
+
+def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> Solved:
+    """Of a QP in which rows are given up that are violated by more than this part of what they can change."""
+    monkeypatch.setattr(reduced_qp_module, "_BEYOND", beyond)
+    program = TimedProgram(chain(bound=1.5))
+    point = program.point(np.array([0.5, np.sin(0.5), np.sin(0.5) ** 2 + 0.5, 2.0]))
+    reduction = Reduction(program, point.jacobian, Chain.determined)
+    reduction.load(point)
+    qp = ReducedQP(program, reduction, make_qp_solver("osqp"))
+    model = make_model(program, WAYS["osqp"], reduction).at(point, np.zeros(4), qp.active(point), True)
+    found = qp.solve(point, model, point.g, radius=radius, price=100.0, time_limit=None)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("radius", [0.1, 10.0])
+def test_rows_that_are_given_up_cost_what_elastic_ones_do(
+    radius: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elastic, given_up = (_step(beyond, radius, monkeypatch) for beyond in (1e9, 0.0))
+    assert elastic.elastic == 1
+    # inside a wide radius the row can be met: it comes back
+    assert given_up.elastic == (radius > 1)
+    np.testing.assert_allclose(given_up.d, elastic.d, atol=1e-6)
+    assert given_up.linear_violation == pytest.approx(elastic.linear_violation, abs=1e-6)
+
+
+def test_a_structure_is_kept_for_the_next_program_that_has_it() -> None:
+    first, second = TimedProgram(chain()), TimedProgram(chain(bound=1.0))
+    x = np.array([0.5, 0.1, -0.2, 0.5])
+    made = [Reduction(first, first.point(x).jacobian, Chain.determined)]
+    made[0].release()
+    made.append(Reduction(second, second.point(x).jacobian, Chain.determined))
+    assert made[1]._condenser is made[0]._condenser
+    other = Reduction(second, second.point(x).jacobian, Chain.determined)
+    assert other._condenser is not made[1]._condenser  # as that is in use

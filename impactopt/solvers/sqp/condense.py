@@ -222,6 +222,17 @@ class Condenser:
         self._kernels.expand(self._stages, d)
         return d
 
+    def particular(self, residual: Vector) -> Vector:
+        """The step (n,) with which the eliminated equalities are met and no free variable moves; residual
+        (m,)."""
+        self.forward(np.zeros(self.n), residual)
+        return self.expand(np.zeros(self.free.size))
+
+    def expand_basis(self, Z: np.ndarray) -> None:
+        """Steps of eliminated variables for those of the free ones, each a column of Z (n, k), in place."""
+        for a in reversed(self._stages):
+            Z[a.e] = -(a.X.swapaxes(1, 2) @ Z[a.c])
+
     def multipliers(self, dual: Vector, y: Vector) -> Vector:
         """Multipliers of the eliminated rows.
 

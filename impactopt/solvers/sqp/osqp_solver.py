@@ -18,6 +18,7 @@ from impactopt.solvers.sqp.refine import active_set, refine
 _USABLE = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 _INFEASIBLE = (osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE, osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE)
 _UNFINISHED = (osqp.SolverStatus.OSQP_MAX_ITER_REACHED, osqp.SolverStatus.OSQP_TIME_LIMIT_REACHED)
+_FEW = 5  # rows that a guess of the active set may lack or have too many
 
 
 class OsqpSolver:
@@ -38,13 +39,13 @@ class OsqpSolver:
         *,
         tolerance: float = 1e-6,
         eps: float = 1e-6,
-        stages: tuple[int, ...] = (500, 1000, 2000, 4000, 8000),
+        stages: tuple[int, ...] = (200, 500, 1000, 2000, 4000, 8000),
     ):
         """Tolerance as above; eps: OSQP's; stages: its iterations before the 1st, 2nd, ... try to finish."""
         self.tolerance = tolerance
         self.setups = 0
         self._eps, self._stages = eps, stages
-        self._active_set = ActiveSetSolver()
+        self._active_set, self._near = ActiveSetSolver(), ActiveSetSolver(max_iterations=_FEW)
         self._solver: osqp.OSQP | None = None
         self._pattern: list[np.ndarray] = []
 
@@ -61,9 +62,9 @@ class OsqpSolver:
             return no_answer(qp, QPStatus.INFEASIBLE)
         if start is not None:
             # Near the end of an SQP the active set no longer changes: the last one gives the answer.
-            guess = refine(qp, start[0], np.concatenate(start[1:]) / qp.row_scale, rounds=3)
-            if guess is not None and guess.error <= self.tolerance:
-                return answer(qp, guess.x, guess.y, QPStatus.SOLVED, 0)
+            known = self._known(qp, start)
+            if known is not None:
+                return known
         if not self._load(qp, C, lower, upper):
             return no_answer(qp, QPStatus.FAILED)
         assert self._solver is not None
@@ -71,6 +72,17 @@ class OsqpSolver:
             self._solver.warm_start(x=start[0], y=np.concatenate(start[1:]) / qp.row_scale)
         deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
         return self._iterate(qp, deadline)
+
+    def _known(self, qp: QuadraticProgram, start: tuple[Vector, Vector, Vector]) -> QPSolution | None:
+        """The solution, if the guess has its active set but for a few rows."""
+        if qp.n <= SMALL:
+            found = self._near.solve(qp, start=start)
+            exact = found.status is QPStatus.SOLVED and qp.error(found.x, found.y, found.z) <= self.tolerance
+            return dataclasses.replace(found, iterations=0) if exact else None
+        guess = refine(qp, start[0], np.concatenate(start[1:]) / qp.row_scale, rounds=3)
+        if guess is None or guess.error > self.tolerance:
+            return None
+        return answer(qp, guess.x, guess.y, QPStatus.SOLVED, 0)
 
     def _iterate(self, qp: QuadraticProgram, deadline: float) -> QPSolution:
         """Let OSQP run for longer and longer, and try to finish from its answer each time."""

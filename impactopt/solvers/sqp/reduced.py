@@ -25,16 +25,19 @@ from impactopt.solvers.sqp.run import Run, Task
 _HALVINGS = 12  # of a step
 _ARMIJO = 1e-4
 _NEAR = 1e-2  # violation below which the objective may lead
-_TRIED, _SHORTER, _LEAST = 0.1, 0.2, 1e-4  # part of a step; of the radius after a refused one; its least
+_SHORTER, _LEAST = 0.2, 1e-4  # of the radius after a refused step; its least
+_REACHED = 2.0  # times the step that was taken, after a shortened one: the radius
+_FORESEEN = 0.7  # of the relief that a QP promises: the radius may grow
 _MET, _AGAIN = 0.1, 0.2  # of a violation when the objective counts again; of a radius
 _ROUNDING = 1e-11
 # radius of the QPs over the option's, and whether steps towards the equalities are shortened to it: local
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
-_PATIENCE = 40  # iterations without less violation
+_CLOSE = 0.1  # violation of a start from which there is one way only
+_PATIENCE = 40  # iterations without less violation, or a better objective
+_LESS, _BETTER = 0.97, 1e-3  # of a violation, of an objective
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
 _BACK = 3  # steps back to the equalities, of a trial point
-_WIDER = 3.0  # times that radius near points that meet the rows
 _DEARER = 3  # iterations after which rows that stay elastic cost twice as much
 
 
@@ -47,13 +50,15 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Taken:
-    """A point that the search took: after which part of the step; whether for the objective's sake."""
+    """A point that the search took: after which part of the step; whether for the objective's sake; whether
+    the violation fell as the QP foresaw."""
 
     point: Point
     length: float
     for_objective: bool
     solved: Solved
     label: str
+    foreseen: bool = False
 
 
 class ReducedRun(Run):
@@ -64,6 +69,7 @@ class ReducedRun(Run):
         self._determined, self._filter = determined, list[Pair]()
         self._radius = self._widest = self.options.radius
         self._price, self._raised = self.options.price, 0
+        self._patient = False
         self._start: float | None = None  # of a phase in which only the violation counts: where it began
 
     def iterate(self) -> Status:
@@ -78,10 +84,18 @@ class ReducedRun(Run):
         self._reduction = Reduction(self.program, start.jacobian, self._determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
+        try:
+            return self._attempts(start, y, z)
+        finally:
+            self._reduction.release()
+
+    def _attempts(self, start: Point, y: Vector, z: Vector) -> Status:
         status = Status.INFEASIBLE
-        for wide, careful in _ATTEMPTS:
+        far = start.violation > _CLOSE
+        for wide, careful in _ATTEMPTS if far else _ATTEMPTS[:1]:
             self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []
             self._qp.start_from(y, z)
+            self._patient = (wide, careful) == _ATTEMPTS[-1]  # the last way may creep
             self._qp.careful, self._widest = careful, wide * self.options.radius
             self._price, self._raised = self.options.price, self.report.iterations
             self._begin_anew()
@@ -91,7 +105,7 @@ class ReducedRun(Run):
         return status
 
     def _iterate(self) -> Status:
-        note, least, since = "start", np.inf, self.report.iterations
+        note, least, best, since = "start", np.inf, np.inf, self.report.iterations
         while True:
             try:
                 self._reduction.load(self.point)
@@ -105,10 +119,15 @@ class ReducedRun(Run):
                 return Status.INTERRUPTED
             if self.report.iterations > self.options.max_iterations:
                 return Status.ITERATION_LIMIT
-            if self.point.violation < 0.9 * least or not self._excess():
-                least, since = self.point.violation, self.report.iterations
-            elif self.report.iterations > since + _PATIENCE:
-                return Status.FAILED
+            f, h = self.point.objective, self.point.violation
+            lower = self._start is None and f < best - _BETTER * (1.0 + abs(best))
+            if h < _LESS * least or lower or not self._excess():
+                best = f if h < _LESS * least else min(best, f)
+                least, since = min(least, h), self.report.iterations
+            elif self.report.iterations > since + _PATIENCE and not self._patient:
+                if self._give_way() is not None:
+                    return Status.FAILED
+                least, best, since = np.inf, np.inf, self.report.iterations
             found = self._advance(self.report.iterations)
             if isinstance(found, Status):
                 return found
@@ -155,7 +174,9 @@ class ReducedRun(Run):
             trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
             verdict = self._judge(trial, length, solved, model)
             if verdict is not None:
-                return Taken(trial, length, verdict, solved, "")
+                relief = self.point.violation - trial.violation
+                hoped = self.point.violation - solved.linear_violation
+                return Taken(trial, length, verdict, solved, "", relief > _FORESEEN * hoped)
             if attempt == 0 and trial.finite and self.options.second_order_correction:
                 bent = trial.g - self.point.jacobian @ (trial.x - self.point.x)
                 again = self._solve(model, bent)
@@ -200,7 +221,9 @@ class ReducedRun(Run):
         leads = slope < 0 and before.violation < _NEAR and -length * slope > 1e-2 * before.violation**1.2
         if leads:
             return True if f <= before.objective + _ARMIJO * length * slope + noise else None
-        less = h <= (1 - 1e-5) * before.violation or f <= before.objective - _GAIN * h
+        # a QP trades the objective for violations at the price; what its steps bring is not to cost more
+        worth = f <= before.objective + self._price * (before.violation - h)
+        less = (worth and h <= (1 - 1e-5) * before.violation) or f <= before.objective - _GAIN * h
         met = h <= self.options.violation_tolerance and f <= before.objective + noise
         return False if less or met else None
 
@@ -230,13 +253,16 @@ class ReducedRun(Run):
         return words if self._start is None else f"{words}, violation only"
 
     def _trust(self, taken: Taken) -> None:
-        """Longer steps where full ones are taken, shorter ones where these are shortened."""
-        widest = self._widest * (_WIDER if self.point.violation < _NEAR else 1.0)
+        """Longer steps where full ones are taken, beyond the widest where the rows are nearly met or do as
+        foreseen; after a shortened step little more than what was taken.
+        """
         if taken.length == 1.0:
-            self._radius = min(2.0 * self._radius, widest)
+            wide = self.point.violation < _NEAR if self._start is None else taken.foreseen
+            widest = self.options.radius if wide else self._widest
+            self._radius = min(2.0 * self._radius, max(widest, self._radius))
         else:
-            least = 0.5 * self._radius if taken.length < _TRIED else self._radius
-            self._radius = min(max(least, 1e-3), widest)
+            taken_length = taken.length * taken.solved.longest
+            self._radius = min(max(_REACHED * taken_length, 1e-3), self._radius)
 
     def _give_way(self) -> Status | None:
         """Where no step is taken: only the violation counts from now on; or it is the end."""
@@ -266,10 +292,12 @@ class ReducedRun(Run):
         self.y = self._reduction.add_multipliers(self.y, dual)
 
     def _settle_price(self, k: int, solved: Solved) -> None:
-        """Rows that stay elastic, and cost all that they can, cost more."""
+        """Rows that stay elastic, and cost all that they can, cost more: not where the radius is too small to
+        meet them, as there they would at any price."""
         rows = self._reduction.rows
         largest = float(np.max(np.abs(solved.y[rows]) / self.program.weights[rows], initial=0.0))
-        if self._excess() and self._price < 1.5 * largest and k >= self._raised + _DEARER:
+        narrow = solved.longest > 0.99 * self._radius and self._radius < self.options.radius
+        if self._excess() and not narrow and self._price < 1.5 * largest and k >= self._raised + _DEARER:
             self._price, self._raised = min(2.0 * self._price, self.options.price_max), k
 
     # ------------------------------------------------------------------ how good it is

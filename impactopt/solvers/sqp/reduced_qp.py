@@ -13,10 +13,13 @@ from impactopt.solvers.sqp.qp import QPSolver, QuadraticProgram
 from impactopt.solvers.sqp.reduced_hessian import ReducedModel
 from impactopt.solvers.sqp.reduction import Reduction
 
-_NEAR = 0.02  # unit rows with less room than this are in the QP from the start
+# part of the way that a row can change, within which it is in the QP from the start; rows for each direction
+_NEAR, _NEAREST = 0.1, 2
 _MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
 _SLACK_CURVATURE = 1e-4  # of the price
 _ACTIVE = 1e-4  # multiplier of a unit row that holds
+_SOFT = 1e-9  # violation where t = 0 of rows that may stay violated
+_BEYOND = 0.5  # of the way that a row can change inside the radius: what is violated by more is given up
 # parts of the radius that a step towards the equalities may be long: it is shortened with the rest, but where
 # only the violation counts
 _LARGEST, _CAREFUL = 1e4, 0.8
@@ -25,7 +28,8 @@ _LARGEST, _CAREFUL = 1e4, 0.8
 @dataclass(frozen=True)
 class Solved:
     """A step d (n,); multipliers y (m,) and z (n,) of all but the equalities; what the linearized rows are
-    off by; rows of the QP, and those elastic; iterations of its solver."""
+    off by; rows of the QP, and those elastic; iterations of its solver; largest entry of the step that keeps
+    the equalities."""
 
     d: Vector
     y: Vector
@@ -34,6 +38,7 @@ class Solved:
     rows: int
     elastic: int
     iterations: int
+    longest: float
 
 
 class ReducedQP:
@@ -46,6 +51,7 @@ class ReducedQP:
 
     def __init__(self, program: TimedProgram, reduction: Reduction, solver: QPSolver):
         self._program, self._reduction, self._solver = program, reduction, solver
+        self._at: Point | None = None
         self.start_from(np.zeros(program.m), np.zeros(program.n))
 
     def start_from(self, y: Vector, z: Vector) -> None:
@@ -55,16 +61,17 @@ class ReducedQP:
 
     def active(self, point: Point) -> Matrix:
         """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
-        return self._rows(point, np.flatnonzero(np.abs(self._unit) > _ACTIVE))
+        return self._rows(point)[np.flatnonzero(np.abs(self._unit) > _ACTIVE)]
 
-    def _rows(self, point: Point, which: np.ndarray) -> Matrix:
-        """Rows (k, r) of these numbers: of the rows that are not eliminated, then of the bounds."""
-        reduction, T = self._reduction, self._reduction.T
-        count = reduction.rows.size
-        rows = reduction.rows[which[which < count]]
-        own = sp.diags_array(1.0 / point.row_norms[rows]) @ (point.jacobian.tocsr()[rows] @ T)
-        bounds = T[reduction.bounded[which[which >= count] - count]]
-        return sp.vstack([own, bounds]) if reduction.sparse else np.vstack([own, bounds])
+    def _rows(self, point: Point) -> Matrix:
+        """Unit rows (k, r): those that are not eliminated, then of the bounds."""
+        if self._at is not point:
+            reduction, T = self._reduction, self._reduction.T
+            unit = sp.diags_array(1.0 / point.row_norms[reduction.rows])
+            own, bounds = unit @ (point.jacobian.tocsr()[reduction.rows] @ T), T[reduction.bounded]
+            self._at = point
+            self._every = sp.vstack([own, bounds], "csr") if reduction.sparse else np.vstack([own, bounds])
+        return self._every
 
     def solve(
         self,
@@ -87,16 +94,29 @@ class ReducedQP:
         lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
         upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
         prices = price * np.concatenate([(p.weights * norms)[rows], np.ones(bounded.size)])
-        working = (np.abs(self._unit) > 1e-9) | (np.minimum(-lower, upper) < _NEAR)
-        slope, unit, iterations = model.slope(d0), self._unit, 0
+        every = self._rows(point)
+        reach = radius * abs(every).sum(axis=1)  # how much a row can change
+        off = np.maximum(lower, -upper)
+        soft = off > _SOFT
+        lost = soft & ((off > _BEYOND * reach) | (np.abs(self._unit) > 0.99 * prices))
+        late = np.argsort(-off / np.maximum(reach, 1e-12))[_NEAREST * T.shape[1] :]
+        working = off > -_NEAR * reach
+        working[late] = False
+        working |= np.abs(self._unit) > 1e-9
+        slope0, unit, iterations = model.slope(d0), self._unit, 0
         guess = np.zeros(T.shape[1])
         for _ in range(_ROUNDS):
-            which = np.flatnonzero(working)
-            qp = _elastic(
-                model.B, slope, self._rows(point, which), lower[which], upper[which], radius, prices[which]
+            which, given_up = np.flatnonzero(working & ~lost), np.flatnonzero(lost)
+            dear = np.where(lower > 0, -prices, prices)[given_up]
+            slope = slope0 + every[given_up].T @ dear
+            qp = _elastic(model.B, slope, every[which], lower[which], upper[which], radius, prices[which])
+            priced = np.concatenate([which[lower[which] > _SOFT], which[upper[which] < -_SOFT]])
+            held = np.minimum(np.abs(unit[priced]) - prices[priced], 0.0)  # of slacks that are zero
+            start = (
+                np.concatenate([guess, np.zeros(priced.size)]),
+                unit[which],
+                np.concatenate([np.zeros(guess.size), held]),
             )
-            room = np.zeros(qp.n - guess.size)
-            start = np.concatenate([guess, room]), unit[which], np.zeros(qp.n)
             found = self._solver.solve(qp, start=start, time_limit=time_limit)
             iterations += found.iterations
             if not found.usable:
@@ -104,25 +124,29 @@ class ReducedQP:
             guess = found.x[: T.shape[1]]
             step = T @ guess
             unit = np.zeros(lower.size)
-            unit[which] = found.y
+            unit[which], unit[given_up] = found.y, dear
             values = np.concatenate([(point.jacobian @ step)[rows] / scale, step[bounded]])
-            missed = np.where(working, 0.0, np.maximum(lower - values, values - upper))
-            if missed.max(initial=0.0) <= _MISSED:
+            beyond = np.maximum(lower - values, values - upper)
+            back = lost & (np.where(lower > 0, lower - values, values - upper) < -_MISSED)
+            missed = np.where(working | lost, 0.0, beyond)
+            if missed.max(initial=0.0) <= _MISSED and not back.any():
                 break
+            lost &= ~back
+            working |= back
             worst = np.argsort(-missed)[: max(_MORE, missed.size // 10)]
             working[worst[missed[worst] > 0]] = True
         self._unit = unit
         d, y, z = d0 + step, np.zeros(p.m), np.zeros(p.n)
         y[rows], z[bounded] = unit[: rows.size] / scale, unit[rows.size :]
         linear = float(p.weights @ row_violations(p, g + point.jacobian @ d))
-        return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations)
+        return Solved(d, y, z, linear, which.size, qp.n - guess.size, iterations, float(np.abs(guess).max()))
 
 
 def _elastic(
     B: Matrix, c: Vector, A: Matrix, lower: Vector, upper: Vector, radius: float, prices: Vector
 ) -> QuadraticProgram:
     """The QP in (t, s), s >= 0 at a price: A t + s >= lower where t = 0 is below, A t - s <= upper above."""
-    below, above = np.flatnonzero(lower > 1e-9), np.flatnonzero(upper < -1e-9)
+    below, above = np.flatnonzero(lower > _SOFT), np.flatnonzero(upper < -_SOFT)
     elastic = np.concatenate([below, above])
     k, n = elastic.size, c.size
     box = np.full(n, radius)

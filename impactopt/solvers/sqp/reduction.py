@@ -8,6 +8,8 @@ Nocedal and Wright 2006, section 15.3.
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,13 +17,15 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 from impactopt.solvers.program import Determined, Matrix, Vector
-from impactopt.solvers.sqp.condense import find_eliminations
+from impactopt.solvers.sqp.compiled import kernels
+from impactopt.solvers.sqp.condense import Condenser, find_eliminations
+from impactopt.solvers.sqp.patterns import Elimination
 from impactopt.solvers.sqp.point import Point, TimedProgram
 
 Index = npt.NDArray[np.intp]
+_KEPT = 4  # structures
 _LARGE = 300  # free variables: beyond, QPs stay sparse, with the equalities that are left as rows
 _NOTHING = 1e-13  # what rounding leaves of a zero
 _RANK = 1e-9  # of the equalities left: what is this much smaller than the largest depends on the others
@@ -50,10 +54,18 @@ class Reduction:
     ):
         """jacobian : (m, n) csc, at any point.  dense : never sparse, however many variables are free."""
         equal = program.g_lower == program.g_upper
-        found = find_eliminations(jacobian, equal, determined)
+        self._equations, every = np.flatnonzero(equal), np.ones(int(equal.sum()), dtype=bool)
+        equations = self._of_equations(jacobian)
+        self._empty = sp.csc_array((program.n, program.n))
+        self._key = _key(equations, determined)
+        if self._key not in _structures:
+            _structures[self._key] = _structure(equations, self._empty, every, determined)
+        self._found, self._condenser = _structures.pop(self._key)
+        found = self._found
         none = np.zeros(0, dtype=np.intp)
-        self.gone: Index = np.concatenate([none, *[e.rows.ravel() for e in found]])
+        self.gone: Index = self._equations[np.concatenate([none, *[e.rows.ravel() for e in found]])]
         self.variables: Index = np.concatenate([none, *[e.variables.ravel() for e in found]])
+        self._place = np.argsort(np.argsort(self.gone))
         self._level = program.g_lower
         self.free = np.setdiff1d(np.arange(program.n), self.variables)
         here = np.ones(program.m, dtype=bool)
@@ -64,25 +76,26 @@ class Reduction:
         self.bounded = np.flatnonzero(np.isfinite(program.x_lower) | np.isfinite(program.x_upper))
         self._n = program.n
 
+    def release(self) -> None:
+        """Keep the structure for the next program that has it."""
+        _structures[self._key] = self._found, self._condenser
+        while len(_structures) > _KEPT:
+            _structures.popitem(last=False)
+
     def load(self, point: Point) -> None:
-        """Take the Jacobian at a point.
+        """Take the Jacobian at a point, by the interior-point method's elimination.
 
         Raises
         ------
         LinAlgError : rows do not determine their variables there.
         """
-        rows = point.jacobian.tocsr()
-        of_gone, self._of_left = rows[self.gone].tocsc(), rows[self.left]
-        self._factors: Any = None
-        determined = np.zeros((0, self.free.size))
-        if self.gone.size:
-            try:
-                self._factors = spla.splu(sp.csc_matrix(of_gone[:, self.variables]))
-            except RuntimeError as error:
-                raise np.linalg.LinAlgError(str(error)) from None
-            determined = -self._factors.solve(of_gone[:, self.free].toarray())
-        Z = self._placed(determined)
-        self._Z = Z
+        equations = self._of_equations(point.jacobian)
+        self._of_left = point.jacobian.tocsr()[self.left]
+        self._condenser.load(equations, self._empty)
+        Z = np.zeros((self._n, self.free.size))
+        Z[self.free, np.arange(self.free.size)] = 1.0
+        self._condenser.expand_basis(Z)
+        Z = self._Z = _without_zeros(Z) if self.sparse else Z
         A = self._of_left @ Z
         if not self.left.size:
             self._Y, self._R, self._order = np.zeros((self.free.size, 0)), np.zeros((0, 0)), self.left
@@ -94,24 +107,13 @@ class Reduction:
         self._Y, self._R = Q[:, :rank], R[:rank]
         self.T = Z @ Q[:, rank:]
 
-    def _placed(self, determined: np.ndarray) -> Any:
-        """(n, f) from what the variables that are determined do with each of the free ones."""
-        every = np.arange(self.free.size)
-        if not self.sparse:
-            Z = np.zeros((self._n, self.free.size))
-            Z[self.free, every], Z[self.variables] = 1.0, determined
-            return Z
-        i, j = np.nonzero(np.abs(determined) > _NOTHING)
-        rows, columns = np.concatenate([self.free, self.variables[i]]), np.concatenate([every, j])
-        values = np.concatenate([np.ones(every.size), determined[i, j]])
-        return sp.csr_array((values, (rows, columns)), shape=(self._n, self.free.size))
+    def _of_equations(self, jacobian: Matrix) -> Matrix:
+        return jacobian.tocsr()[self._equations].tocsc()
 
     def normal(self, g: Vector) -> Vector:
         """The step (n,) that meets the linearized equalities, as well as they can be, whose values are g
         (m,); the shortest of the free variables."""
-        d = np.zeros(self._n)
-        if self.gone.size:
-            d[self.variables] = -self._factors.solve(g[self.gone] - self._level[self.gone])
+        d = self._condenser.particular((g - self._level)[self._equations])
         if self.left.size:
             off = -(g[self.left] - self._level[self.left] + self._of_left @ d)
             along = np.linalg.lstsq(self._R.T, off[self._order], rcond=None)[0]
@@ -130,8 +132,8 @@ class Reduction:
             of_left[self._order] = np.linalg.lstsq(self._R, target, rcond=None)[0]
             y[self.left] = of_left
             dual = dual + self._of_left.T @ of_left
-        if self.gone.size:
-            y[self.gone] = -self._factors.solve(dual[self.variables], trans="T")
+        of_gone = self._condenser.multipliers(dual, np.zeros(len(self._condenser.left)))
+        y[self.gone] = of_gone[self._place]
         return y
 
     @property
@@ -142,3 +144,26 @@ class Reduction:
     def gradient(self, dual: Vector) -> Vector:
         """(f,) of what the free variables change, those that they determine with them; dual (n,)."""
         return np.asarray(self._Z.T @ dual)
+
+
+_structures: OrderedDict[bytes, tuple[list[Elimination], Condenser]] = OrderedDict()
+
+
+def _structure(
+    equations: Matrix, empty: Matrix, every: npt.NDArray[np.bool_], determined: Sequence[Determined]
+) -> tuple[list[Elimination], Condenser]:
+    found = find_eliminations(equations, every, determined)
+    nowhere = np.zeros(equations.shape[1], dtype=bool)
+    return found, Condenser(equations, empty, found, every, nowhere, kernels())
+
+
+def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:
+    digest = hashlib.sha256(repr([(rank, v.size) for rank, v in determined]).encode())
+    for array in (equations.indptr, equations.indices, *[variables for _, variables in determined]):
+        digest.update(np.ascontiguousarray(array, dtype=np.int64).tobytes())
+    return digest.digest()
+
+
+def _without_zeros(Z: np.ndarray) -> Matrix:
+    i, j = np.nonzero(np.abs(Z) > _NOTHING)
+    return sp.csr_array((Z[i, j], (i, j)), shape=Z.shape)

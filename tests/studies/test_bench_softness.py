@@ -38,7 +38,8 @@ def test_a_row_a_factor_and_one_with_what_is_chosen(tmp_path: Path) -> None:
         assert row["stiffness_N_m_rad"] == pytest.approx(20.0 * row["factor"])
         assert row["gear_replayed"] == pytest.approx(row["gear_planned"], rel=0.05)
     assert rows[2]["energy_J"] > max(row["energy_J"] for row in rows[:2])
-    depth, gear = report.figures["softness"]().axes
+    impulse, depth, gear = report.figures["softness"]().axes
+    assert list(impulse.lines[0].get_ydata()) == [row["impulse_Ns"] for row in rows[:2]]
     (line, star) = depth.lines
     assert list(line.get_xdata()) == [0.3, 4.0] and list(star.get_xdata()) == [rows[2]["factor"]]
     assert star.get_ydata()[0] == pytest.approx(1e3 * rows[2]["target"])

@@ -5,44 +5,53 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from matplotlib.lines import Line2D
+
 from impactopt.report.pictures.style import BLUE, GREEN, PAGE, PURPLE, VERMILION, Picture, styled
 
 Row = Mapping[str, Any]
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
 
 
 @styled
 def softness_picture(rows: Sequence[Row]) -> Picture:
-    """Two panels, a line a problem, over factors on the stiffness; stars are what plans choose.
+    """A line a problem over factors on the stiffness; stars are what plans choose.
 
-    rows : of `impactopt.studies.bench.softness`; of a blow the nail's depth is drawn, else its impulse.
+    rows : of `impactopt.studies.bench.softness`. Panels are impulse, depth of nails if there are any, gears.
     """
-    figure = Picture(PAGE, 2.6)
-    worth, gear = figure.subplots(1, 2)
-    colours = (BLUE, VERMILION, GREEN, PURPLE)
-    names = dict.fromkeys(row["problem"] for row in rows)
-    for name, colour in zip(names, colours, strict=False):
-        own = [row for row in rows if row["problem"] == name and row.get("impulse_Ns")]
-        given = [row for row in own if not row["chosen"]]
-        chosen = [row for row in own if row["chosen"]]
-        for axes, of in ((worth, _brought), (gear, _load)):
-            axes.plot(
-                [r["factor"] for r in given], [of(r) for r in given], "o-", ms=3, color=colour, label=name
-            )
-            axes.plot([r["factor"] for r in chosen], [of(r) for r in chosen], "*", ms=9, color=colour)
-    depths = any("depth_m" in row.get("outcome", {}) for row in rows)
-    worth.set(ylabel="nail driven [mm]" if depths else "impulse [N s]")
-    gear.set(ylabel="gear load / torque limit")
-    for axes in (worth, gear):
-        axes.set(xscale="log", xlabel="stiffness / that of the file")
+    quantities = {"impulse [N s]": _impulse, "nail driven [mm]": _depth, "gear load / torque limit": _load}
+    solved = [row for row in rows if row.get("impulse_Ns")]
+    if not any("depth_m" in row["outcome"] for row in solved):
+        del quantities["nail driven [mm]"]
+    figure = Picture(PAGE, 2.4)
+    panels = figure.subplots(1, len(quantities))
+    colours = dict(zip(dict.fromkeys(row["problem"] for row in rows), COLOURS, strict=False))
+    given = sorted({row["factor"] for row in solved if not row["chosen"]})
+    for axes, (label, of) in zip(panels, quantities.items(), strict=True):
+        for name, colour in colours.items():
+            for chosen, style in ((False, "o-"), (True, "*")):
+                own = [r for r in solved if r["problem"] == name and r["chosen"] is chosen]
+                factors, size = [r["factor"] for r in own], 9 if chosen else 3
+                axes.plot(factors, [of(r) for r in own], style, markersize=size, color=colour)
+        axes.set(xscale="log", xlabel="stiffness / that of the file", ylabel=label)
+        axes.set_xticks(given, [f"{factor:g}" for factor in given], minor=False)
+        axes.set_xticks([], minor=True)
+        axes.margins(y=0.1)
         axes.set_ylim(bottom=0.0)
-    if worth.lines:
-        worth.legend(fontsize=6.5)
+    key = [Line2D([], [], marker="o", markersize=3, color=c, label=name) for name, c in colours.items()]
+    star: Any = {"marker": "*", "markersize": 9, "linestyle": "", "color": "#555555"}
+    key.append(Line2D([], [], label="chosen by the plan", **star))
+    figure.legend(handles=key, loc="outside lower center", ncols=len(key))
     return figure
 
 
-def _brought(row: Row) -> float:
-    depth = row["outcome"].get("depth_m")
-    return float(row["impulse_Ns"] if depth is None else 1e3 * depth)
+def _impulse(row: Row) -> float:
+    return float(row["impulse_Ns"])
+
+
+def _depth(row: Row) -> float:
+    return 1e3 * float(row["outcome"].get("depth_m", np.nan))
 
 
 def _load(row: Row) -> float:

@@ -27,6 +27,7 @@ class MujocoRobot:
         self.mujoco, self.robot, self.world = mujoco_module(), robot, world
         self.data = self.mujoco.MjData(world)
         self.floating = robot.floating
+        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv  # a robot counts anew each time
         joints = [world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.place = np.array([joint.qposadr[0] for joint in joints])
@@ -50,17 +51,17 @@ class MujocoRobot:
 
     def state(self) -> tuple[Array, Array]:
         """q (nq), v (nv)."""
-        d, robot = self.data, self.robot
-        q, v = np.zeros(robot.nq), np.zeros(robot.nv)
+        qpos, qvel = self.data.qpos, self.data.qvel
+        q, v = np.zeros(self._nq), np.zeros(self._nv)
         if self.floating:
-            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
-            v[:3], v[3:6] = self.base_rotation().T @ d.qvel[:3], d.qvel[3:6]
-        angles = d.qpos[self.place]
+            q[:3], q[3:6], q[6] = qpos[:3], qpos[4:7], qpos[3]
+            v[:3], v[3:6] = self.base_rotation().T @ qvel[:3], qvel[3:6]
+        angles = qpos[self.place]
         q[self._place] = angles
         for k in self._continuous:
             at = self._place[k]
             q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
-        v[-robot.n :] = d.qvel[self.dof]
+        v[-self._n :] = qvel[self.dof]
         return q, v
 
     def base_rotation(self) -> Array:

@@ -293,14 +293,15 @@ def simulate_mujoco(
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
-    saturates = servo.limit * (1 + 1e-9)
+    most = servo.limit * (1 + 1e-9)  # demand that does not saturate
     period, wait = world.period, world.delay
     if controller is not None:
         period, wait = period or controller.period, wait or controller.delay
     hold = max(1, round(period / step))
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
     lag = round(wait / step)
-    told = np.zeros((2, robot.n))  # what the servo tells the motors: demand, and what saturation leaves of it
+    # what the servo tells the motors, and what reaches them: demand, and what saturation leaves of it
+    told, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
     force = 0.0
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
@@ -324,8 +325,11 @@ def simulate_mujoco(
                 waiting.append((k + lag if k else 0, asked))
             while waiting and waiting[0][0] <= k:
                 told = np.array(waiting.popleft()[1])
-            demand, wanted = delay.at(t, told)
+            reached, late = delay.at(t, told), reached
             delay.keep(t, told)
+            if reached is not late:
+                demand, wanted = reached
+                saturates = bool((np.abs(demand) > most).any())
             rates = data.qvel[replay.dof]
             cut = motors.cut(wanted, rates)
             if motors.lines:
@@ -342,7 +346,7 @@ def simulate_mujoco(
             replay.apply(torque, push.forces)
             replay.shove(t)
             touches.add(t, force, step, push.since)
-            saturated += step * bool((np.abs(demand) > saturates).any())
+            saturated += step * saturates
             replay.place_target()
             impulses += step * push.forces
             left = replay.target if force > 0 else left

@@ -35,7 +35,7 @@ class MujocoRobot:
         self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
         # a continuous joint's angle is (cosine, sine) in Pinocchio
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
-        self.sites = [world.site(striker).id for striker in strikers]
+        self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
 
     def put(self, q: Array, v: Array | None = None) -> None:
@@ -72,7 +72,7 @@ class MujocoRobot:
 
     def places(self) -> Array:
         """(h, 3) [m] of the striking points."""
-        return np.array(self.data.site_xpos[self.sites])
+        return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
         """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`."""
@@ -83,5 +83,6 @@ class MujocoRobot:
 
     def apply(self, torque: Array, forces: Array | float) -> None:
         """Torque (n) [N m] at the joints, and the contacts' forces (h,) [N], against the normal."""
-        self.data.qfrc_applied[:] = -np.atleast_1d(forces) @ self.along
-        self.data.qfrc_applied[self.dof] += torque
+        applied = self.data.qfrc_applied
+        applied[:] = -np.atleast_1d(forces) @ self.along
+        applied[self.dof] += torque

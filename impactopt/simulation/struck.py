@@ -59,7 +59,9 @@ class Struck:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.law, self.target = scene, scene.law, scene.target
-        self.points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
+        points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
+        # as floats: of three of them, arrays would take several times as long
+        self._points, self._normal = [tuple(p.tolist()) for p in points], tuple(scene.normal.tolist())
         self.untouched: Array = np.zeros(self.target.n_states)
         # read once: they are asked for in every step
         self._law, self._target = self.law.parameters, self.target.parameters
@@ -77,16 +79,13 @@ class Struck:
         """(h,) [m] of striking points at places (h, 3) [m] in a target that has gone so far [m]; beside its
         face minus infinity.
         """
-        return np.array(
-            [self._depth(at, point, travel) for at, point in zip(places, self.points, strict=True)]
-        )
-
-    def _depth(self, place: Array, point: Array, travel: float) -> float:
-        normal = self.scene.normal
-        way = place - point
-        along = float(normal @ way)
-        across = way - along * normal
-        return -np.inf if across @ across > FACE**2 else along - travel
+        depths, (nx, ny, nz) = [], self._normal
+        for (x, y, z), (px, py, pz) in zip(places.tolist(), self._points, strict=True):
+            dx, dy, dz = x - px, y - py, z - pz
+            along = nx * dx + ny * dy + nz * dz
+            across = (dx - along * nx) ** 2 + (dy - along * ny) ** 2 + (dz - along * nz) ** 2
+            depths.append(-np.inf if across > FACE**2 else along - travel)
+        return np.array(depths)
 
     def forces(self, depths: Array, speeds: Array, state: Array) -> Array:
         """Contact forces (h,) [N] of striking points so deep in the target [m], with speeds along the normal
@@ -99,7 +98,8 @@ class Struck:
 
     def near(self, depths: Array, speeds: Array, state: Array, step: float) -> bool:
         """Whether any of them may touch the target within a step [s]."""
-        return bool((depths + NEAR * step * (np.abs(speeds - self.speed(state)) + 1.0) > 0).any())
+        speed, pairs = self.speed(state), zip(depths.tolist(), speeds.tolist(), strict=True)
+        return any(depth + NEAR * step * (abs(rate - speed) + 1.0) > 0 for depth, rate in pairs)
 
     def pushed(
         self,
@@ -170,7 +170,7 @@ class Struck:
         """The state after a time [s] under one force, by Runge-Kutta's steps of order four: the swing of a
         board that has not broken does not grow by them.
         """
-        if not self.rates(state, force).any():
+        if not any(self.target.derivative(state, force, self._target)):
             return state  # as it is before a blow
 
         def begin(_done: float, s: Array) -> Move[Array]:

@@ -49,15 +49,18 @@ class Cones:
     m : rows of all of them.
     """
 
-    def __init__(self, corners: tuple[Array, ...], settings: ControllerSettings, n: int, weight: float) -> None:
+    def __init__(
+        self, corners: tuple[Array, ...], settings: ControllerSettings, n: int, weight: float
+    ) -> None:
         cones = [cone_of(c, settings) for c in corners]
         self.m = sum(len(cone) for cone in cones)
         self._weight, self._soles = weight, len(cones)
         self._rows = block_diag(*cones) / weight if cones else np.zeros((0, 0))
         self._least = np.zeros(self.m)  # of the normal force, which is each cone's first row
         self._least[np.cumsum([0, *map(len, cones)])[:-1]] = settings.least_force / weight
-        self._low = np.array([c.min(axis=0) for c in corners])
-        self._high = np.array([c.max(axis=0) for c in corners])
+        self._low = np.array([[*c.min(axis=0), 0.0] for c in corners])
+        self._high = np.array([[*c.max(axis=0), 0.0] for c in corners])
+        self._turn = np.zeros((6 * len(cones), 6 * len(cones)))  # from the world's axes to the soles'
         # wrenches by torques over their limits, and at none: in the soles' axes
         self._local = np.zeros((6 * len(cones), n + 1))
 
@@ -67,11 +70,11 @@ class Cones:
 
         B (6 a sole, n), b0 : wrenches in world axes, B x + b0.  places : of the soles.
         """
-        local = self._local
+        turn, local = self._turn, self._local
         for k, place in enumerate(places):
-            back = place.rotation.T
-            for rows in (slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)):
-                local[rows, :-1], local[rows, -1] = back @ B[rows], back @ b0[rows]
+            at, back = 6 * k, place.rotation.T
+            turn[at : at + 3, at : at + 3] = turn[at + 3 : at + 6, at + 3 : at + 6] = back
+        local[:, :-1], local[:, -1] = turn @ B, turn @ b0
         C = self._rows @ local
         c = self._least - C[:, -1]
         C[:, -1] = 1.0
@@ -81,9 +84,9 @@ class Cones:
         """Normal forces (soles,) [N] and centres of pressure (soles, 3) [m], in the soles' frames, at torques
         over their limits x (n,), where `look` was last.
         """
-        wrench = (self._local[:, :-1] @ x + self._local[:, -1]).reshape(-1, 6)
-        loads = np.maximum(wrench[:, 2], 1e-3 * self._weight)
+        wrench = self._local[:, :-1] @ x + self._local[:, -1]
+        loads = np.maximum(wrench[2::6], 1e-3 * self._weight)
         points = np.zeros((self._soles, 3))
-        at = np.stack([-wrench[:, 4], wrench[:, 3]], axis=1) / loads[:, None]
-        points[:, :2] = np.minimum(np.maximum(at, self._low), self._high)
+        points[:, 0], points[:, 1] = -wrench[4::6] / loads, wrench[3::6] / loads
+        np.clip(points, self._low, self._high, out=points)
         return loads, points

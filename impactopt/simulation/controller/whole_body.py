@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.aim import Aim
@@ -142,7 +143,7 @@ class WholeBodyController:
             now, goal = held.back, B @ feed
             if recovers:  # what makes the momentum's rate with the least wrenches
                 spread = lift / self.share**2
-                now, goal = held.b0, spread.T @ np.linalg.solve(spread @ lift.T, rate)
+                now, goal = held.b0, spread.T @ dgesv(spread @ lift.T, rate)[2]
             tasks.add(s.wrench, self.share[:, None] * B, self.share * (now - goal))
         P, g = np.zeros((n + 1, n + 1)), np.zeros(n + 1)
         P[:n, :n], g[:n] = tasks.sums()

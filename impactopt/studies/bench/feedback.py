@@ -41,6 +41,7 @@ def loosened(problem: ImpactProblem) -> ImpactProblem:
 
 
 PROBLEMS = ("punch", "punch_strongest")
+KEYS = ("problem", "balance", "controller", "draws", "seed")
 BALANCE = {"stated": None, "loosened": loosened}  # what is done to a problem
 COLUMNS = (
     ("problem", "problem", 0),
@@ -74,17 +75,17 @@ def run(
     InputError : no file of that name.
     """
     files = [problem_file(name) for name in problems or PROBLEMS]
-    kept = Kept(ROWS, ("problem", "balance", "controller", "draws", "seed"), resume=resume)
+    kept = Kept(ROWS, KEYS, resume=resume)
     rows: list[dict[str, Any]] = []
     for file, (balance, change) in product(files, BALANCE.items()):
         solution = None
         for controller in CONTROLLERS:
-            case = {"problem": file.stem, "balance": balance, "controller": controller}
-            case |= {"draws": draws, "seed": seed}
-            found = kept.found.get(tuple(case.values()))
+            case = (file.stem, balance, controller, draws, seed)
+            found = kept.found.get(case)
             if found is None:
                 solution = solved(file, say, change) if solution is None else solution
-                found = kept.add(case | _row(solution, file, controller, draws, seed, workers, say))
+                row = _row(solution, file, controller, draws, seed, workers, say)
+                found = kept.add({**dict(zip(KEYS, case, strict=True)), **row})
             rows.append(found)
     return Report(
         name="feedback",

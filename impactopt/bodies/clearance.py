@@ -28,6 +28,7 @@ MISSED = 3  # phase in which there is no target
 FAR = 1.0  # [m] no clearance beyond this is asked for
 _REQUEST = coal.DistanceRequest()
 SHALLOW, EVERY = 2e-3, 5e-3  # [m] deeper bodies are looked at once in so long [s]
+CLOSE = 2e-2  # [m] that is looked at first
 DEEPEST = -1e-6  # [m] what is deeper is a touch
 
 
@@ -168,6 +169,16 @@ class Bodies:
         return {j: np.flatnonzero(self.links.joint == j) for j in self.links.joints}
 
     @cached_property
+    def _about_spheres(self) -> dict[int, tuple[Array, float]]:
+        """Of each joint the centre (3,) and radius [m] of a ball about all its spheres."""
+        links, out = self.links, {}
+        for j, own in self._of_joint.items():
+            centre = links.balls[j][0]
+            away = np.linalg.norm(links.centre[own] - centre, axis=1)
+            out[j] = centre, float((away + links.radius[own]).max())
+        return out
+
+    @cached_property
     def directed(self) -> dict[Pair, Pair]:
         """Of each pair of joints, whose spheres are held against whose planes: of the one they fit best."""
         out = self.links.out
@@ -219,14 +230,18 @@ class Bodies:
             when = np.flatnonzero(self.present(body, at))
             shift = body.place + np.outer(at.travel[when], self.normal) * body.moves
             for j in joints if len(when) else ():
-                own = self._of_joint[j]
+                own, (centre, radius) = self._of_joint[j], self._about_spheres[j]
+                ball = centre @ at.rotation[when, j].transpose(0, 2, 1) + at.translation[when, j]
+                gap = _outside(body.planes, ((ball - shift) @ body.rotation)[:, None])[:, 0] - radius
+                near = np.flatnonzero(gap < within)
                 points = (
-                    links.centre[own] @ at.rotation[when, j].transpose(0, 2, 1)
-                    + at.translation[when, j, None]
+                    links.centre[own] @ at.rotation[when[near], j].transpose(0, 2, 1)
+                    + at.translation[when[near], j, None]
                 )
-                gap = _outside(body.planes, (points - shift[:, None]) @ body.rotation) - links.radius[own]
+                local = (points - shift[near, None]) @ body.rotation
+                gap = _outside(body.planes, local) - links.radius[own]
                 i, c = np.nonzero(gap < within)
-                found.append((when[i], own[c], j, -1 - w, gap[i, c]))
+                found.append((when[near[i]], own[c], j, -1 - w, gap[i, c]))
         none = np.zeros(0, dtype=np.intp)
         instants = np.concatenate([none, *(f[0] for f in found)])
         sphere = np.concatenate([none, *(f[1] for f in found)])
@@ -308,6 +323,14 @@ class Bodies:
         time (k,) [s] : of the instants.  within [m] : pairs that are farther apart count as `FAR`.
         Two that are deep in each other are looked at every `EVERY`, so that begin and end are that fine.
         """
+        close = self.slack + CLOSE  # of most motions the nearest two are, and then no others matter
+        if close < within:
+            found = self._survey(time, at, close)
+            if found.clearance <= CLOSE:
+                return found
+        return self._survey(time, at, within)
+
+    def _survey(self, time: Array, at: Places, within: float) -> Survey:
         least, when, which = FAR, 0, None
         found: dict[Pair, list[tuple[int, float]]] = {}
         seen: set[tuple[Pair, int]] = set()

@@ -36,7 +36,10 @@ class Besides:
             return
         contacts = data.contact
         numbers = self._number[contacts.geom]
-        for k in np.flatnonzero((numbers >= 0).all(axis=1) & (contacts.dist < 0)):
+        both = numbers.min(axis=1) >= 0
+        if not both.any():
+            return
+        for k in np.flatnonzero(both & (contacts.dist < 0)):
             one, other = (int(n) for n in sorted(numbers[k], reverse=True))
             address = contacts.efc_address[k]
             force = float(data.efc_force[address]) if address >= 0 else 0.0

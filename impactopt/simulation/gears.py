@@ -17,14 +17,17 @@ class GearWatch:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._armature, self._most = robot.armature, np.zeros(robot.n)
+        self._armature = robot.armature
+        self._high, self._low = np.zeros((2, robot.n))
 
     def look(self, torque: Array, acceleration: Array) -> None:
         """Torque (n,) [N m] of the servos, acceleration (nv,) of the robot."""
         load = torque - self._armature * acceleration[-len(self._armature) :]
-        self._most = np.where(np.abs(load) > np.abs(self._most), load, self._most)
+        np.maximum(self._high, load, out=self._high)
+        np.minimum(self._low, load, out=self._low)
 
     def taken(self) -> Array:
         """(n,) [N m]; from now on it begins anew."""
-        found, self._most = self._most, np.zeros(len(self._armature))
+        found = np.where(self._high >= -self._low, self._high, self._low)
+        self._high[:], self._low[:] = 0.0, 0.0
         return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -18,16 +19,23 @@ from impactopt.simulation.touch import Touches
 Array = NDArray[np.float64]
 
 
-def slip_and_lift(corners: list[Array], start: list[Array]) -> tuple[list[float], list[float]]:
-    """[m] of each sole, of the corner that moved most, from places (k, 3) of its corners now and at first."""
-    moves = [now - then for now, then in zip(corners, start, strict=True)]
-    slip = [float(np.linalg.norm(m[:, :2], axis=1).max()) for m in moves]
-    return slip, [max(0.0, float(m[:, 2].max())) for m in moves]
+def slip_and_lift(scene: Scene, corners: Array) -> tuple[Array, Array]:
+    """(k, soles) [m] of each sole, of the corner that moved most since the first instant, from the places
+    (k, corners, 3) of all soles' corners, in the scene's order.
+    """
+    moves = corners - corners[0]
+    level, up = np.linalg.norm(moves[..., :2], axis=2), np.maximum(moves[..., 2], 0.0)
+    first = np.cumsum([0, *(len(c) for c in scene.corners)])
+    soles = [slice(a, b) for a, b in itertools.pairwise(first)]
+    slip, lift = np.zeros((2, len(corners), len(soles)))
+    for i, its in enumerate(soles):
+        slip[:, i], lift[:, i] = level[:, its].max(axis=1), up[:, its].max(axis=1)
+    return slip, lift
 
 
 def check_not_diverged(rates: Array, t: float, step: float) -> None:
     """InputError with the time [s] if the rates [rad/s, m/s] are of no robot."""
-    if not np.all(np.isfinite(rates)) or np.abs(rates).max() > 1e4:
+    if not np.abs(rates).max() <= 1e4:  # nan is not, either
         raise InputError(
             f"the simulation diverged at t = {t:.4f} s: take a smaller step than {step:g} s, or softer gains"
         )
@@ -45,13 +53,14 @@ def simulation_of(
     robot: Robot, scene: Scene, rows: list[tuple[Any, ...]], touches: Touches, **rest: Any
 ) -> Simulation:
     """Histories of recorded instants: rows of time, q, v, force, target speed, hand speed, demand, torque,
-    wrench of each sole and each hand that holds on, slip and lift of each sole, torque through the gears
+    wrench of each sole and each hand that holds on, places of the soles' corners, torque through the gears
     since the row before; ``rest``: the other fields.
     """
     if not rows:
         raise InputError("the step of the simulation is longer than its motion: give a shorter one (--step)")
     columns = [np.array(c) for c in zip(*rows, strict=True)]
-    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, slip, lift, gear = columns
+    time, q, v, force, target_speed, hand_speed, demand, torque, sole_ground, corners, gear = columns
+    slip, lift = slip_and_lift(scene, corners)
     contact_start, contact_end = touches.blow()
     joints, soles = v[:, -robot.n :], len(scene.soles)
     sole_ground, grips = sole_ground[:, :soles], sole_ground[:, soles:]
@@ -67,8 +76,8 @@ def simulation_of(
         sole_ground=sole_ground,
         soles=sole_names(robot, scene),
         cop_margin=cop_margin(robot, scene, q, sole_ground),
-        slip=slip.reshape(len(time), -1),
-        lift=lift.reshape(len(time), -1),
+        slip=slip,
+        lift=lift,
         grip_force=np.linalg.norm(grips[:, :, :3], axis=2),
         gear=gear,
         loads=DriveLoads.of(

@@ -7,11 +7,11 @@ feed-forward), the robot's numbers and the scene's.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
@@ -19,7 +19,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.besides import Besides
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.gears import GearWatch
-from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of
 from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.mujoco_robot import MujocoRobot
 from impactopt.simulation.mujoco_welds import Welds
@@ -32,6 +32,7 @@ from impactopt.simulation.struck import Push, Struck
 from impactopt.simulation.touch import Touches
 
 Array = NDArray[np.float64]
+THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
@@ -64,6 +65,7 @@ class _Replay(MujocoRobot):
         self.struck = Struck(self.scene)
         # the target's state, and how far it has gone [m]
         self.target, self.travel = self.struck.untouched, self.struck.travel_at_start(reference)
+        self.placed: tuple[Array | None, float, bool] = (None, 0.0, False)  # as its body is: both, and broken
         # strikers' depths in it at the end of a step in contact; of the step before, their speeds and forces
         self.kept: Array | None = None
         self.before: tuple[Array, Array] | None = None
@@ -75,11 +77,11 @@ class _Replay(MujocoRobot):
             for k in range(len(sole.polygon)):
                 self.geom_sole[self.world.geom(f"sole {sole.frame} {k}").id] = self.held.get(sole.frame, -1)
         frames = [robot.model.frames[robot.model.getFrameId(name)] for name in scene.soles]
-        self.sole_body = [self.world.body(f"body {robot.model.names[f.parentJoint]}").id for f in frames]
-        self.corners = [
-            np.array([f.placement.act(np.array([*c, 0.0])) for c in corners])
-            for f, corners in zip(frames, scene.corners, strict=True)
-        ]
+        on = list(zip(frames, scene.corners, strict=True))
+        bodies = [self.world.body(f"body {robot.model.names[f.parentJoint]}").id for f, _ in on]
+        self.corner_body = np.repeat(bodies, [len(corners) for corners in scene.corners]).astype(np.intp)
+        places = [f.placement.act(np.array([*c, 0.0])) for f, corners in on for c in corners]
+        self.corners = np.reshape(places, (-1, 3))
         self.start(self.reference_q[0])
 
     def follow(self, reference: Any) -> None:
@@ -87,6 +89,8 @@ class _Replay(MujocoRobot):
         world = self.perturbation
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
+        if self.floating:
+            self.upright = _upright(self.reference_q[:, 3:7].T)
 
     def miss(self, reference: Any) -> None:
         """What they follow from now on, as nothing is hit."""
@@ -109,7 +113,6 @@ class _Replay(MujocoRobot):
         self.mujoco.mj_kinematics(self.world, self.data)
         self.grips.put(self.data)
         self.mujoco.mj_forward(self.world, self.data)
-        self.start_corners = self.corner_places()
 
     # ------------------------------------------------------------------ what a step needs
     def hand_speeds(self) -> Array:
@@ -149,15 +152,21 @@ class _Replay(MujocoRobot):
     def shove(self, t: float) -> None:
         """The perturbation's push at the base, if it is on at a time [s]."""
         world = self.perturbation
+        if not (self.floating and world.push):
+            return
         on = world.push_start <= t < world.push_start + world.push_time
         way = np.array([np.cos(world.push_way), np.sin(world.push_way)])
-        if self.floating:
-            self.data.xfrc_applied[1, :2] = on * world.push * way
+        self.data.xfrc_applied[1, :2] = on * world.push * way
 
     def place_target(self) -> None:
         """Its body goes with it; what a blow has broken is put away."""
-        broken = bool(self.scene.target.outcome(self.target).get("broken", False))
+        state, travel, broken = self.placed
+        if state is not self.target:  # it is replaced where it changes
+            broken = bool(self.scene.target.outcome(self.target).get("broken", False))
+        elif travel == self.travel:
+            return
         self.besides.place(self.data, self.travel * self.scene.normal + broken * AWAY)
+        self.placed = self.target, self.travel, broken
 
     # ------------------------------------------------------------------ what a record needs
     def look_at(self, gears: GearWatch, torque: Array, push: Push) -> None:
@@ -167,23 +176,10 @@ class _Replay(MujocoRobot):
         if self.yields is not None:
             gears.look(torque, acceleration + (push.forces - push.peaks) @ self.yields[:, self.dof])
 
-    def base(self) -> tuple[Array, Array, float]:
-        """Position (3,), rotation (3, 3) and speed [m/s] of the base."""
-        if not self.floating:
-            return np.zeros(3), np.eye(3), 0.0
-        return self.data.qpos[:3].copy(), self.base_rotation(), float(np.linalg.norm(self.data.qvel[:3]))
-
-    def corner_places(self) -> list[Array]:
-        """World places (k, 3) of each held sole's corners."""
-        d = self.data
-        return [
-            c @ d.xmat[b].reshape(3, 3).T + d.xpos[b]
-            for b, c in zip(self.sole_body, self.corners, strict=True)
-        ]
-
-    def sole_moves(self) -> tuple[list[float], list[float]]:
-        """Slip and lift [m] of each held sole."""
-        return slip_and_lift(self.corner_places(), self.start_corners)
+    def corner_places(self) -> Array:
+        """World places (k, 3) of all held soles' corners."""
+        rotations = self.data.xmat[self.corner_body].reshape(-1, 3, 3)
+        return self.data.xpos[self.corner_body] + (rotations @ self.corners[:, :, None])[:, :, 0]
 
     def sole_ground(self) -> Array:
         """(soles, 6) wrench of the floor on each held sole about the world's origin; after the step's forces
@@ -196,44 +192,48 @@ class _Replay(MujocoRobot):
         on = (contacts.efc_address >= 0) & (sole >= 0)
         axes, place = contacts.frame[on].reshape(-1, 3, 3), contacts.pos[on]
         # the frame's first axis points from the first geom to the second: from the floor, geom 0, up
-        parts = self.data.efc_force[contacts.efc_address[on][:, None] + np.arange(3)]
-        force = np.einsum("kji,kj->ki", axes, parts)
-        np.add.at(out, sole[on], np.hstack([force, np.cross(place, force)]))
+        parts = self.data.efc_force[contacts.efc_address[on][:, None] + THREE]
+        force = (parts[:, None] @ axes)[:, 0]
+        # place x force; np.cross takes several times as long
+        moment = place[:, NEXT] * force[:, LAST] - place[:, LAST] * force[:, NEXT]
+        np.add.at(out, sole[on], np.concatenate([force, moment], axis=1))
         return out
 
     def ground(self) -> Array:
         """(soles and hands, 6) wrench of the world on what stands on it and holds on to it, about its origin;
         after the step's forces are known.
         """
+        if not self.grips.frames:
+            return self.sole_ground()
         found, places = self.grips.wrenches(self.data)
         found[:, 3:] += np.cross(places, found[:, :3])
         return np.vstack([self.sole_ground(), found])
 
-    def fallen(self, q_planned: Array) -> str:
-        """Whether the base is far from where the reference (nq,) has it: a plan may bow deeply itself."""
+    def fallen(self, t: float) -> str:
+        """Whether the base is far from where the reference has it at a time [s]: a plan may bow deeply
+        itself.
+        """
         if not self.floating:
             return ""
-        place, lean = self.data.qpos[:3], self.base_error(q_planned)
+        row = max(int(np.searchsorted(self.servo.time, t, side="right")) - 1, 0)
+        height, lean, planned = self.data.qpos[2], self.base_error(row), self.reference_q[row, 2]
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
-        if place[2] < (1 - FALLEN_DROP) * q_planned[2]:
-            return f"fell: the base is {place[2]:.2f} m high where it should be {q_planned[2]:.2f} m"
+        if height < (1 - FALLEN_DROP) * planned:
+            return f"fell: the base is {height:.2f} m high where it should be {planned:.2f} m"
         return ""
 
-    def planned(self, t: float) -> Array:
-        """The reference's configuration (nq,) at a time, or just before it."""
-        return self.reference_q[max(int(np.searchsorted(self.servo.time, t, side="right")) - 1, 0)]
-
-    def base_error(self, q_planned: Array) -> float:
-        """Angle [rad] between the verticals of the base and of a configuration's."""
-        planned = pin.Quaternion(q_planned[3:7]).toRotationMatrix()
-        return float(np.arccos(np.clip((self.base()[1] @ planned.T)[2, 2], -1.0, 1.0)))
+    def base_error(self, row: int) -> float:
+        """Angle [rad] between the verticals of the base and of the reference's configuration in a row."""
+        w, x, y, z = self.data.qpos[3:7].tolist()
+        cosine = float(self.upright[row] @ _upright((x, y, z, w)))
+        return math.acos(min(max(cosine, -1.0), 1.0))
 
     def not_standing(self, sole_ground: Array, weight: float) -> str:
         """Why the robot does not stand at the end, "" if it does."""
         if not self.floating:
             return ""
-        lean, speed = self.base_error(self.reference_q[-1]), self.base()[2]
+        lean, speed = self.base_error(-1), float(np.linalg.norm(self.data.qvel[:3]))
         if lean > LEANS:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STIRS:
@@ -242,6 +242,12 @@ class _Replay(MujocoRobot):
             if wrench[2] < BEARS * weight:
                 return f"the sole {name!r} bears no load at the end"
         return ""
+
+
+def _upright(quaternion: Any) -> Array:
+    """(..., 3) the world's vertical in axes turned by quaternions (x, y, z, w) of numbers or arrays (...)."""
+    x, y, z, w = quaternion
+    return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]).T
 
 
 def simulate_mujoco(
@@ -287,18 +293,21 @@ def simulate_mujoco(
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller)
     mujoco, model, data, servo = replay.mujoco, replay.world, replay.data, replay.servo
+    most = servo.limit * (1 + 1e-9)  # demand that does not saturate
     period, wait = world.period, world.delay
     if controller is not None:
         period, wait = period or controller.period, wait or controller.delay
     hold = max(1, round(period / step))
     waiting: deque[tuple[int, tuple[Array, Array]]] = deque()  # when to set, and what: demand and torque
     lag = round(wait / step)
-    told = np.zeros((2, robot.n))  # what the servo tells the motors: demand, and what saturation leaves of it
+    # what the servo tells the motors, and what reaches them: demand, and what saturation leaves of it
+    told, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
     force = 0.0
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
+    sprung = bool(passive.any())
     drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
     # given to the target [N s] by each striker, and its state when it was last touched
@@ -316,52 +325,44 @@ def simulate_mujoco(
                 waiting.append((k + lag if k else 0, asked))
             while waiting and waiting[0][0] <= k:
                 told = np.array(waiting.popleft()[1])
-            demand, wanted = delay.at(t, told)
+            reached, late = delay.at(t, told), reached
             delay.keep(t, told)
+            if reached is not late:
+                demand, wanted = reached
+                saturates = bool((np.abs(demand) > most).any())
             rates = data.qvel[replay.dof]
             cut = motors.cut(wanted, rates)
-            cuts.look(t, wanted, cut, step)
+            if motors.lines:
+                cuts.look(t, wanted, cut, step)
             drive = cut if drive is None else drive
             torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
-            if passive.any():  # springs, that no computer samples
+            if sprung:  # springs, that no computer samples
                 torque = np.where(passive, servo.springs(data.qpos[replay.place], rates), torque)
             speeds = replay.hand_speeds()
-            target_speed = replay.struck.speed(replay.target)
+            target_before = replay.target
             push = replay.push(speeds, step)
             force = push.force
             peak = max(peak, push.peak)
             replay.apply(torque, push.forces)
             replay.shove(t)
             touches.add(t, force, step, push.since)
-            saturated += step * bool(np.any(np.abs(demand) > servo.limit * (1 + 1e-9)))
+            saturated += step * saturates
             replay.place_target()
             impulses += step * push.forces
             left = replay.target if force > 0 else left
             kept = k % record == 0 or force > 0
             state = replay.state() if kept else None
-            moves = replay.sole_moves() if kept else None
+            corners = replay.corner_places() if kept else None
             mujoco.mj_step2(model, data)
             replay.besides.look(data, t)
             replay.look_at(gears, torque, push)
             if kept:
                 ground = replay.ground()
-                assert state is not None and moves is not None
-                rows.append(
-                    (
-                        t,
-                        *state,
-                        force,
-                        target_speed,
-                        float(speeds[0]),
-                        demand,
-                        torque,
-                        ground,
-                        *moves,
-                        gears.taken(),
-                    )
-                )
+                assert state is not None
+                contact = force, replay.struck.speed(target_before), float(speeds[0])
+                rows.append((t, *state, *contact, demand, torque, ground, corners, gears.taken()))
                 check_not_diverged(data.qvel, t, step)
-                fall = replay.fallen(replay.planned(t))
+                fall = replay.fallen(t)
                 if fall:
                     fall = f"{fall} at t = {t:.2f} s"
                     break

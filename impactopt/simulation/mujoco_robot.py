@@ -27,6 +27,7 @@ class MujocoRobot:
         self.mujoco, self.robot, self.world = mujoco_module(), robot, world
         self.data = self.mujoco.MjData(world)
         self.floating = robot.floating
+        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv  # a robot counts anew each time
         joints = [world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.place = np.array([joint.qposadr[0] for joint in joints])
@@ -34,7 +35,7 @@ class MujocoRobot:
         self._place = np.array([joint.idx_q for joint in own], dtype=np.intp)
         # a continuous joint's angle is (cosine, sine) in Pinocchio
         self._continuous = np.flatnonzero([joint.nq == 2 for joint in own])
-        self.sites = [world.site(striker).id for striker in strikers]
+        self.sites = np.array([world.site(striker).id for striker in strikers], dtype=np.intp)
         self._rows, self.along = np.zeros((3, world.nv)), np.zeros((len(strikers), world.nv))
 
     def put(self, q: Array, v: Array | None = None) -> None:
@@ -50,17 +51,17 @@ class MujocoRobot:
 
     def state(self) -> tuple[Array, Array]:
         """q (nq), v (nv)."""
-        d, robot = self.data, self.robot
-        q, v = np.zeros(robot.nq), np.zeros(robot.nv)
+        qpos, qvel = self.data.qpos, self.data.qvel
+        q, v = np.zeros(self._nq), np.zeros(self._nv)
         if self.floating:
-            q[:3], q[3:7] = d.qpos[:3], d.qpos[[4, 5, 6, 3]]
-            v[:3], v[3:6] = self.base_rotation().T @ d.qvel[:3], d.qvel[3:6]
-        angles = d.qpos[self.place]
+            q[:3], q[3:6], q[6] = qpos[:3], qpos[4:7], qpos[3]
+            v[:3], v[3:6] = self.base_rotation().T @ qvel[:3], qvel[3:6]
+        angles = qpos[self.place]
         q[self._place] = angles
         for k in self._continuous:
             at = self._place[k]
             q[at], q[at + 1] = np.cos(angles[k]), np.sin(angles[k])
-        v[-robot.n :] = d.qvel[self.dof]
+        v[-self._n :] = qvel[self.dof]
         return q, v
 
     def base_rotation(self) -> Array:
@@ -71,7 +72,7 @@ class MujocoRobot:
 
     def places(self) -> Array:
         """(h, 3) [m] of the striking points."""
-        return np.array(self.data.site_xpos[self.sites])
+        return np.asarray(self.data.site_xpos[self.sites])
 
     def speeds_along(self, normal: Array) -> Array:
         """Speeds (h,) [m/s] of the striking points along a normal (3,); leaves their rows in `along`."""
@@ -82,5 +83,6 @@ class MujocoRobot:
 
     def apply(self, torque: Array, forces: Array | float) -> None:
         """Torque (n) [N m] at the joints, and the contacts' forces (h,) [N], against the normal."""
-        self.data.qfrc_applied[:] = -np.atleast_1d(forces) @ self.along
-        self.data.qfrc_applied[self.dof] += torque
+        applied = self.data.qfrc_applied
+        applied[:] = -np.atleast_1d(forces) @ self.along
+        applied[self.dof] += torque

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 from impactopt.simulation.gears import GearWatch
-from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of, slip_and_lift
+from impactopt.simulation.histories import check_not_diverged, posture_error, simulation_of
 from impactopt.simulation.motors import CutWatch, Delay, Motors
 from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
@@ -120,12 +120,13 @@ class _World:
         out[:, 3:] += np.cross(self.body.places(), out[:, :3])
         return out
 
-    def corners(self) -> list[Array]:
-        """World places (k, 3) of each held sole's corners."""
-        return [
+    def corners(self) -> Array:
+        """World places (k, 3) of all held soles' corners."""
+        places = [
             np.column_stack([c, np.zeros(len(c))]) @ m.rotation.T + m.translation
             for m, c in zip(self.body.placements(), self.scene.corners, strict=False)  # then hands
         ]
+        return np.concatenate([np.zeros((0, 3)), *places])
 
     def step(self, t: float, s: _State, first: _Rates, h: float) -> _State:
         """A step of the midpoint rule from a state with its rates, under the contact's mean force in it.
@@ -190,7 +191,6 @@ def simulate_pinocchio(
     end = min(float(reference.end) + settle, until)
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
-    start: list[Array] | None = None
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
     for k in range(round(end / step)):
         t = k * step
@@ -206,11 +206,10 @@ def simulate_pinocchio(
         peak = max(peak, float(first.forces.sum()) if push is None else push.peak)
         gears.look(first.torque, first.a)
         if touches.touching or k % record == 0:
-            corners = world.corners()
-            start = corners if start is None else start
             motion = (state.q, state.v, float(first.forces.sum()), first.vt, first.hand_speed)
-            moves = slip_and_lift(corners, start)
-            rows.append((t, *motion, first.demand, first.torque, world.ground(), *moves, gears.taken()))
+            rows.append(
+                (t, *motion, first.demand, first.torque, world.ground(), world.corners(), gears.taken())
+            )
         if push is not None:  # the force of a contact that begins within the step jumps there
             gears.look(first.torque, world.body.accelerate(first.torque, push.peaks))
         before, state = state, world.step(t, state, first, step)

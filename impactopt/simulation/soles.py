@@ -34,15 +34,14 @@ def cop_margin(robot: Robot, scene: Scene, q: Array, sole_ground: Array) -> Arra
     model, data = robot.model, robot.model.createData()
     out = np.full(sole_ground.shape[:2], np.nan)
     frames = [model.getFrameId(name) for name in scene.soles]
+    wrenches = np.empty_like(sole_ground)
     for k, posture in enumerate(q if frames else ()):
         pin.forwardKinematics(model, data, posture)
         for i, frame in enumerate(frames):
             place = pin.updateFramePlacement(model, data, frame)
             # in the sole's own frame, so that a tilted sole's edges are its edges
-            out[k, i] = _inside(place.actInv(pin.Force(sole_ground[k, i])).vector, scene.corners[i])
+            wrenches[k, i] = place.actInv(pin.Force(sole_ground[k, i])).vector
+    for i, corners in enumerate(scene.corners):
+        out[:, i] = distance_inside(corners, centre_of_pressure(wrenches[:, i]))
     out[sole_ground[:, :, 2] < BEARS * weight_of(robot)] = np.nan
     return out
-
-
-def _inside(wrench: Array, corners: Array) -> float:
-    return float(distance_inside(corners, centre_of_pressure(wrench[None]))[0])

@@ -59,12 +59,16 @@ class Struck:
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.law, self.target = scene, scene.law, scene.target
-        self.points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
+        points = [scene.point, *([] if scene.second is None else [scene.second[1]])]
+        # as floats: of three of them, arrays would take several times as long
+        self._points, self._normal = [tuple(p.tolist()) for p in points], tuple(scene.normal.tolist())
         self.untouched: Array = np.zeros(self.target.n_states)
+        # read once: they are asked for in every step
+        self._law, self._target = self.law.parameters, self.target.parameters
 
     def speed(self, state: Array) -> float:
         """[m/s] of the hit surface along the normal."""
-        return float(self.target.velocity(state))
+        return float(self.target.velocity(state, self._target))
 
     def travel_at_start(self, reference: Any) -> float:
         """[m] that it has to go until contact is planned, below zero, as it moves before contact already."""
@@ -75,15 +79,13 @@ class Struck:
         """(h,) [m] of striking points at places (h, 3) [m] in a target that has gone so far [m]; beside its
         face minus infinity.
         """
-        return np.array(
-            [self._depth(at, point, travel) for at, point in zip(places, self.points, strict=True)]
-        )
-
-    def _depth(self, place: Array, point: Array, travel: float) -> float:
-        normal = self.scene.normal
-        way = place - point
-        along = float(normal @ way)
-        return -np.inf if np.linalg.norm(way - along * normal) > FACE else along - travel
+        depths, (nx, ny, nz) = [], self._normal
+        for (x, y, z), (px, py, pz) in zip(places.tolist(), self._points, strict=True):
+            dx, dy, dz = x - px, y - py, z - pz
+            along = nx * dx + ny * dy + nz * dz
+            across = (dx - along * nx) ** 2 + (dy - along * ny) ** 2 + (dz - along * nz) ** 2
+            depths.append(-np.inf if across > FACE**2 else along - travel)
+        return np.array(depths)
 
     def forces(self, depths: Array, speeds: Array, state: Array) -> Array:
         """Contact forces (h,) [N] of striking points so deep in the target [m], with speeds along the normal
@@ -91,11 +93,13 @@ class Struck:
         """
         rates = speeds - self.speed(state)
         pairs = zip(depths, rates, strict=True)
-        return np.array([float(self.law.force(depth, rate)) if depth > 0 else 0.0 for depth, rate in pairs])
+        force, numbers = self.law.force, self._law
+        return np.array([float(force(depth, rate, numbers)) if depth > 0 else 0.0 for depth, rate in pairs])
 
     def near(self, depths: Array, speeds: Array, state: Array, step: float) -> bool:
         """Whether any of them may touch the target within a step [s]."""
-        return bool(np.any(depths + NEAR * step * (np.abs(speeds - self.speed(state)) + 1.0) > 0))
+        speed, pairs = self.speed(state), zip(depths.tolist(), speeds.tolist(), strict=True)
+        return any(depth + NEAR * step * (abs(rate - speed) + 1.0) > 0 for depth, rate in pairs)
 
     def pushed(
         self,
@@ -123,7 +127,7 @@ class Struck:
 
         def rates(t: float, y: Array) -> list[float]:
             force, hands, target = forces(t, y)
-            moves = self.target.derivative(y[2 * h + 1 :], float(force.sum()))
+            moves = self.target.derivative(y[2 * h + 1 :], float(force.sum()), self._target)
             return [*(hands - target), *force, target, *moves]
 
         begin = np.concatenate([there, np.zeros(h + 1), state])
@@ -156,16 +160,18 @@ class Struck:
 
     def rates(self, state: Array, force: float) -> Array:
         """d(state)/dt (n_states,)."""
-        return np.array([float(rate) for rate in self.target.derivative(state, force)])
+        return np.array([float(rate) for rate in self.target.derivative(state, force, self._target)])
 
     def side(self, state: Array, force: float) -> tuple[bool, ...]:
         """On which side of each of its switches the target is."""
-        return tuple(float(switch) > 0 for switch in self.target.switches(state, force))
+        return tuple(float(switch) > 0 for switch in self.target.switches(state, force, self._target))
 
     def moved(self, state: Array, force: float, length: float) -> Array:
         """The state after a time [s] under one force, by Runge-Kutta's steps of order four: the swing of a
         board that has not broken does not grow by them.
         """
+        if not any(self.target.derivative(state, force, self._target)):
+            return state  # as it is before a blow
 
         def begin(_done: float, s: Array) -> Move[Array]:
             before = self.side(s, force)

@@ -109,6 +109,24 @@ def _margins(
     """What planning with margin costs in impulse, and what it buys in robustness, one option at a time."""
 
 
+@_command("feedback")
+def _feedback(
+    problems: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--problem", metavar="NAME", help="A problem's name or file; several times for several."
+        ),
+    ] = None,
+    draws: Draws = 50,
+    seed: Seed = 0,
+    workers: Workers = 2,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Resume from results/bench/feedback.jsonl.")
+    ] = False,
+) -> None:
+    """What feedback is worth to a plan: balance as stated and loosened, with servos and with a controller."""
+
+
 @_command("gains")
 def _gains(
     quick: Annotated[bool, typer.Option("--quick", help="The two arms only.")] = False,
@@ -289,6 +307,7 @@ def _all(
         "robustness": {"draws": draws, **drawn},
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
+        "feedback": {"problems": ["punch"], "draws": min(draws, FEW_DRAWS), **drawn},
         "models": {"quick": True},
         "moved": {"shifts": min(draws, FEW_DRAWS), "quick": True, "seed": seed},
         "fidelity": {"workers": workers, "quick": True},

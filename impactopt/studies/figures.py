@@ -34,6 +34,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "fig4": ("reproduce", "fig4"),
     "fig7": ("reproduce", "fig7"),
     "margins": ("bench", "margins"),
+    "feedback": ("bench", "feedback"),
     "fidelity": ("bench", "fidelity"),
     "virtual_base": ("bench", "virtual-base"),
     "collision": ("bench", "collision"),

@@ -21,6 +21,7 @@ BENCHES = {
     "replay": "replay",
     "baselines": "baselines",
     "margins": "margins",
+    "feedback": "feedback",
     "models": "models",
     "moved": "moved",
     "fidelity": "fidelity",

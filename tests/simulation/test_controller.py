@@ -18,7 +18,8 @@ from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco
-from impactopt.simulation.controller import WholeBodyController, controller_of
+from impactopt.simulation.controller import controller_of
+from impactopt.simulation.controller.cones import cone_of
 from impactopt.simulation.controller.estimate import StateEstimate
 from impactopt.simulation.controller.held import HeldDynamics
 from impactopt.simulation.controller.quadratic import TorqueQP
@@ -94,11 +95,10 @@ def test_torques_move_a_held_robot_by_its_equation_of_motion() -> None:
 @pytest.mark.parametrize("friction", [0.4, 0.9])
 def test_the_cone_holds_what_corners_can_bear(friction: float) -> None:
     """Forces at the corners inside their pyramids make wrenches inside; none pulls or turns more."""
-    robot = biped()
-    ref, where = still(robot)
+    _, where = still(biped())
     settings = replace(QUIET, friction=friction, cop_margin=0.0)
-    cone = WholeBodyController(robot, ref, where, settings).cones[0]
     random, corners = np.random.default_rng(1), where.corners[0]
+    cone = cone_of(corners, settings)
     at = np.column_stack([corners, np.zeros(len(corners))])
     for _ in range(50):
         force = random.random((len(at), 3))

@@ -37,8 +37,8 @@ def softness_picture(rows: Sequence[Row]) -> Picture:
         axes.set(xscale="log", xlabel="stiffness / that of the file", ylabel=label)
         axes.set_xticks(given, [f"{factor:g}" for factor in given], minor=False)
         axes.set_xticks([], minor=True)
-        axes.margins(y=0.1)
-        axes.set_ylim(bottom=0.0)
+        most = max((of(row) for row in solved if np.isfinite(of(row))), default=1.0)
+        axes.set_ylim(0.0, 1.08 * most)
     key = [Line2D([], [], marker="o", markersize=3, color=c, label=name) for name, c in colours.items()]
     star: Any = {"marker": "*", "markersize": 9, "linestyle": "", "color": "#555555"}
     key.append(Line2D([], [], label="chosen by the plan", **star))

@@ -7,6 +7,8 @@
 * target.py     what it tracks, by what it has felt of the blow
 * recovery.py   how it comes to rest after the blow
 * held.py       accelerations and sole wrenches as functions of the torques
+* cones.py      what wrenches soles can have, and where they are pressed
+* tasks.py      squared errors, weighed against each other
 * quadratic.py  its QP in OSQP, in place
 * whole_body.py the controller
 """

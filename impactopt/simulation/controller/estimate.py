@@ -24,7 +24,8 @@ class StateEstimate:
     """soles : frames of the model that stand.  q0 (nq,) : configuration in which they began to."""
 
     def __init__(self, robot: Robot, soles: tuple[str, ...], q0: Array) -> None:
-        self.robot, self.model = robot, robot.model
+        self.model, self.floating = robot.model, robot.floating
+        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv  # a robot counts anew each time
         self.data: Any = robot.model.createData()
         joints = list(robot.model.joints)[-robot.n :]
         self._place = np.array([joint.idx_q for joint in joints], dtype=np.intp)
@@ -37,14 +38,14 @@ class StateEstimate:
         """q (nq,), v (nv,).  loads (soles,) : weights;  points (soles, 3) [m] : of each sole, in its frame,
         that rests.
         """
-        robot, model, data = self.robot, self.model, self.data
-        q, v = np.zeros(robot.nq), np.zeros(robot.nv)
+        model, data = self.model, self.data
+        q, v = np.zeros(self._nq), np.zeros(self._nv)
         q[self._place] = measured.angles
         for k in self._continuous:
             at = self._place[k]
             q[at], q[at + 1] = np.cos(measured.angles[k]), np.sin(measured.angles[k])
-        v[-robot.n :] = measured.rates
-        if not robot.floating:
+        v[-self._n :] = measured.rates
+        if not self.floating:
             return q, v
         q[3:7] = pin.Quaternion(measured.rotation).coeffs()
         v[3:6] = measured.gyro

@@ -31,25 +31,29 @@ class HeldDynamics:
     """
 
     def __init__(self, robot: Robot, soles: tuple[str, ...], striker: str, normal: Array, q0: Array) -> None:
-        self.robot, self.model, self.normal = robot, robot.model, normal
+        self.model, self.normal = robot.model, normal
         self.data: Any = robot.model.createData()
         self._soles = [self.model.getFrameId(name) for name in soles]
         self._hand = self.model.getFrameId(striker)
         nv, n, rows = robot.nv, robot.n, 6 * len(soles)
-        self._left, self._right = np.zeros((nv + rows, nv + rows)), np.zeros((nv + rows, n + 3))
+        self._n, self._nv = n, nv
+        # as LAPACK has them, by columns
+        self._left = np.zeros((nv + rows, nv + rows), order="F")
+        self._right = np.zeros((nv + rows, n + 3), order="F")
         self._right[nv - n : nv, :n] = np.eye(n)
+        self._upper = np.triu(np.ones((nv, nv)), 1) + 0.5 * np.eye(nv)  # of H, half its diagonal
         self._none = np.zeros(nv)
         pin.framesForwardKinematics(self.model, self.data, q0)
         self._stood = [self.data.oMf[i].copy() for i in self._soles]
 
     def look(self, q: Array, v: Array, force: float = 0.0, bandwidth: float = 0.0) -> None:
         """Go to q (nq), v (nv), with a force [N] on the hand, against the normal."""
-        model, data, nv, n = self.model, self.data, self.robot.nv, self.robot.n
+        model, data, nv, n = self.model, self.data, self._nv, self._n
         left, right = self._left, self._right
         pin.forwardKinematics(model, data, q, v, self._none)
         pin.computeJointJacobians(model, data)
-        H = pin.crba(model, data, q)
-        left[:nv, :nv] = np.triu(H) + np.triu(H, 1).T
+        half = pin.crba(model, data, q) * self._upper
+        np.add(half, half.T, out=left[:nv, :nv])
         right[:nv, n] = -pin.nonLinearEffects(model, data, q, v)
         self.places = []
         for k, i in enumerate(self._soles):
@@ -60,8 +64,8 @@ class HeldDynamics:
             right[rows, n] = -pin.getFrameClassicalAcceleration(model, data, i, _AXES).vector
             at, stood = self.places[-1], self._stood[k]
             turned = pin.log3(at.rotation @ stood.rotation.T)
-            away = np.concatenate([at.translation - stood.translation, turned])
-            away[[0, 1, 5]] = 0.0  # a sole that has slid stays where it is
+            away = np.zeros(6)  # a sole that has slid stays where it is
+            away[2], away[3:5] = at.translation[2] - stood.translation[2], turned[:2]
             right[rows, n + 2] = -(bandwidth**2) * away - 2 * bandwidth * (J @ v)
         pin.updateFramePlacement(model, data, self._hand)
         self.hand = np.reshape(pin.getFrameJacobian(model, data, self._hand, _AXES), (6, nv))[:3]

@@ -30,13 +30,15 @@ class TorqueQP:
 
     def __init__(self, n: int, m: int, *, iterations: int) -> None:
         self.n, self.m = n, m
-        self._rows = np.ones((m + n, n))
-        self._upper = np.full(m, ENDLESS)
+        # by columns, as OSQP has them; those of the bounds are an upper triangle
+        self._columns = np.zeros((n, m + n))
+        self._there = np.hstack([np.ones((n, m), dtype=bool), np.tril(np.ones((n, n), dtype=bool))])
+        self._lower, self._upper = np.zeros(m + n), np.full(m + n, ENDLESS)
         self._solver: Any = osqp.OSQP()
         self._solver.setup(
             sp.identity(n, format="csc"),
             np.zeros(n),
-            sp.csc_matrix(self._rows),
+            sp.csc_matrix(self._there.T.astype(float)),
             np.full(m + n, -ENDLESS),
             np.full(m + n, ENDLESS),
             scaling=0,
@@ -53,16 +55,13 @@ class TorqueQP:
         """x (n,), inside its bounds."""
         root, _ = dpotrf(P, lower=1, clean=1)
         inverse, _ = dtrtri(root, lower=1)
-        back, rows, m = inverse.T, self._rows, self.m
-        np.matmul(C, back, out=rows[:m])
-        rows[m:] = back
-        scale = 1.0 / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), LEAST)
-        rows *= scale[:, None]
-        self._solver.update(
-            Ax=rows.ravel(order="F"),
-            q=inverse @ q,
-            l=np.concatenate([c, low]) * scale,
-            u=np.concatenate([self._upper, high * scale[m:]]),
-        )
-        x = back @ np.array(self._solver.solve(raise_error=False).x)
-        return np.clip(x, low, high)
+        columns, m = self._columns, self.m
+        np.matmul(inverse, C.T, out=columns[:, :m])
+        columns[:, m:] = inverse
+        scale = 1.0 / np.maximum(np.sqrt(np.einsum("ij,ij->j", columns, columns)), LEAST)
+        columns *= scale
+        self._lower[:m], self._lower[m:] = c, low
+        self._upper[m:] = high * scale[m:]
+        self._solver.update(Ax=columns[self._there], q=inverse @ q, l=self._lower * scale, u=self._upper)
+        x = inverse.T @ self._solver.solve(raise_error=False).x
+        return np.minimum(np.maximum(x, low), high)

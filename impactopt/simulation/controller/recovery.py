@@ -7,7 +7,6 @@ edges.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,16 +51,17 @@ class Recovery:
     def of(self, aim: Aim, rate: float, gain: float) -> Aim:
         """The plan's at this rate and second rate, shifted, with the centre of mass at its place."""
         com, momentum = aim.com, aim.momentum
-        rates = np.array([rate * com[1], rate**2 * com[2] + gain * com[1]])
-        rates[:, :2] = 0.0
-        return replace(
-            aim,
+        com_aim = np.zeros((3, 3))
+        com_aim[0, :2] = self.place
+        com_aim[:, 2] = com[0, 2], rate * com[1, 2], rate**2 * com[2, 2] + gain * com[1, 2]
+        return Aim(
             q=np.array(pin.integrate(self.model, aim.q, self.shift)),
             v=rate * aim.v,
             a=rate**2 * aim.a + gain * aim.v,
             torque=np.zeros_like(aim.torque),
-            com=np.vstack([[*self.place, com[0, 2]], rates]),
+            com=com_aim,
             momentum=np.array([rate * momentum[0], rate**2 * momentum[1] + gain * momentum[0]]),
+            hand=aim.hand,
         )
 
 

@@ -52,13 +52,13 @@ class Sensors:
 
     def read(self, angles: Array, v: Array, rotation: Array, force: float) -> Measured:
         """Of a robot with joint angles (n,), velocity v (nv,) and base rotation (3, 3)."""
-        s, normal = self.noise, self._random.standard_normal
-        off = pin.exp3(s * (self._tilt + FLUTTER * normal(3)))
-        gyro = v[3:6] if len(v) >= self.n + 6 else np.zeros(3)
+        s, n, drawn = self.noise, self.n, self._random.standard_normal(7 + 2 * self.n)
+        off = pin.exp3(s * (self._tilt + FLUTTER * drawn[:3]))
+        gyro = v[3:6] if len(v) >= n + 6 else np.zeros(3)
         return Measured(
-            angles=angles + s * ENCODER * normal(self.n),
-            rates=v[-self.n :] + s * self._rate * normal(self.n),
+            angles=angles + s * ENCODER * drawn[3 : 3 + n],
+            rates=v[-n:] + s * self._rate * drawn[3 + n : 3 + 2 * n],
             rotation=off @ rotation,
-            gyro=gyro + s * (self._bias + self._gyro * normal(3)),
-            force=force + s * HAND_FORCE * normal(),
+            gyro=gyro + s * (self._bias + self._gyro * drawn[-4:-1]),
+            force=force + s * HAND_FORCE * float(drawn[-1]),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,8 @@ class Target:
     def __init__(
         self, robot: Robot, reference: Any, striker: str, *, spread: bool, recovery: Recovery | None = None
     ) -> None:
-        self.robot, self.model, self.spread, self.recovery = robot, robot.model, spread, recovery
+        self.model, self.spread, self.recovery = robot.model, spread, recovery
+        self._n, self._nv = robot.n, robot.nv
         self.time = np.asarray(reference.time)
         self.q, self.v = np.asarray(reference.q), np.asarray(reference.v)
         self.contact = float(reference.contact_start), float(reference.contact_end)
@@ -69,37 +71,37 @@ class Target:
 
     def feel(self, t: float, touching: bool) -> None:
         """What the hand feels at a time [s]."""
-        if touching and np.isnan(self.felt):
+        if touching and self.before:
             self.felt = t
-        elif not touching and np.isfinite(self.felt) and np.isnan(self.free):
+        elif not touching and self.struck:
             self.free = t
 
     @property
     def before(self) -> bool:
         """Whether the hand has felt nothing yet."""
-        return bool(np.isnan(self.felt))
+        return math.isnan(self.felt)
 
     @property
     def bounced(self) -> bool:
         """Whether the hand was in contact, and is free again."""
-        return bool(np.isfinite(self.free))
+        return math.isfinite(self.free)
 
     @property
     def struck(self) -> bool:
         """Whether the hand is in contact, for the first time."""
-        return bool(np.isfinite(self.felt) and np.isnan(self.free))
+        return math.isfinite(self.felt) and math.isnan(self.free)
 
     def near_blow(self, t: float, window: float) -> bool:
         """Whether the blow is on, or within a window [s] of it."""
-        if np.isfinite(self.felt):
-            return bool(np.isnan(self.free) or t < self.free + window)
+        if math.isfinite(self.felt):
+            return math.isnan(self.free) or t < self.free + window
         return bool(self.contact[0] - window <= t <= self.contact[1] + window)
 
     @property
     def over(self) -> float:
         """[s] when the blow is over, at the latest; nan: the hand has felt nothing yet."""
         start, end = self.contact
-        return self.free if np.isfinite(self.free) else self.felt + 2 * (end - start) + PATIENCE
+        return self.free if math.isfinite(self.free) else self.felt + 2 * (end - start) + PATIENCE
 
     def recovers(self, t: float) -> bool:
         """Whether the robot recovers from the blow."""
@@ -110,7 +112,7 @@ class Target:
         end, final = self.contact[1], len(self.time) - 1
         if not self.spread:
             return t, final
-        if np.isfinite(self.felt):
+        if math.isfinite(self.felt):
             return (t, self.last) if t < self.over else (end + t - self.over, final)
         return (t, self.last) if t < end + PATIENCE else (t, final)
 
@@ -132,9 +134,9 @@ class Target:
         f = min(f, 1.0)
         row = (1 - f) * self.rows[i] + f * self.rows[i + 1]
         q = pin.interpolate(self.model, self.q[i], self.q[i + 1], f)
-        n, nv = self.robot.n, self.robot.nv
+        n, nv = self._n, self._nv
         v, a, torque = row[:nv], row[nv : 2 * nv], row[2 * nv : 2 * nv + n]
-        com, momentum, hand = np.split(row[2 * nv + n :], [9, 15])
+        com, momentum, hand = row[2 * nv + n : -15], row[-15:-9], row[-9:]
         if beyond:  # the motion before the blow coasts on
             q = pin.integrate(self.model, q, beyond * v)
             com = np.concatenate([com[:3] + beyond * com[3:6], com[3:]])

@@ -118,7 +118,7 @@ def _data(
     }
     if soles:
         part = mass / 90.0  # bounds that fit TALOS, which has 90 kg on soles 12 cm wide
-        width = min(float(np.ptp(sole.polygon[:, 1])) for sole in soles)
+        width = min(float(np.ptp(sole.polygon, axis=0).min()) for sole in soles)
         margin = round(float(np.clip(0.15 * width, 0.005, 0.02)), 3)
         data["terms"] = {
             "contact_wrench_cone": {

@@ -383,6 +383,7 @@ def test_every_field_of_what_a_file_describes_has_a_key() -> None:
         *sections.ObjectiveSection.model_fields,
     }
     keys |= {*sections.CollisionSection.model_fields, "law", "collision_elements", *kinds[FreeMass].apart}
+    keys |= set(robot_sections.RobotSection.model_fields) & {"gains"}  # [[robot.gains]]
     assert {f.name for f in dataclasses.fields(ImpactProblem)} <= keys
 
 

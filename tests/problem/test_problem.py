@@ -60,8 +60,8 @@ def nothing_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any, **__: Any) -> Any:
         raise AssertionError("functions are being built")
 
-    monkeypatch.setattr(codegen, "cached", refuse)
-    monkeypatch.setattr("impactopt.transcription.transcription.cached", refuse)
+    monkeypatch.setattr(codegen, "cached_groups", refuse)
+    monkeypatch.setattr("impactopt.transcription.transcription.cached_groups", refuse)
 
 
 def problem(robot: Robot, **changes: Any) -> ImpactProblem:

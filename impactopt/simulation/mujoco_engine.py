@@ -307,7 +307,7 @@ def simulate_mujoco(
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
-    sprung = bool(passive.any())
+    undriven = bool(passive.any())
     drive: Array | None = None  # torque of the motors
     gears = GearWatch(robot)
     # given to the target [N s] by each striker, and its state when it was last touched
@@ -336,7 +336,7 @@ def simulate_mujoco(
                 cuts.look(t, wanted, cut, step)
             drive = cut if drive is None else drive
             torque, drive = motors.mean(drive, cut, step), motors.after(drive, cut, step)
-            if sprung:  # springs, that no computer samples
+            if undriven:  # springs, that no computer samples
                 torque = np.where(passive, servo.springs(data.qpos[replay.place], rates), torque)
             speeds = replay.hand_speeds()
             target_before = replay.target

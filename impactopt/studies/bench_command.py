@@ -36,6 +36,10 @@ Out = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="DIR", help="Write numbers and pictures there.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Problems = Annotated[
+    list[str] | None,
+    typer.Option("--problem", metavar="NAME", help="A problem's name or file; several times for several."),
+]
 Draws = Annotated[int, typer.Option(min=1, help="Replays under drawn perturbations.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draws.")]
 Workers = Annotated[int, typer.Option(min=1, help="Processes that replay.")]
@@ -111,12 +115,7 @@ def _margins(
 
 @_command("feedback")
 def _feedback(
-    problems: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--problem", metavar="NAME", help="A problem's name or file; several times for several."
-        ),
-    ] = None,
+    problems: Problems = None,
     draws: Draws = 50,
     seed: Seed = 0,
     workers: Workers = 2,
@@ -136,12 +135,7 @@ def _gains(
 
 @_command("machine")
 def _machine(
-    problems: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--problem", metavar="NAME", help="A problem's name or file; several times for several."
-        ),
-    ] = None,
+    problems: Problems = None,
     limits: Annotated[
         list[str] | None,
         typer.Option("--limit", metavar="N", help="Of gears over torque limits, or 'none'; for all five."),
@@ -156,12 +150,7 @@ def _machine(
 
 @_command("softness")
 def _softness(
-    problems: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--problem", metavar="NAME", help="A problem's name or file; several times for several."
-        ),
-    ] = None,
+    problems: Problems = None,
     joints: Annotated[
         list[str] | None,
         typer.Option("--joint", metavar="NAME", help="Whose stiffness: a name or pattern; may be repeated."),

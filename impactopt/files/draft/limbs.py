@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -93,8 +94,8 @@ def legs_of(model: pin.Model, pieces: Mapping[int, tuple[Piece, ...]]) -> tuple[
     pin.forwardKinematics(model, data, pin.neutral(model))
 
     def heights(joint: int) -> Array:
-        found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
-        return np.concatenate(found or [np.zeros(1)]) + data.oMi[joint].translation[2]
+        found = _heights(data, pieces, joint)
+        return found if found.size else data.oMi[joint].translation[2:]
 
     everywhere = np.concatenate([heights(j) for j in range(1, model.njoints)])
     lowest, tall = float(everywhere.min()), float(np.ptp(everywhere))
@@ -123,8 +124,7 @@ def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Pi
     pin.forwardKinematics(model, data, pin.neutral(model))
 
     def low(joint: int) -> float:
-        found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
-        return float(np.concatenate(found).min() + data.oMi[joint].translation[2]) if found else np.inf
+        return float(_heights(data, pieces, joint).min(initial=np.inf))
 
     out = []
     for own in map(list, unshared(legs)):
@@ -137,7 +137,7 @@ def toes(model: pin.Model, legs: tuple[Limb, ...], pieces: Mapping[int, tuple[Pi
     return out
 
 
-def unshared(legs: tuple[Limb, ...]) -> list[tuple[int, ...]]:
+def unshared(legs: Sequence[Limb]) -> list[tuple[int, ...]]:
     """Of each leg the joints that lead to no other one."""
     others = [{j for other in legs if other is not leg for j in other.path} for leg in legs]
     return [tuple(j for j in leg.path if j not in of) for leg, of in zip(legs, others, strict=True)]
@@ -150,6 +150,12 @@ def renumbered(limb: Limb, old: pin.Model, new: pin.Model) -> Limb:
         return tuple(int(new.getJointId(old.names[j])) for j in joints)
 
     return Limb(path=at(limb.path), own=at(limb.own))
+
+
+def _heights(data: Any, pieces: Mapping[int, tuple[Piece, ...]], joint: int) -> Array:
+    """[m] of the corners of what a joint moves, where the data (pin.Data) have it; none: it has no shapes."""
+    found = [p.vertices @ data.oMi[joint].rotation[2] for p in pieces.get(joint, ())]
+    return np.concatenate([np.zeros(0), *found]) + data.oMi[joint].translation[2]
 
 
 def _is_head(model: pin.Model, limb: Limb) -> bool:

@@ -40,7 +40,7 @@ def half_sitting(robot: Robot, legs: Sequence[Limb], soles: Sequence[Sole], forw
     pin.framesForwardKinematics(model, data, neutral)
     turn = np.column_stack([forward, np.cross([0.0, 0.0, 1.0], forward), [0.0, 0.0, 1.0]])
     straight = [np.array(data.oMf[model.getFrameId(s.frame)].translation) for s in soles]
-    chains = unshared(tuple(legs))
+    chains = unshared(legs)
     hips = [np.array(data.oMi[own[0]].translation) for own in chains]
     aside = [float(spot @ turn[:, 1]) for spot in straight]
     length = float(np.mean([_path(robot, own[1:]) for own in chains]))

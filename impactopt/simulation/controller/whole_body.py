@@ -85,7 +85,7 @@ class WholeBodyController:
         self.felt = 0.0  # [N] at the hand, filtered
         self.springs = Servo(robot, reference).springs
         # what motors steer: springs are not followed, nor where a tool swings on them
-        self.passive, self.hangs = robot.passive, bool(robot.passive.any())
+        self.passive, self.undriven = robot.passive, bool(robot.passive.any())
         self.sprung = bool(robot.sprung.any())
         self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
@@ -105,7 +105,7 @@ class WholeBodyController:
         self.target.feel(t, measured.force > TOUCH)
         aim = self.target.at(t + ahead)
         self.held.look(q, rates, self.felt, s.sole_bandwidth)
-        if self.hangs:
+        if self.undriven:
             angles = self.robot.joint_positions(q)
             self.held.pulled(self.passive, self.springs(angles, rates[-self.n :]))
         x = self._solve(t, q, rates, aim)[:-1]

@@ -16,6 +16,7 @@ first of a leg of seven, a waist that leads to both legs. A hand that holds on i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -24,6 +25,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.kinematics.closing import Closing
 from impactopt.kinematics.fixed_order import Index, elimination_order, solve_in_order
 from impactopt.robots.checks import LEG, check_arms, check_legs
 from impactopt.robots.hinges import check_held
@@ -305,6 +307,11 @@ class StanceCoordinates:
         return self._embed(base, of_independent, ca.vertcat(*leg_tau))
 
     # ------------------------------------------------------------------ numeric
+    @cached_property
+    def closing(self) -> Closing:
+        """What closes the legs, in numbers."""
+        return Closing(self)
+
     def split(self, q_pin: Array) -> tuple[Array, Array]:
         """(y, legs) of a pin configuration."""
         q = self.rb.from_pin(q_pin)
@@ -317,83 +324,23 @@ class StanceCoordinates:
         joints[self.independent], joints[self.dependent] = y[self.base :], legs
         return self.rb.to_pin(np.concatenate([y[: self.base], joints]))
 
-    def solve_legs(self, y: Array, guess: Array, *, tolerance: float = 1e-12, iterations: int = 50) -> Array:
+    def solve_legs(self, y: Array, guess: Array) -> Array:
         """Leg joints (nl,) that put every held sole in its place; Newton from ``guess``.
 
         Raises InputError if a sole cannot be reached.
         """
-        legs = np.array(guess, dtype=float)
-        model, data = self.model, self.data
-        for _ in range(iterations):
-            q = self.join(y, legs)
-            pin.computeJointJacobians(model, data, q)
-            worst = 0.0
-            for k, leg in enumerate(self.legs):
-                fid = model.getFrameId(leg.frame)
-                m = pin.updateFramePlacement(model, data, fid)
-                error = pin.log6(m.actInv(leg.placement)).vector
-                worst = max(worst, float(np.abs(error).max()))
-                jac = pin.getFrameJacobian(model, data, fid, pin.LOCAL)[:, self.base + leg.joints]
-                step = np.linalg.solve(jac.T @ jac + 1e-12 * np.eye(6), jac.T @ error)
-                legs[6 * k : 6 * k + 6] += np.clip(step, -0.3, 0.3)
-            if worst < tolerance:
-                return legs
-        if worst < 1e-6:
-            return legs
-        raise InputError(
-            f"the legs cannot hold the soles in place here (off by {worst:.2g} m or rad): the base is out of "
-            "the legs' reach"
-        )
+        return self.closing.legs(y, guess)
 
     def sole_jacobians(self, q: Array) -> tuple[Array, list[Any]]:
         """Jacobians of the held soles, stacked (6 a sole, nv), and their placements, at a pin configuration.
 
         The Jacobians are in each sole's own frame, the placements in the world.
         """
-        model, data = self.model, self.data
-        pin.computeJointJacobians(model, data, q)
-        pin.updateFramePlacements(model, data)
-        ids = [model.getFrameId(leg.frame) for leg in self.legs]
-        jac = np.vstack(
-            [np.zeros((0, model.nv)), *[pin.getFrameJacobian(model, data, i, pin.LOCAL) for i in ids]]
-        )
-        return jac, [data.oMf[i].copy() for i in ids]
+        jac = self.closing.jacobians(q)
+        pin.updateFramePlacements(self.model, self.data)
+        return jac, [self.data.oMf[self.model.getFrameId(leg.frame)].copy() for leg in self.legs]
 
     def complete_motion(self, y: Array, yd: Array, ydd: Array, legs: Array) -> tuple[Array, Array, Array]:
         """pin q, v, a of independent coordinates and rates; the legs' part is from the soles' constraint."""
-        model, data, b = self.model, self.data, self.base
-        q = self.join(y, legs)
-        v, a = np.zeros(model.nv), np.zeros(model.nv)
-        if b:
-            v[:6], a[:6] = base_motion(y[:6], yd[:6], ydd[:6])
-        v[b + self.independent], a[b + self.independent] = yd[b:], ydd[b:]
-        if self.legs:
-            columns = b + self.dependent
-            jac, _ = self.sole_jacobians(q)
-            block = jac[:, columns]
-            v[columns] = np.linalg.solve(block, -jac @ v)
-            pin.forwardKinematics(model, data, q, v, a)
-            drift = np.concatenate(
-                [
-                    pin.getFrameAcceleration(model, data, model.getFrameId(leg.frame), pin.LOCAL).vector
-                    for leg in self.legs
-                ]
-            )
-            a[columns] = np.linalg.solve(block, -drift)
+        q, v, a, _ = self.closing.motion(y, yd, ydd, legs)
         return q, v, a
-
-
-def base_motion(y: Array, yd: Array, ydd: Array) -> tuple[Array, Array]:
-    """Free-flyer velocity and acceleration (6,), in its own frame, of (p, roll, pitch, yaw) and rates.
-
-    The numeric twin of the symbolic map.
-    """
-    rotation = pin.rpy.rpyToMatrix(y[3:6])
-    jac = pin.rpy.computeRpyJacobian(y[3:6], pin.LOCAL)
-    omega = jac @ yd[3:6]
-    alpha = jac @ ydd[3:6] + pin.rpy.computeRpyJacobianTimeDerivative(y[3:6], yd[3:6], pin.LOCAL) @ yd[3:6]
-    linear = rotation.T @ yd[:3]
-    # body components of a vector that turns with the base: d/dt (R' pdot) = R' pddot - omega x (R' pdot)
-    return np.concatenate([linear, omega]), np.concatenate(
-        [rotation.T @ ydd[:3] - np.cross(omega, linear), alpha]
-    )

@@ -182,7 +182,9 @@ class Solution(Solved):
     @cached_property
     def missed_trajectory(self) -> Trajectory:
         """The servo's reference if nothing is hit; InputError if the plan has no abort motion."""
-        return self.plan.trajectory(missed=True)
+        return self.plan.trajectory(
+            missed=True, known=self.trajectory if self.plan.abort is not None else None
+        )
 
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.

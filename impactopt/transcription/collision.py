@@ -27,7 +27,8 @@ from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import CollocationPoint
 from impactopt.transcription.nodes import add_cone_rows
 from impactopt.transcription.phases import pulls_apart, switches
-from impactopt.transcription.plan import PlannedCollision, total_ground_wrench
+from impactopt.transcription.plan import PlannedCollision
+from impactopt.transcription.reference import total_ground_wrench
 from impactopt.transcription.rows import Measure, Place, along, by_leg, percent, rates
 
 

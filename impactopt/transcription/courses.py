@@ -11,7 +11,7 @@ from impactopt.kinematics.statics import static_wrenches
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.motion_phase import MotionPhase
-from impactopt.transcription.plan import complete_reference
+from impactopt.transcription.reference import complete_reference
 from impactopt.transcription.rows import Place
 
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from impactopt.kinematics.support import margin, zmp
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
-from impactopt.transcription.plan import Plan, complete_reference
+from impactopt.transcription.plan import Plan
 from impactopt.transcription.planned_loads import gear_share
+from impactopt.transcription.reference import complete_reference
 
 Array = NDArray[np.float64]
 _SHARE = 0.5  # of a margin that may be given up between nodes

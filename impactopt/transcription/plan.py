@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
@@ -18,6 +17,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
+from impactopt.transcription.reference import complete_reference
 
 Array = NDArray[np.float64]
 
@@ -209,10 +209,18 @@ class Plan:
             )
         return self.abort, self.contact_start + after, self.follow_nodes, self.abort_wrench
 
-    def trajectory(self, *, step: float = 1e-3, hold: float = 0.5, missed: bool = False) -> Trajectory:
+    def trajectory(
+        self,
+        *,
+        step: float = 1e-3,
+        hold: float = 0.5,
+        missed: bool = False,
+        known: Trajectory | None = None,
+    ) -> Trajectory:
         """The servo's reference about every ``step`` [s], until ``hold`` [s] after the motion's end.
 
         missed : the reference of a robot that hits nothing: the same until it notices, then the abort motion.
+        known : the other reference of this plan with this step, if it is known: their swing is the same.
 
         Legs by inverse kinematics, so that the soles are where they are held; feed-forward by inverse
         dynamics under the planned sole wrenches, corrected to balance the base exactly between the nodes.
@@ -226,7 +234,11 @@ class Plan:
         parts: list[tuple[Any, ...]] = []
         for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
             times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
-            rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
+            if phase == 0 and known is not None:
+                own = known.phase == 0
+                rows: tuple[Array, ...] = known.q[own], known.v[own], known.a[own], known.torque[own], known.ground[own]
+            else:
+                rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
             parts.append((phase, times, *rows))
             legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
@@ -315,12 +327,9 @@ class Plan:
     def closed(self, y: Array) -> Array:
         """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""
         c = self.coordinates
-        legs = c.split(self.problem.start_posture)[1]
-        q = np.zeros((len(y), self.problem.robot.nq))
-        for k, row in enumerate(y):
-            legs = c.solve_legs(row, legs)
-            q[k] = c.join(row, legs)
-        return q
+        legs = c.closing.follow(y, c.split(self.problem.start_posture)[1])
+        q = [c.join(row, leg) for row, leg in zip(y, legs, strict=True)]
+        return np.array(q).reshape(len(y), self.problem.robot.nq)
 
     def margins(
         self, trajectory: Trajectory | None = None, collision: PlannedCollision | None = None
@@ -349,52 +358,3 @@ class Plan:
                 if len(g)
             }
         return out
-
-
-def complete_reference(
-    problem: ImpactProblem, y: Array, yd: Array, ydd: Array, wrench: Array, legs: Array
-) -> tuple[Array, ...]:
-    """Rows of q (nq), v (nv), a (nv), torque (n) [N m] and ground wrench (6).
-
-    y, yd, ydd (k, ny) are independent coordinates, rates and second rates. wrench (k, 6 a sole) is corrected
-    as little as it takes to balance the base and hinges of soles; legs (nl,) starts their inverse kinematics.
-    """
-    c, robot = problem.coordinates, problem.robot
-    model, data = robot.model, robot.model.createData()
-    n = len(y)
-    q, v, a = np.zeros((n, model.nq)), np.zeros((n, model.nv)), np.zeros((n, model.nv))
-    torque, ground = np.zeros((n, robot.n)), np.zeros((n, 6))
-    # least correction of the interpolated wrenches, moments dear: the soles share the load as planned
-    scale = np.array([1, 1, 1, 10, 10, 10] * len(c.legs))
-    for k in range(n):
-        legs = c.solve_legs(y[k], legs)
-        q[k], v[k], a[k] = c.complete_motion(y[k], yd[k], ydd[k], legs)
-        tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
-        if c.legs:
-            jac, place = c.sole_jacobians(q[k])
-            base = jac[:, c.undriven].T / scale
-            miss = tau[c.undriven] - jac[:, c.undriven].T @ wrench[k]
-            w = wrench[k] + base.T @ np.linalg.solve(base @ base.T, miss) / scale
-            tau = tau - jac.T @ w
-            ground[k] = _about_origin(place[: len(c.soles)], w)
-        torque[k] = tau[c.base :]
-    return q, v, a, torque, ground
-
-
-def _about_origin(placements: list[pin.SE3], wrenches: Array) -> Array:
-    """Sum of sole wrenches (each in its sole's frame) as one wrench about the world's origin, world axes."""
-    total = np.zeros(6)
-    for k, m in enumerate(placements):
-        f = m.rotation @ wrenches[6 * k : 6 * k + 3]
-        total[:3] += f
-        total[3:] += m.rotation @ wrenches[6 * k + 3 : 6 * k + 6] + np.cross(m.translation, f)
-    return total
-
-
-def total_ground_wrench(coordinates: StanceCoordinates, wrenches: Array) -> Array:
-    """(k, 6) ground wrenches about the world's origin of (k, 6 a sole) sole wrenches.
-
-    The soles are where they are held. What hands hold on to is not the ground.
-    """
-    placements = [leg.placement for leg in coordinates.legs if leg.sole is not None]
-    return np.array([_about_origin(placements, w) for w in wrenches])

@@ -32,8 +32,9 @@ def plan_loads(robot: Robot, plan: Plan, hits: Sequence[PlannedCollision]) -> li
     targets.
     """
     expected, *others = hits
-    motions = (False, True) if plan.abort is not None else (False,)
-    ways = [plan.trajectory(step=STEP, hold=STEP, missed=missed) for missed in motions]
+    ways = [plan.trajectory(step=STEP, hold=STEP)]
+    if plan.abort is not None:
+        ways.append(plan.trajectory(step=STEP, hold=STEP, missed=True, known=ways[0]))
     out = [motion_loads(robot, way, expected) for way in ways]
     still = np.zeros(robot.nv)
     return out + [strike_loads(robot, still, still, hit) for hit in others]

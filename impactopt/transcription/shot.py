@@ -19,7 +19,8 @@ from impactopt.transcription.contacts import Contacts
 from impactopt.transcription.drives import ContactEnd, DrivePoint, still
 from impactopt.transcription.guess import natural_durations
 from impactopt.transcription.layout import Affine, Array, stack
-from impactopt.transcription.plan import PlannedCollision, PlannedScenario, total_ground_wrench
+from impactopt.transcription.plan import PlannedCollision, PlannedScenario
+from impactopt.transcription.reference import total_ground_wrench
 from impactopt.transcription.rows import Index, Measure, Place, percent
 from impactopt.transcription.shooting import FORCE, INSTANTS, Shooting, horizon_of, shot_block
 

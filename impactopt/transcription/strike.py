@@ -25,8 +25,8 @@ from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.motion_phase import at_node
 from impactopt.transcription.nodes import add_nodes
 from impactopt.transcription.objective import Prices, wrench_prices
-from impactopt.transcription.plan import total_ground_wrench
 from impactopt.transcription.planned_strike import PlannedStrike
+from impactopt.transcription.reference import total_ground_wrench
 from impactopt.transcription.rows import Measure, Place, along, by_leg
 from impactopt.transcription.shot import Shots
 from impactopt.transcription.touch import add_touch_rows

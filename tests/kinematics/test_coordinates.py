@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from support.small_robots import arm, biped
 
 from impactopt.errors import InputError
-from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
+from impactopt.kinematics.closing import base_motion
+from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.fixed_order import elimination_order, solve_in_order
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.kinematics.statics import static_wrenches

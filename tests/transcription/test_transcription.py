@@ -25,7 +25,7 @@ from impactopt.problem.terms import ContactWrenchCone, Incidence, TorqueLimit, V
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Status, check_program
 from impactopt.transcription.mesh import collision_mesh, with_middles
-from impactopt.transcription.plan import total_ground_wrench
+from impactopt.transcription.reference import total_ground_wrench
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.touch import rotation_rows
 from impactopt.transcription.transcription import Transcription

@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.collision.settings import REFERENCE_ORDER, no_bend
 from impactopt.errors import InputError, check_array
-from impactopt.kinematics.coordinates import StanceCoordinates, base_motion
+from impactopt.kinematics.closing import base_motion
+from impactopt.kinematics.coordinates import StanceCoordinates
 
 __all__ = ["coasting_reference"]
 

@@ -236,7 +236,13 @@ class Plan:
             times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
             if phase == 0 and known is not None:
                 own = known.phase == 0
-                rows: tuple[Array, ...] = known.q[own], known.v[own], known.a[own], known.torque[own], known.ground[own]
+                rows: tuple[Array, ...] = (
+                    known.q[own],
+                    known.v[own],
+                    known.a[own],
+                    known.torque[own],
+                    known.ground[own],
+                )
             else:
                 rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
             parts.append((phase, times, *rows))

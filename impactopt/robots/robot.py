@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from os import PathLike, fspath
 from typing import Any
 
@@ -253,25 +254,25 @@ class Robot:
         """One line: its model and arrays would fill pages."""
         return f"<Robot {self.name!r}: {self.n} joints, strikes with {', '.join(self.strikers) or 'nothing'}>"
 
-    @property
+    @cached_property
     def floating(self) -> bool:
         """Whether the root is a free-flyer."""
         return build.is_floating(self.model)
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of joints, the free-flyer left out."""
         return int(self.model.nv) - (6 if self.floating else 0)
 
-    @property
+    @cached_property
     def nq(self) -> int:
         return int(self.model.nq)
 
-    @property
+    @cached_property
     def nv(self) -> int:
         return int(self.model.nv)
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         return build.joint_names(self.model)
 
@@ -282,9 +283,7 @@ class Robot:
 
     @property
     def gear_limit(self) -> Array:
-        """(n,) What the gears bear in a blow, over the torque limit: their momentary peak, or 2 where that is
-        not known; inf where there is no gear.
-        """
+        """(n,) What gears bear in a blow, over the torque limit: their peak, else 2; inf: there is no gear."""
         known = numbers_of(self.actuators, "momentary_torque") / self.torque_limit
         limit = np.where(np.isnan(known), MOMENTARY_PEAK, known)
         return read_only(np.where(self.passive, np.inf, limit))

@@ -7,7 +7,6 @@ feed-forward), the robot's numbers and the scene's.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Any
 
@@ -88,7 +87,7 @@ class _Replay(MujocoRobot):
         """What the servo follows from now on."""
         world = self.perturbation
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
-        self.reference_q = np.asarray(reference.q)
+        self.reference_q, self.over = np.asarray(reference.q), float(reference.contact_end)
         if self.floating:
             self.upright = _upright(self.reference_q[:, 3:7].T)
 
@@ -211,29 +210,32 @@ class _Replay(MujocoRobot):
 
     def fallen(self, t: float) -> str:
         """Whether the base is far from where the reference has it at a time [s]: a plan may bow deeply
-        itself.
+        itself. A robot that recovers comes through what the reference has after the blow later.
         """
         if not self.floating:
             return ""
-        row = max(int(np.searchsorted(self.servo.time, t, side="right")) - 1, 0)
-        height, lean, planned = self.data.qpos[2], self.base_error(row), self.reference_q[row, 2]
+        times = self.servo.time
+        row = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
+        late = self.wbc is not None and self.wbc.target.recovers(t)
+        since = min(int(np.searchsorted(times, self.over)), row) if late else row
+        lean = float(self.base_errors(slice(since, row + 1)).min())
+        height, planned = self.data.qpos[2], float(self.reference_q[since : row + 1, 2].min())
         if lean > FALLEN_TILT:
             return f"fell: the base leans {lean:.1f} rad from where it should be"
         if height < (1 - FALLEN_DROP) * planned:
             return f"fell: the base is {height:.2f} m high where it should be {planned:.2f} m"
         return ""
 
-    def base_error(self, row: int) -> float:
-        """Angle [rad] between the verticals of the base and of the reference's configuration in a row."""
+    def base_errors(self, rows: slice) -> Array:
+        """Angles [rad] between the verticals of the base and of the reference's configurations in rows."""
         w, x, y, z = self.data.qpos[3:7].tolist()
-        cosine = float(self.upright[row] @ _upright((x, y, z, w)))
-        return math.acos(min(max(cosine, -1.0), 1.0))
+        return np.arccos(np.clip(self.upright[rows] @ _upright((x, y, z, w)), -1.0, 1.0))
 
     def not_standing(self, sole_ground: Array, weight: float) -> str:
         """Why the robot does not stand at the end, "" if it does."""
         if not self.floating:
             return ""
-        lean, speed = self.base_error(-1), float(np.linalg.norm(self.data.qvel[:3]))
+        lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
         if lean > LEANS:
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STIRS:

@@ -27,7 +27,7 @@ class MujocoRobot:
         self.mujoco, self.robot, self.world = mujoco_module(), robot, world
         self.data = self.mujoco.MjData(world)
         self.floating = robot.floating
-        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv  # a robot counts anew each time
+        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv
         joints = [world.joint(name) for name in robot.joint_names]
         self.dof = np.array([joint.dofadr[0] for joint in joints])
         self.place = np.array([joint.qposadr[0] for joint in joints])

@@ -26,6 +26,8 @@ from impactopt.simulation.controller.quadratic import TorqueQP
 from impactopt.simulation.controller.recovery import Recovery
 from impactopt.simulation.controller.sensors import Sensors
 from impactopt.simulation.controller.target import Target
+from impactopt.simulation.mujoco_engine import _Replay
+from impactopt.simulation.mujoco_world import MujocoOptions
 
 Array = NDArray[np.float64]
 QUIET = ControllerSettings(noise=0.0)
@@ -299,3 +301,26 @@ def test_a_problem_file_has_its_settings() -> None:
     assert changed.controller == replace(usual, rate=500.0, impact="spread")
     with pytest.raises(InputError, match="capture_gain"):
         read_problem_file("arm_planar", {"controller.capture_gain": -1.0})
+
+
+def test_who_recovers_comes_late_through_what_is_planned_and_has_not_fallen() -> None:
+    """A plan that bows by 1 rad after the blow is up again when a slower robot still bows."""
+    robot = biped()
+    ref, where = still(robot)
+    q0 = np.asarray(ref.q[0])
+    bow, back = q0.copy(), q0.copy()
+    for q, angle in ((bow, 1.0), (back, -1.0)):
+        q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.0, angle, 0.0)).coeffs()
+    ref.time = np.array([0.0, 0.6, 1.0, 1.5, 3.0])
+    ref.q = np.array([q0, q0, bow, q0, q0])
+    ref.v = ref.a = np.zeros((5, robot.nv))
+    ref.torque = np.zeros((5, robot.n))
+    replay = _Replay(robot, ref, where, Perturbation(), MujocoOptions(1e-3, 100, 1e-10), QUIET)
+    assert replay.wbc is not None
+    replay.start(bow)
+    assert replay.fallen(2.0).startswith("fell"), "nothing was hit: it is due upright"
+    replay.wbc.target.feel(0.55, True)
+    replay.wbc.target.feel(0.6, False)
+    assert replay.fallen(2.0) == ""
+    replay.start(back)
+    assert replay.fallen(2.0).startswith("fell"), "nobody planned that"

@@ -25,7 +25,7 @@ class StateEstimate:
 
     def __init__(self, robot: Robot, soles: tuple[str, ...], q0: Array) -> None:
         self.model, self.floating = robot.model, robot.floating
-        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv  # a robot counts anew each time
+        self._n, self._nq, self._nv = robot.n, robot.nq, robot.nv
         self.data: Any = robot.model.createData()
         joints = list(robot.model.joints)[-robot.n :]
         self._place = np.array([joint.idx_q for joint in joints], dtype=np.intp)

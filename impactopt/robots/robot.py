@@ -283,7 +283,7 @@ class Robot:
 
     @property
     def gear_limit(self) -> Array:
-        """(n,) What gears bear in a blow, over the torque limit: their peak, else 2; inf: there is no gear."""
+        """(n,) Gears' peak in a blow over the torque limit, 2 where not known; inf: there is no gear."""
         known = numbers_of(self.actuators, "momentary_torque") / self.torque_limit
         limit = np.where(np.isnan(known), MOMENTARY_PEAK, known)
         return read_only(np.where(self.passive, np.inf, limit))

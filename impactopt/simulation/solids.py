@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 __all__ = ["FLOOR", "Solid", "Solids", "Touched"]
 
@@ -37,6 +40,15 @@ class Solid:
     of_target: bool = False
     moves: bool = False
     before: bool = False
+
+    @cached_property
+    def hull(self) -> Any:
+        """Of its vertices, as coal has it."""
+        assert self.vertices is not None
+        points, facets = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        points.extend(list(self.vertices))
+        facets.extend([coal.Triangle(*map(int, facet)) for facet in ConvexHull(self.vertices).simplices])
+        return coal.Convex(points, facets)
 
     def ball(self) -> tuple[Array, float]:
         """Centre (3,) and radius [m] of a ball about it, in its frame."""
@@ -70,13 +82,41 @@ class Solids:
 
     def near(self, model: Any, reference: Any) -> tuple[tuple[int, int], ...]:
         """Those pairs that can come near when the robot follows a reference: time (k,), q (k, nq)."""
-        data, time = model.createData(), np.asarray(reference.time)
+        time = np.asarray(reference.time)
         chosen = np.searchsorted(time, np.arange(time[0], time[-1] + LOOK, LOOK)).clip(0, len(time) - 1)
+        return self.near_at(model, np.asarray(reference.q)[chosen])
+
+    def links_between(self, model: Any, moves: Array) -> Solids:
+        """With the pairs of links alone that change their distance when velocities move (nv,): all but 0."""
+        moving = {j for j in range(2, model.njoints) if np.any(_own(model.joints[j], moves))}
+        paths = [moving.intersection(model.supports[solid.joint]) for solid in self.solids]
+        links = [k for k, solid in enumerate(self.solids) if solid.vertices is not None]
+        chosen = [p for p in self.pairs if set(p) <= set(links) and paths[p[0]] != paths[p[1]]]
+        return replace(self, pairs=tuple(chosen))
+
+    def apart(self, model: Any, q: Array) -> Array:
+        """(k,) [m] between the two links that are nearest to each other in configurations q (k, nq), by their
+        hulls; < 0 in each other, inf where none come near.
+        """
+        near = self.near_at(model, q)
+        data, asked, out = model.createData(), coal.DistanceRequest(), np.full(len(q), np.inf)
+        for i, posture in enumerate(q):
+            pin.forwardKinematics(model, data, posture)
+            at = {k: _placed(data.oMi[self.solids[k].joint]) for pair in near for k in pair}
+            for one, other in near:
+                found, shapes = coal.DistanceResult(), (self.solids[one].hull, self.solids[other].hull)
+                coal.distance(shapes[0], at[one], shapes[1], at[other], asked, found)
+                out[i] = min(out[i], found.min_distance)
+        return out
+
+    def near_at(self, model: Any, q: Array) -> tuple[tuple[int, int], ...]:
+        """Those pairs that can come near in configurations q (k, nq)."""
+        data = model.createData()
         balls = [s.ball() for s in self.solids]
         radius = np.array([r for _, r in balls])
-        centre = np.zeros((len(chosen), len(balls), 3))
-        for i, k in enumerate(chosen):
-            pin.forwardKinematics(model, data, np.asarray(reference.q[k]))
+        centre = np.zeros((len(q), len(balls), 3))
+        for i, posture in enumerate(q):
+            pin.forwardKinematics(model, data, posture)
             for n, (solid, (middle, _)) in enumerate(zip(self.solids, balls, strict=True)):
                 centre[i, n] = data.oMi[solid.joint].act(middle)
         out = []
@@ -115,3 +155,11 @@ class Touched:
             "depth_mm": 1e3 * self.depth,
         }
         return out if self.force is None else {**out, "force_N": self.force}
+
+
+def _own(joint: Any, moves: Array) -> Array:
+    return moves[joint.idx_v : joint.idx_v + joint.nv]
+
+
+def _placed(place: Any) -> Any:
+    return coal.Transform3s(place.rotation, place.translation)

@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 STEPS = 30  # of Gauss-Newton, from the plan's last posture
 LARGEST = 0.2  # [rad] of one
 SMALLEST = 1e-3  # singular value that counts, of the largest
+PARTS = (1.0, 0.75, 0.5, 0.25)  # of the shift, the most that keeps links apart
+CLEAR = 3e-3  # [m] between links
+LOOK = 0.05  # [s] at which that is looked at
 BRAKING = 0.15  # [s] from the plan's pace to the slower one
 _AXES = pin.LOCAL_WORLD_ALIGNED
 
@@ -38,8 +41,10 @@ class Recovery:
         self.model, self.start, self.pace = robot.model, settings.recovery_start, settings.recovery_pace
         last = np.asarray(reference.q[-1])
         q = _moved(robot, last, np.asarray(reference.q[0]), scene, settings.recovery_margin)
+        shift = np.array(pin.difference(self.model, last, q))
+        self.shift = shift * _clear_part(self.model, reference, scene, shift)
+        q = pin.integrate(self.model, last, self.shift)
         self.place = np.array(pin.centerOfMass(self.model, self.model.createData(), q)[:2])
-        self.shift = np.array(pin.difference(self.model, last, q))
 
     def clock(self, since: float) -> tuple[float, float, float]:
         """How far the plan goes on [s] in a time since the recovery began, and the first and second rate."""
@@ -63,6 +68,22 @@ class Recovery:
             momentum=np.array([rate * momentum[0], rate**2 * momentum[1] + gain * momentum[0]]),
             hand=aim.hand,
         )
+
+
+def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float:
+    """How much of a shift (nv,) of the postures after the blow leaves links as far apart as planned, or by
+    `CLEAR`: legs that shift the body may bring thighs together.
+    """
+    time, postures = np.asarray(reference.time), np.asarray(reference.q)
+    looked = np.arange(float(reference.contact_end), float(time[-1]) + LOOK, LOOK)
+    q = postures[np.searchsorted(time, looked).clip(0, len(time) - 1)]
+    links = scene.solids.links_between(model, shift)
+    least = np.minimum(links.apart(model, q), CLEAR)
+    for part in PARTS:
+        moved = np.array([pin.integrate(model, row, part * shift) for row in q])
+        if np.all(links.apart(model, moved) >= least):
+            return part
+    return 0.0
 
 
 def _inside(scene: Scene, com: Array, margin: float) -> Array:

@@ -97,14 +97,14 @@ class _Replay(MujocoRobot):
         if self.wbc is not None:
             self.wbc.miss(reference)
 
-    def asked(self, t: float, force: float) -> tuple[Array, Array]:
+    def asked(self, t: float, forces: Array) -> tuple[Array, Array]:
         """Torque demand (n,) [N m] at a time [s], and what saturation leaves of it."""
         d = self.data
         if self.wbc is None:
             return self.servo.torque(t, d.qpos[self.place], d.qvel[self.dof])
         _, v = self.state()
         rotation = self.base_rotation() if self.floating else np.eye(3)
-        demand = self.wbc.torque(t, d.qpos[self.place], v, rotation, force)
+        demand = self.wbc.torque(t, d.qpos[self.place], v, rotation, forces)
         return demand, np.clip(demand, -self.servo.limit, self.servo.limit)
 
     def start(self, q: Array) -> None:
@@ -286,11 +286,6 @@ def simulate_mujoco(
     """
     if not step > 0:
         raise InputError(f"the step of the simulation is {step} s; give a number > 0")
-    if controller is not None and (scene.hands or scene.second):
-        raise InputError(
-            "the whole-body controller has one hand that strikes, and none that holds on: take "
-            "controller='servo'"
-        )
     world = perturbation if perturbation is not None else Perturbation()
     solver = MujocoOptions(step, iterations, tolerance)
     replay = _Replay(robot, reference, scene, world, solver, controller)
@@ -304,7 +299,7 @@ def simulate_mujoco(
     lag = round(wait / step)
     # what the servo tells the motors, and what reaches them: demand, and what saturation leaves of it
     told, reached = np.zeros((2, robot.n)), np.zeros((2, robot.n))
-    force = 0.0
+    force, forces = 0.0, np.zeros(len(scene.strikers))
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
@@ -322,7 +317,7 @@ def simulate_mujoco(
                 replay.miss(missed)
                 servo, missed = replay.servo, None
             if k % hold == 0:
-                asked = replay.asked(t, force)
+                asked = replay.asked(t, forces)
                 # at rest before the start, it asked for the same
                 waiting.append((k + lag if k else 0, asked))
             while waiting and waiting[0][0] <= k:
@@ -343,7 +338,7 @@ def simulate_mujoco(
             speeds = replay.hand_speeds()
             target_before = replay.target
             push = replay.push(speeds, step)
-            force = push.force
+            forces, force = push.forces, push.force
             peak = max(peak, push.peak)
             replay.apply(torque, push.forces)
             replay.shove(t)

@@ -77,8 +77,8 @@ def test_torques_move_a_held_robot_by_its_equation_of_motion() -> None:
     robot = biped()
     ref, where = still(robot)
     q = np.asarray(ref.q[0])
-    held = HeldDynamics(robot, where.soles, where.striker, where.normal, q)
-    held.look(q, np.zeros(robot.nv), force=40.0)
+    held = HeldDynamics(robot, where.soles, where.strikers, where.normal, q)
+    held.look(q, np.zeros(robot.nv), forces=40.0)
     torque = 20 * np.sin(np.arange(robot.n))
     a, wrench = held.A @ torque + held.a0, held.B @ torque + held.b0
     model, data = robot.model, robot.model.createData()
@@ -127,20 +127,20 @@ def test_the_state_is_known_exactly_without_errors_of_sensors() -> None:
     robot = biped()
     ref, where = still(robot)
     q0 = np.asarray(ref.q[0])
-    held = HeldDynamics(robot, where.soles, where.striker, where.normal, q0)
+    held = HeldDynamics(robot, where.soles, where.strikers, where.normal, q0)
     held.look(q0, np.zeros(robot.nv))
     v = 0.1 * (
         held.A @ np.sin(np.arange(robot.n))
     )  # accelerations of a held robot are velocities of one, too
     rotation = pin.Quaternion(q0[3:7]).toRotationMatrix()
     measured = Sensors(robot, noise=0.0, rate=1000.0, seed=1).read(
-        robot.joint_positions(q0), v, rotation, 7.0
+        robot.joint_positions(q0), v, rotation, np.array([7.0])
     )
     points = np.array([[0.05, 0.02, 0.0], [-0.03, 0.0, 0.0]])
     q, rates = StateEstimate(robot, where.soles, q0).of(measured, np.array([1.0, 3.0]), points)
     np.testing.assert_allclose(q, q0, atol=1e-12)
     np.testing.assert_allclose(rates, v, atol=1e-12)
-    assert measured.force == 7.0
+    assert measured.forces.tolist() == [7.0]
 
 
 def test_errors_of_sensors_are_of_their_seed() -> None:
@@ -149,7 +149,7 @@ def test_errors_of_sensors_are_of_their_seed() -> None:
 
     def read(seed: int) -> Array:
         sensors = Sensors(robot, noise=1.0, rate=1000.0, seed=seed)
-        return sensors.read(robot.joint_positions(q), v, np.eye(3), 0.0).angles
+        return sensors.read(robot.joint_positions(q), v, np.eye(3), np.zeros(1)).angles
 
     assert np.array_equal(read(1), read(1))
     assert not np.array_equal(read(1), read(2))
@@ -170,7 +170,7 @@ def test_the_motion_before_the_blow_coasts_on_until_the_hand_is_free() -> None:
         contact_start=0.5,
         contact_end=0.6,
     )
-    target = Target(robot, ref, "striker:hand", spread=True)
+    target = Target(robot, ref, ("striker:hand",), spread=True)
     target.feel(0.55, True)  # later than planned
     late = target.at(0.64)
     np.testing.assert_allclose(late.v, v0)
@@ -232,7 +232,7 @@ def test_the_recovery_begins_after_the_blow_and_goes_on_from_where_the_plan_is()
     ref = bowed(robot, where, still_ref)
     settings = replace(QUIET, recovery_start=0.1, recovery_margin=0.0)
     recovery = Recovery(robot, ref, where, settings)
-    target = Target(robot, ref, where.striker, spread=True, recovery=recovery)
+    target = Target(robot, ref, where.strikers, spread=True, recovery=recovery)
     assert not target.recovers(5.0)  # nothing was hit
     target.feel(0.2, True)
     target.feel(0.4, False)  # 0.1 s later than planned

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Aim:
     """q (nq,), v, a (nv,), torque (n,); com, its rate and acceleration (3,) each, momentum: angular about it,
-    and its rate; hand: place, rate and acceleration (3,) of the striking point.
+    and its rate; hands (h, 3, 3): place, rate and acceleration of each striking point.
     """
 
     q: Array
@@ -24,4 +24,4 @@ class Aim:
     torque: Array
     com: Array
     momentum: Array
-    hand: Array
+    hands: Array

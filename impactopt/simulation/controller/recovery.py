@@ -40,8 +40,10 @@ class Recovery:
     def __init__(self, robot: Robot, reference: Any, scene: Scene, settings: ControllerSettings) -> None:
         self.model, self.start, self.pace = robot.model, settings.recovery_start, settings.recovery_pace
         last = np.asarray(reference.q[-1])
-        q = _moved(robot, last, np.asarray(reference.q[0]), scene, settings.recovery_margin)
-        shift = np.array(pin.difference(self.model, last, q))
+        shift = np.zeros(robot.nv)
+        if not scene.hands:  # they would be torn off
+            q = _moved(robot, last, np.asarray(reference.q[0]), scene, settings.recovery_margin)
+            shift = np.array(pin.difference(self.model, last, q))
         self.shift = shift * _clear_part(self.model, reference, scene, shift)
         q = pin.integrate(self.model, last, self.shift)
         self.place = np.array(pin.centerOfMass(self.model, self.model.createData(), q)[:2])
@@ -66,7 +68,7 @@ class Recovery:
             torque=np.zeros_like(aim.torque),
             com=com_aim,
             momentum=np.array([rate * momentum[0], rate**2 * momentum[1] + gain * momentum[0]]),
-            hand=aim.hand,
+            hands=aim.hands,
         )
 
 

@@ -29,14 +29,14 @@ GYRO_BIAS = np.deg2rad(10.0 / 3600)  # [rad/s]
 @dataclass(frozen=True)
 class Measured:
     """angles, rates (n,) of the joints; rotation (3, 3) of the base, and its angular velocity (3,) in its own
-    axes [rad/s]; force [N] against the normal, at the hand.
+    axes [rad/s]; forces (h,) [N] against the normal, at each striking point.
     """
 
     angles: Array
     rates: Array
     rotation: Array
     gyro: Array
-    force: float
+    forces: Array
 
 
 class Sensors:
@@ -50,15 +50,15 @@ class Sensors:
         # a difference of two counts; half the rate is the bandwidth
         self._rate, self._gyro = np.sqrt(2) * ENCODER * rate, GYRO_DENSITY * np.sqrt(rate / 2)
 
-    def read(self, angles: Array, v: Array, rotation: Array, force: float) -> Measured:
-        """Of a robot with joint angles (n,), velocity v (nv,) and base rotation (3, 3)."""
-        s, n, drawn = self.noise, self.n, self._random.standard_normal(7 + 2 * self.n)
+    def read(self, angles: Array, v: Array, rotation: Array, forces: Array) -> Measured:
+        """Of a robot with joint angles (n,), velocity v (nv,), base rotation (3, 3) and forces (h,)."""
+        s, n, drawn = self.noise, self.n, self._random.standard_normal(6 + 2 * self.n + len(forces))
         off = pin.exp3(s * (self._tilt + FLUTTER * drawn[:3]))
         gyro = v[3:6] if len(v) >= n + 6 else np.zeros(3)
         return Measured(
             angles=angles + s * ENCODER * drawn[3 : 3 + n],
             rates=v[-n:] + s * self._rate * drawn[3 + n : 3 + 2 * n],
             rotation=off @ rotation,
-            gyro=gyro + s * (self._bias + self._gyro * drawn[-4:-1]),
-            force=force + s * HAND_FORCE * float(drawn[-1]),
+            gyro=gyro + s * (self._bias + self._gyro * drawn[3 + 2 * n : 6 + 2 * n]),
+            forces=forces + s * HAND_FORCE * drawn[6 + 2 * n :],
         )

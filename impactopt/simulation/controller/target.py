@@ -29,30 +29,37 @@ class Target:
     """
 
     def __init__(
-        self, robot: Robot, reference: Any, striker: str, *, spread: bool, recovery: Recovery | None = None
+        self,
+        robot: Robot,
+        reference: Any,
+        strikers: tuple[str, ...],
+        *,
+        spread: bool,
+        recovery: Recovery | None = None,
     ) -> None:
         self.model, self.spread, self.recovery = robot.model, spread, recovery
         self._n, self._nv = robot.n, robot.nv
         self.time = np.asarray(reference.time)
         self.q, self.v = np.asarray(reference.q), np.asarray(reference.v)
         self.contact = float(reference.contact_start), float(reference.contact_end)
-        data = self.model.createData()
-        self.rows = np.array([self._row(data, reference, k, striker) for k in range(len(self.time))])
+        data, frames = self.model.createData(), [self.model.getFrameId(name) for name in strikers]
+        self.rows = np.array([self._row(data, reference, k, frames) for k in range(len(self.time))])
         self.felt = self.free = np.nan  # [s] when the hand began and ceased to feel a force
         jump = np.flatnonzero(np.diff(self.time) == 0)
         after = jump[self.time[jump] >= self.contact[1] - 1e-9]
         self.last = int(after[0]) if after.size else len(self.time) - 1  # of the motion before
 
-    def _row(self, data: Any, r: Any, k: int, striker: str) -> Array:
+    def _row(self, data: Any, r: Any, k: int, frames: list[int]) -> Array:
         model = self.model
         q, v, a = r.q[k], r.v[k], r.a[k]
         pin.computeCentroidalMomentumTimeVariation(model, data, q, v, a)
         mass = max(float(pin.computeTotalMass(model)), 1e-9)
         h, dh = data.hg, data.dhg
-        i = model.getFrameId(striker)
-        at = pin.updateFramePlacement(model, data, i).translation
-        rate = pin.getFrameVelocity(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear
-        gain = pin.getFrameClassicalAcceleration(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear
+        hands = []
+        for i in frames:
+            hands.append(pin.updateFramePlacement(model, data, i).translation)
+            hands.append(pin.getFrameVelocity(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear)
+            hands.append(pin.getFrameClassicalAcceleration(model, data, i, pin.LOCAL_WORLD_ALIGNED).linear)
         com = data.com[0]
         parts = (
             v,
@@ -63,9 +70,7 @@ class Target:
             dh.linear / mass,
             h.angular,
             dh.angular,
-            at,
-            rate,
-            gain,
+            *hands,
         )
         return np.concatenate(parts)
 
@@ -136,9 +141,11 @@ class Target:
         q = pin.interpolate(self.model, self.q[i], self.q[i + 1], f)
         n, nv = self._n, self._nv
         v, a, torque = row[:nv], row[nv : 2 * nv], row[2 * nv : 2 * nv + n]
-        com, momentum, hand = row[2 * nv + n : -15], row[-15:-9], row[-9:]
+        rest = row[2 * nv + n :]
+        com, momentum, hands = rest[:9], rest[9:15], rest[15:].reshape(-1, 3, 3)
         if beyond:  # the motion before the blow coasts on
             q = pin.integrate(self.model, q, beyond * v)
             com = np.concatenate([com[:3] + beyond * com[3:6], com[3:]])
-            hand = np.concatenate([hand[:3] + beyond * hand[3:6], hand[3:]])
-        return Aim(q, v, a, torque, com.reshape(3, 3), momentum.reshape(2, 3), hand.reshape(3, 3))
+            hands = hands.copy()
+            hands[:, 0] += beyond * hands[:, 1]
+        return Aim(q, v, a, torque, com.reshape(3, 3), momentum.reshape(2, 3), hands)

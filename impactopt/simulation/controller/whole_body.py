@@ -58,31 +58,32 @@ class WholeBodyController:
         self.robot, self.scene, self.settings, self.kp, self.kd = robot, scene, settings, kp, kd
         self.limit = limit * robot.torque_limit
         self.sensors = Sensors(robot, noise=settings.noise, rate=settings.rate, seed=settings.seed)
-        self.held = HeldDynamics(robot, scene.soles, scene.striker, scene.normal, np.asarray(reference.q[0]))
+        q0 = np.asarray(reference.q[0])
+        self.held = HeldDynamics(robot, scene.soles, scene.strikers, scene.normal, q0, holding=scene.hands)
         self.data: Any = robot.model.createData()
         self.mass = float(pin.computeTotalMass(robot.model))
         self.weight = 9.81 * max(self.mass, 1e-9)
-        n, soles = robot.n, len(scene.soles)
+        n, soles, held = robot.n, len(scene.soles), len(scene.soles) + len(scene.hands)
         self.n, self.gravity = n, np.array(robot.model.gravity.linear)
         self.balances = robot.floating and soles > 0
         self.cones = Cones(scene.corners, settings, n, self.weight)
-        self.tasks = Tasks(n, robot.nv + 3 + 6 * self.balances + 6 * soles)
+        self.tasks = Tasks(n, robot.nv + 3 * len(scene.strikers) + 6 * self.balances + 6 * held)
         self.qp = TorqueQP(n + 1, self.cones.m, iterations=settings.iterations)
         self.low, self.high = -np.ones(n + 1), np.ones(n + 1)
         self.low[n], self.high[n] = 0.0, 1e3
         # of a wrench's parts over the weight, and of rates of momentum
-        self.share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), soles) / self.weight
+        self.share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), held) / self.weight
         self.moves = np.repeat([settings.com, settings.angular_momentum], 3)
         # from wrenches to what they make: the momentum's rate over the mass
-        self.lift = np.tile(np.eye(6), soles) / max(self.mass, 1e-9)
+        self.lift = np.tile(np.eye(6), held) / max(self.mass, 1e-9)
         self.seconds: list[float] = []
         stands = robot.floating and bool(scene.soles) and settings.follow == "recover"
         recovery = Recovery(robot, reference, scene, settings) if stands else None
-        self.target = Target(robot, reference, scene.striker, spread=settings.spreads, recovery=recovery)
-        self.estimate = StateEstimate(robot, scene.soles, np.asarray(reference.q[0]))
+        self.target = Target(robot, reference, scene.strikers, spread=settings.spreads, recovery=recovery)
+        self.estimate = StateEstimate(robot, scene.soles, q0)
         self.loads, self.points = np.ones(soles), np.zeros((soles, 3))
         self.acceleration = np.zeros(robot.nv)
-        self.felt = 0.0  # [N] at the hand, filtered
+        self.felt = np.zeros(len(scene.strikers))  # [N] at the hands, filtered
         self.springs = Servo(robot, reference).springs
         # what motors steer: springs are not followed, nor where a tool swings on them
         self.passive, self.undriven = robot.passive, bool(robot.passive.any())
@@ -91,18 +92,18 @@ class WholeBodyController:
 
     def miss(self, reference: Any) -> None:
         """What it tracks from now on, as it has hit nothing."""
-        self.target = Target(self.robot, reference, self.scene.striker, spread=False)
+        self.target = Target(self.robot, reference, self.scene.strikers, spread=False)
 
-    def torque(self, t: float, angles: Array, v: Array, rotation: Array, force: float) -> Array:
+    def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:
         """Torque demand (n,) [N m] at a time [s], from what the sensors make of the true state."""
         s = self.settings
-        measured = self.sensors.read(angles, v, rotation, force)
+        measured = self.sensors.read(angles, v, rotation, forces)
         q, rates = self.estimate.of(measured, self.loads, self.points)
         ahead = s.delay
         q = pin.integrate(self.robot.model, q, ahead * rates)
         rates = rates + ahead * self.acceleration
-        self.felt += (1 - math.exp(-s.period / FILTER)) * (measured.force - self.felt)
-        self.target.feel(t, measured.force > TOUCH)
+        self.felt += (1 - math.exp(-s.period / FILTER)) * (measured.forces - self.felt)
+        self.target.feel(t, bool((measured.forces > TOUCH).any()))
         aim = self.target.at(t + ahead)
         self.held.look(q, rates, self.felt, s.sole_bandwidth)
         if self.undriven:
@@ -124,15 +125,15 @@ class WholeBodyController:
         lag = aim.v - v
         rate_error = lag[-n:]
         if s.projects and self.target.near_blow(t, WINDOW):
-            row = self.scene.normal @ held.hand
-            lag = lag - held.recoil * (row @ lag) / (row @ held.recoil)
+            rows = self.scene.normal @ held.hands
+            lag = lag - held.recoil @ dgesv(rows @ held.recoil, rows @ lag)[2]
         A, B = held.A * self.limit, held.B * self.limit  # of torques over their limits
         tasks.begin()
         if not struck:
             w = s.recovery_bandwidth if recovers else s.posture_bandwidth
             wanted = aim.a + self.kp * w**2 * off + self.kd * 2 * w * lag
             tasks.add(s.posture * self.steered, A, held.a0 - wanted)
-        self._hand(off, lag, aim, A, recovers)
+        self._hands(off, lag, aim, A, recovers)
         rate, lift = np.zeros(6), self.lift
         if self.balances:
             rate = self._momentum(q, v, lag, aim, B, recovers)
@@ -152,27 +153,30 @@ class WholeBodyController:
         P.flat[: n * (n + 1) : n + 2] += effort
         g[:n] -= effort * feed
         P[n, n], g[n] = SQUARE, PRICE
-        C, c = self.cones.look(held.places, B, held.b0)
+        soles = 6 * len(self.scene.soles)
+        C, c = self.cones.look(held.places[: len(self.scene.soles)], B[:soles], held.b0[:soles])
         begun = time.process_time()
         x = self.qp.solve(P, g, C, c, self.low, self.high)
         self.seconds.append(time.process_time() - begun)
         return x
 
-    def _hand(self, off: Array, lag: Array, aim: Aim, A: Array, recovers: bool) -> None:
-        """Rows of the striking point."""
+    def _hands(self, off: Array, lag: Array, aim: Aim, A: Array, recovers: bool) -> None:
+        """Rows of the striking points."""
         held, s, w = self.held, self.settings, self.settings.hand_bandwidth
-        weight, hand, away, gain = 0.0, held.hand, aim.hand[0] - held.hand_place, aim.hand[2]
-        if self.target.before:
-            weight = s.hand
-        if self.sprung:
-            swing, hand = hand * (1.0 - self.steered), hand * self.steered
-            away, gain = away - swing @ off, gain - swing @ aim.a
-            if self.target.bounced and not recovers:
-                # a tool swings on in a soft grip, and would touch again
-                weight, away = s.hand, away - s.draw_back * self.scene.normal
-        if weight:
+        back = self.sprung and self.target.bounced and not recovers
+        if not (self.target.before or back):
+            return
+        for hand, place, drift, goal in zip(
+            held.hands, held.hand_places, held.hand_drift, aim.hands, strict=True
+        ):
+            away, gain = goal[0] - place, goal[2]
+            if self.sprung:
+                swing, hand = hand * (1.0 - self.steered), hand * self.steered
+                away, gain = away - swing @ off, gain - swing @ aim.a
+            if back:  # a tool swings on in a soft grip, and would touch again
+                away = away - s.draw_back * self.scene.normal
             wanted = gain + self.kp * w**2 * away + self.kd * 2 * w * (hand @ lag)
-            self.tasks.add(weight, hand @ A, hand @ held.a0 + held.hand_drift - wanted)
+            self.tasks.add(s.hand, hand @ A, hand @ held.a0 + drift - wanted)
 
     def _momentum(self, q: Array, v: Array, lag: Array, aim: Aim, B: Array, recovers: bool) -> Array:
         """Rows of the centre of mass and of the angular momentum, whose rates are the soles' wrenches.

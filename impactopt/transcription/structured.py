@@ -203,11 +203,10 @@ def derivative_functions(
     else:
         out, jac, hess = _through(z, out, lam, *through)
     hess = ca.tril(hess)
-    opts = {"cse": True}
     return [
-        ca.Function(name, [z, p], [out], opts),
-        ca.Function(f"{name}_jac", [z, p], [jac], opts),
-        ca.Function(f"{name}_hess", [z, p, lam], [hess], opts),
+        ca.Function(name, [z, p], [out]),
+        ca.Function(f"{name}_jac", [z, p], [jac]),
+        ca.Function(f"{name}_hess", [z, p, lam], [hess]),
     ]
 
 

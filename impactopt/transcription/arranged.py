@@ -92,7 +92,11 @@ def arranged(function: ca.Function, known: Collection[int]) -> Arranged | None:
     done = {*kinds.tolist()} - {_LOAD, _STORE}
     return Arranged(
         words[:length].copy(),
-        frozenset(done | ({SUM_OF_PRODUCT, PRODUCT_LESS, LESS_PRODUCT} if ca.OP_MUL in done else set())),
+        frozenset(
+            done
+            | {ca.OP_ASSIGN}
+            | ({SUM_OF_PRODUCT, PRODUCT_LESS, LESS_PRODUCT} if ca.OP_MUL in done else set())
+        ),
         constants,
         int(places[0]),
     )

@@ -8,6 +8,7 @@ through (`impactopt.transcription.arranged`): a compiler has the loops to compil
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
 import numpy as np
@@ -116,48 +117,53 @@ _LOOPS = """static void run(const place *p, const place *stop, vec *v) {
 _LITERAL = [chr(k) if k < 128 and chr(k).isalnum() else f"\\{k:03o}" for k in range(256)]
 
 
-def in_lanes(function: ca.Function, lanes: int = LANES) -> NativeCode | ca.Function:
-    """The function of so many instances, called as ``function.map(lanes)``: an instance a column.
+def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[NativeCode | ca.Function]:
+    """The functions of so many instances, called as ``function.map(lanes)``: an instance a column.
 
     lanes : a power of two.
-    function : of SX. One with an operation that is not known here stays as it is, as all do where there is no
-        compiler: how many instances a function takes is read off its columns.
+    functions : of SX, which are compiled together. One with an operation that is not known here stays as it
+        is, as all do where there is no compiler: how many instances a function takes is read off its columns.
     """
-    program = arranged(function, {*_OF_VECTORS, *_IN_EACH_LANE})
-    if program is None:
-        return function
-    return NativeCode(
-        name=function.name(), code=_code(function, program, lanes), graph=lambda: function, level=_LEVEL
-    )
+    known = {*_OF_VECTORS, *_IN_EACH_LANE}
+    programs = {f: found for f in functions if (found := arranged(f, known)) is not None}
+    code = _code(programs, lanes)
+    return [_native(f, code) if f in programs else f for f in functions]
 
 
-def _code(function: ca.Function, program: Arranged, lanes: int) -> str:
+def _native(function: ca.Function, code: str) -> NativeCode:
+    return NativeCode(name=function.name(), code=code, graph=lambda: function, level=_LEVEL)
+
+
+def _code(programs: Mapping[ca.Function, Arranged], lanes: int) -> str:
+    """One translation unit: the loops, and of each function its program."""
+    kinds = sorted({kind for program in programs.values() for kind in program.kinds})
+    short = all(program.places <= 1 << 16 for program in programs.values())
+    head = f"#define LANES {lanes}\n{_HEAD}typedef {'uint16_t' if short else 'uint32_t'} place;"
+    each = [f"IN_EACH_LANE(op_{kind}, {_IN_EACH_LANE[kind]})" for kind in kinds if kind in _IN_EACH_LANE]
+    loops = _LOOPS % "\n      ".join(map(_run, kinds))
+    data = []
+    for k, program in enumerate(programs.values()):
+        words = program.words.astype(np.uint16 if short else np.uint32).tobytes()
+        text = "".join(map(_LITERAL.__getitem__, words))
+        constants = ", ".join(map(_number, program.constants)) or "0"
+        data.append(f"static const double constants_{k}[] = {{{constants}}};")
+        data.append(f'static const char program_{k}[] __attribute__((aligned(64))) = "{text}";')
+    return "\n".join([head, *each, loops, *data, _interface(programs, lanes)])
+
+
+def _body(function: ca.Function, program: Arranged, number: int) -> list[str]:
     """One array of vectors for all places: inputs', constants', outputs', and those in between."""
-    short = program.places <= 1 << 16
-    words = program.words.astype(np.uint16 if short else np.uint32).tobytes()
-    text = "".join(map(_LITERAL.__getitem__, words))
-    kinds = sorted(program.kinds | {ca.OP_ASSIGN})
-    at, before, after = 0, [], []
+    at, constants, before, after = 0, len(program.constants), [], []
     for i in range(function.n_in()):
         before.append(f"into_lanes(arg[{i}], {function.nnz_in(i)}, v + {at});")
         at += function.nnz_in(i)
-    constants = ", ".join(map(_number, program.constants)) or "0"
-    before.append(f"for (int k = 0; k < {len(program.constants)}; k++) v[{at} + k] = ALL(constants[k]);")
-    at += len(program.constants)
+    before.append(f"for (int k = 0; k < {constants}; k++) v[{at} + k] = ALL(constants_{number}[k]);")
+    at += constants
     for i in range(function.n_out()):
         after.append(f"out_of_lanes(v + {at}, {function.nnz_out(i)}, res[{i}]);")
         at += function.nnz_out(i)
-    run = f"run((const place *)program, (const place *)program + {program.words.size}, v);"
-    head = f"#define LANES {lanes}\n{_HEAD}typedef {'uint16_t' if short else 'uint32_t'} place;"
-    each = [f"IN_EACH_LANE(op_{kind}, {_IN_EACH_LANE[kind]})" for kind in kinds if kind in _IN_EACH_LANE]
-    data = [
-        f"static const double constants[] = {{{constants}}};",
-        f'static const char program[] __attribute__((aligned(64))) = "{text}";',
-    ]
-    loops = _LOOPS % "\n      ".join(map(_run, kinds))
-    return "\n".join(
-        [head, *each, *data, loops, _interface(function, [*before, run, *after], program.places, lanes)]
-    )
+    start = f"(const place *)program_{number}"
+    return [*before, f"run({start}, {start} + {program.words.size}, v);", *after]
 
 
 def _run(kind: int) -> str:
@@ -171,17 +177,21 @@ def _number(value: float) -> str:
     return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
 
 
-def _interface(function: ca.Function, body: list[str], vectors: int, lanes: int) -> str:
-    """What CasADi writes around a function of as many instances as there are lanes, around this body."""
-    names = function.name_in(), function.name_out()
-    inputs = [ca.SX.sym("x", ca.repmat(function.sparsity_in(i), 1, lanes)) for i in range(function.n_in())]
-    shapes = [ca.repmat(function.sparsity_out(i), 1, lanes) for i in range(function.n_out())]
-    hollow = ca.Function(function.name(), inputs, [ca.SX(ca.DM(shape, 0.0)) for shape in shapes], *names)
+def _interface(programs: Mapping[ca.Function, Arranged], lanes: int) -> str:
+    """What CasADi writes around functions of as many instances as there are lanes, around these bodies."""
     generator = ca.CodeGenerator("c", {"with_header": False})
-    generator.add(hollow)
+    for f in programs:
+        inputs = [ca.SX.sym("x", ca.repmat(f.sparsity_in(i), 1, lanes)) for i in range(f.n_in())]
+        shapes = [ca.repmat(f.sparsity_out(i), 1, lanes) for i in range(f.n_out())]
+        zeros = [ca.SX(ca.DM(shape, 0.0)) for shape in shapes]
+        generator.add(ca.Function(f.name(), inputs, zeros, f.name_in(), f.name_out()))
     code = str(generator.dump())
-    start = code.index("{", code.index("static int casadi_f0(")) + 1
-    end = code.index("\n}\n", start)
     aligned = "vec *v = (vec *)(((uintptr_t)w + sizeof(vec) - 1) / sizeof(vec) * sizeof(vec));"
-    code = code[:start] + "\n  ".join(["", aligned, *body, "return 0;"]) + code[end:]
-    return re.sub(r"(\*sz_w = )\d+", rf"\g<1>{lanes * (vectors + 1)}", code)
+    for number, (f, program) in enumerate(programs.items()):
+        start = code.index("{", code.index(f"static int casadi_f{number}(")) + 1
+        end = code.index("\n}\n", start)
+        code = code[:start] + "\n  ".join(["", aligned, *_body(f, program, number), "return 0;"]) + code[end:]
+        start = code.index(f" {f.name()}_work(")
+        room = re.sub(r"(\*sz_w = )\d+", rf"\g<1>{lanes * (program.places + 1)}", code[start:], count=2)
+        code = code[:start] + room
+    return code

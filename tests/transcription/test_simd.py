@@ -38,7 +38,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def compiled(*functions: Any, count: int = LANES) -> dict[str, Any]:
-    return cached("lanes", (count,), lambda: [in_lanes(f, count) for f in functions])
+    return cached("lanes", (count,), lambda: in_lanes(functions, count))
 
 
 def every_operation() -> Any:
@@ -72,7 +72,7 @@ def test_every_operation_gives_in_lanes_what_it_gives_alone(
     for plain in functions:
         function = found[plain.name()]
         mapped = plain.map(count)
-        assert isinstance(in_lanes(plain), NativeCode)
+        assert isinstance(in_lanes([plain])[0], NativeCode)
         assert (function.name_in(), function.name_out()) == (plain.name_in(), plain.name_out())
         for i in range(plain.n_in()):
             assert function.sparsity_in(i) == mapped.sparsity_in(i)
@@ -132,6 +132,13 @@ def test_operations_of_a_kind_come_together_as_far_as_the_window_reaches(
 
 
 @needs_compiler
+def test_functions_of_a_block_are_one_library(cache: Path) -> None:
+    compiled(*derivative_functions("all", *every_operation()))
+    (library,) = [path for path in cache.glob("*.so") if "arrange" not in path.name]
+    assert library.name.startswith("all-")
+
+
+@needs_compiler
 def test_more_places_than_a_short_number_can_name(cache: Path) -> None:
     x, n = ca.SX.sym("x", 70_000), 70_000
     function = ca.Function("f", [x], [ca.vertcat(2.5 * x, x[0], 3.0, 2.5 * x[1])])
@@ -180,8 +187,9 @@ def test_the_operations_above_are_all() -> None:
 
 def test_an_unknown_operation_stays_out_of_lanes() -> None:
     x = ca.SX.sym("x", 2)
-    function = ca.Function("f", [x], [ca.erf(x)])
-    assert in_lanes(function) is function
+    function, known = ca.Function("f", [x], [ca.erf(x)]), ca.Function("g", [x], [2 * x])
+    assert in_lanes([function]) == [function]
+    assert in_lanes([function, known])[0] is function
 
 
 def test_without_a_compiler_an_instance_a_call(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

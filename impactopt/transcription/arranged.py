@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -30,8 +30,8 @@ WINDOW = 20_000
 SUM_OF_PRODUCT, PRODUCT_LESS, LESS_PRODUCT = 252, 253, 254
 _LOAD, _STORE = 250, 251
 _NONE = -1
-_GIVEN = (ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST)
-_OF_ONE = ((ca.OP_SQ, ca.OP_MUL), (ca.OP_TWICE, ca.OP_ADD))  # a number with itself
+_GIVEN = {ca.OP_INPUT: 2, ca.OP_OUTPUT: 1, ca.OP_CONST: 0}
+_OF_ONE = {ca.OP_SQ: ca.OP_MUL, ca.OP_TWICE: ca.OP_ADD}  # a number with itself
 
 Numbers = npt.NDArray[np.int32]
 
@@ -53,18 +53,23 @@ class Arranged:
     places: int
 
 
-def arranged(function: ca.Function, known: Collection[int]) -> Arranged | None:
-    """Of an SX function of known kinds of operations; None of another, or without a compiler."""
+def arranged(function: ca.Function, known: Mapping[int, int]) -> Arranged | None:
+    """Of an SX function of known kinds of operations, each with the number of its operands; None of another,
+    or without a compiler.
+    """
     library = None if find_compiler() is None else _library()
     if library is None:
         return None
     n, inputs = function.n_instructions(), sum(function.nnz_in(i) for i in range(function.n_in()))
     outputs = sum(function.nnz_out(i) for i in range(function.n_out()))
     kinds = np.fromiter(map(function.instruction_id, range(n)), np.int32, n)
-    if not {*kinds.tolist()} <= {*known, *_GIVEN, *(kind for kind, _ in _OF_ONE)}:
+    operands = {**known, **_GIVEN, **dict.fromkeys(_OF_ONE, 1)}
+    if not {*kinds.tolist()} <= operands.keys():
         return None
-    read, read2 = _pairs(function.instruction_input, n)
-    write, write2 = _pairs(function.instruction_output, n)
+    reads = np.zeros(max(operands) + 1, dtype=np.int32)
+    reads[list(operands)] = list(operands.values())
+    read, read2 = _pairs(function.instruction_input, reads[kinds])
+    write, write2 = _pairs(function.instruction_output, np.where(kinds == ca.OP_OUTPUT, 2, 1))
     is_input, is_output, is_constant = (kinds == kind for kind in _GIVEN)
     constants = tuple(function.instruction_constant(int(k)) for k in np.flatnonzero(is_constant))
     fixed = inputs + len(constants) + outputs
@@ -74,7 +79,7 @@ def arranged(function: ca.Function, known: Collection[int]) -> Arranged | None:
     ends = fixed - outputs + _starts(function.n_out(), function.nnz_out)
     write[is_output] = ends[write[is_output]] + write2[is_output]
     read2[is_input] = _NONE
-    for kind, of_two in _OF_ONE:
+    for kind, of_two in _OF_ONE.items():
         read2[kinds == kind] = read[kinds == kind]
         kinds[kinds == kind] = of_two
     kinds[is_input | is_constant], kinds[is_output] = _LOAD, _STORE
@@ -102,12 +107,13 @@ def arranged(function: ca.Function, known: Collection[int]) -> Arranged | None:
     )
 
 
-def _pairs(of: Callable[[int], Sequence[int]], n: int) -> tuple[Numbers, Numbers]:
-    """First and second number (n,) of what is given for each instruction; _NONE where there is none."""
-    found = list(map(of, range(n)))
-    count = np.fromiter(map(len, found), np.intp, n)
-    numbers = np.fromiter(chain.from_iterable(found), np.int32)
-    out, start = np.full((2, n), _NONE, dtype=np.int32), np.cumsum(count) - count
+def _pairs(of: Callable[[int], Sequence[int]], count: Numbers) -> tuple[Numbers, Numbers]:
+    """First and second number (n,) of the ``count`` that are given for each instruction; _NONE where there is
+    none.
+    """
+    # none of the short lists is kept: hundreds of thousands would keep Python's garbage collector busy
+    numbers = np.fromiter(chain.from_iterable(map(of, range(count.size))), np.int32, int(count.sum()))
+    out, start = np.full((2, count.size), _NONE, dtype=np.int32), np.cumsum(count) - count
     for k in range(2):
         out[k, count > k] = numbers[start[count > k] + k]
     return out[0], out[1]

@@ -72,6 +72,15 @@ _IN_EACH_LANE = {
     ca.OP_OR: "x || y",
     ca.OP_IF_ELSE_ZERO: "x ? y : 0",
 }
+
+
+def _formula(kind: int) -> str:
+    """Of the vectors a, b and c."""
+    return _OF_VECTORS.get(kind) or f"op_{kind}(a, {'b' if 'y' in _IN_EACH_LANE[kind] else 'a'})"
+
+
+_OPERANDS = {k: len({*re.findall(r"\b[abc]\b", _formula(k))}) for k in (*_OF_VECTORS, *_IN_EACH_LANE)}
+
 _HEAD = """#include <math.h>
 #include <stdint.h>
 typedef double vec __attribute__((vector_size(8 * LANES)));
@@ -124,8 +133,7 @@ def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[Nativ
     functions : of SX, which are compiled together. One with an operation that is not known here stays as it
         is, as all do where there is no compiler: how many instances a function takes is read off its columns.
     """
-    known = {*_OF_VECTORS, *_IN_EACH_LANE}
-    programs = {f: found for f in functions if (found := arranged(f, known)) is not None}
+    programs = {f: found for f in functions if (found := arranged(f, _OPERANDS)) is not None}
     code = _code(programs, lanes)
     return [_native(f, code) if f in programs else f for f in functions]
 
@@ -168,9 +176,7 @@ def _body(function: ca.Function, program: Arranged, number: int) -> list[str]:
 
 def _run(kind: int) -> str:
     """The loop over operations of a kind."""
-    formula = _OF_VECTORS.get(kind) or f"op_{kind}(a, {'b' if 'y' in _IN_EACH_LANE[kind] else 'a'})"
-    operands = 1 + max("abc".index(letter) for letter in re.findall(r"\b[abc]\b", formula))
-    return f"RUN({kind}, {operands}, {formula})"
+    return f"RUN({kind}, {_OPERANDS[kind]}, {_formula(kind)})"
 
 
 def _number(value: float) -> str:

@@ -105,14 +105,13 @@ def test_a_product_and_the_sum_with_it_are_one_operation_and_equal_ones_are_done
 
 def runs(function: Any) -> list[tuple[int, int]]:
     """Kind and number of operations of each run."""
-    made = arranged.arranged(function, {*simd._OF_VECTORS, *simd._IN_EACH_LANE})
+    made = arranged.arranged(function, simd._OPERANDS)
     assert made is not None
     out, words = [], made.words.tolist()
     while words:
         kind, count = words[:2]
-        text = simd._run(kind)
         out.append((kind, count))
-        words = words[2 + count * (int(text.split(",")[1]) + 1) :]
+        words = words[2 + count * (simd._OPERANDS[kind] + 1) :]
     return out
 
 

@@ -26,7 +26,7 @@ from impactopt.transcription.arranged import (
 __all__ = ["in_lanes"]
 
 # each operation is rounded on its own, as CasADi has it: what cancels there cancels here
-_LEVEL = "-O2 -ffp-contract=off"
+_LEVEL = "-O2 -ffp-contract=off -fno-strict-aliasing"
 
 # of vectors a, b and c
 _OF_VECTORS = {

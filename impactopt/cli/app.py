@@ -152,7 +152,7 @@ def solve(
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
-            progress.say("building the program (compiles for a minute or two the first time)")
+            progress.say("building the program (compiles for some ten seconds the first time)")
             chosen |= {"start": start.value, "starts": starts, "seed": seed}
             chosen |= {"report": progress.say, "callback": progress.iteration}
             if store is None:

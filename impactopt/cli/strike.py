@@ -66,7 +66,7 @@ def strike(
             progress.say(f"{read.path} is read; building the robot")
             problem = read.build()
             directory = None if out is None else make_directory(out)
-            progress.say("building the program (compiles for a minute or two the first time)")
+            progress.say("building the program (compiles for some ten seconds the first time)")
             solution = optimize_strike(
                 problem,
                 method=method,

@@ -68,6 +68,7 @@ class FunctionGroup:
     recipe : everything but this package's sources that shapes the functions: numbers, text, arrays, enums,
         dataclasses, and tuples or mappings of them; for a model, its `model_hash`.
     build : makes the functions, as graphs or as `NativeCode`; only called when the cache has no valid copy.
+        Those with the same C are compiled once.
         Derivatives have to be among them: a loaded function cannot be differentiated.
     """
 
@@ -168,15 +169,15 @@ def _load_entry(directory: Path, entry: str) -> dict[str, ca.Function] | None:
     try:
         check_private_file(directory / f"{entry}.json")
         listing = json.loads((directory / f"{entry}.json").read_text(encoding="utf-8"))
-        functions = {}
-        for function, (library, digest) in listing["functions"].items():
+        for library, digest in {tuple(found) for found in listing["functions"].values()}:
             if Path(library).name != library:
                 return None
-            path = directory / library
-            check_private_file(path)
-            if hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            check_private_file(directory / library)
+            if hashlib.sha256((directory / library).read_bytes()).hexdigest() != digest:
                 return None
-            functions[function] = ca.external(function, str(path))
+        functions = {
+            f: ca.external(f, str(directory / found[0])) for f, found in listing["functions"].items()
+        }
         return functions or None
     except UnsafePath as error:
         warn(f"{error}; compiling again")
@@ -203,7 +204,7 @@ class _Work:
         self._start, self._held = time.monotonic(), held
         tell(f"{group.name}: building the functions")
         self._functions = _by_name(group.build())
-        self._jobs: dict[Future[tuple[str, str]], str] = {}
+        self._jobs: dict[Future[tuple[str, str]], list[str]] = {}
         self._error: Exception | None = None
         try:
             scratch = Path(held.enter_context(tempfile.TemporaryDirectory(dir=directory, prefix="tmp-")))
@@ -211,9 +212,13 @@ class _Work:
             self._error = error
             return
         # the longest first, so that the cores finish together; CasADi itself stays in this thread
+        together: dict[tuple[str, str], list[str]] = {}
         for function in sorted(self._functions.values(), key=longest_body, reverse=True):
-            job = pool.submit(library_of, directory, scratch, *c_code(function), compiler)
-            self._jobs[job] = name_of(function)
+            name, code, level = c_code(function)
+            together.setdefault((code, level), []).append(name)
+        for (code, level), names in together.items():
+            job = pool.submit(library_of, directory, scratch, names[0], code, level, compiler)
+            self._jobs[job] = names
 
     def finished(self) -> dict[str, ca.Function]:
         """The functions, when all are compiled and in the cache; as CasADi runs them, where one cannot be."""
@@ -243,10 +248,10 @@ class _Work:
             raise self._error
         listing: dict[str, tuple[str, str]] = {}
         for done, job in enumerate(as_completed(self._jobs), start=1):
-            function = self._jobs[job]
-            listing[function] = job.result()
-            seconds = time.monotonic() - self._start
-            self._tell(f"{self._name}: compiled {function} ({done} of {len(self._jobs)}, {seconds:.0f} s)")
+            names, seconds = self._jobs[job], time.monotonic() - self._start
+            listing |= dict.fromkeys(names, job.result())
+            told = ", ".join(names)
+            self._tell(f"{self._name}: compiled {told} ({done} of {len(self._jobs)}, {seconds:.0f} s)")
         ordered = {"functions": {function: listing[function] for function in self._functions}}
         put(self._directory / f"{self._entry}.json", json.dumps(ordered, indent=1).encode())
         return listing

@@ -46,7 +46,7 @@ class NativeCode:
     Attributes
     ----------
     name : of the function.
-    code : C, one translation unit.
+    code : C, one translation unit, which may be that of other functions, too.
     level : of optimization, as the compiler's flags.
     graph : builds the function that takes its place where there is no compiler.
     """

@@ -159,7 +159,7 @@ class StanceCoordinates:
             qd, qdd = ca.SX.sym("qd", rb.nv), ca.SX.sym("qdd", rb.nv)
             v = ca.mtimes(rb.velocity_map(), qd)[:6]
             a = rb.acceleration(qd, qdd)[:6]
-            self._base_motion = ca.Function("base_motion", [rb.q, qd, qdd], [v, a])
+            self.base_motion = ca.Function("base_motion", [rb.q, qd, qdd], [v, a])
         # in the base's own frame: the base at the world's origin, unturned
         self._sole = []
         for leg in self.legs:
@@ -172,7 +172,7 @@ class StanceCoordinates:
                 ca.Function("sole", [rb.q, rb.v, rb.a], [rotation, point, ca.densify(jac), twist, acc])
             )
 
-    def _embed(self, base: Any, independent: Any, dependent: Any) -> Any:
+    def embed(self, base: Any, independent: Any, dependent: Any) -> Any:
         """Vector over base and joints (nv) from its three parts (SX)."""
         full = [None] * self.robot.n
         for i, j in enumerate(self.independent):
@@ -183,13 +183,13 @@ class StanceCoordinates:
 
     def configuration(self, y: Any, legs: Any) -> Any:
         """q of the "rpy" coordinates (nv,) from y (ny,) and the leg joints (nl,), SX."""
-        return self._embed(y[: self.base], y[self.base :], legs)
+        return self.embed(y[: self.base], y[self.base :], legs)
 
-    def _sole_terms(self, k: int, y: Any, legs: Any, v: Any, a: Any) -> Any:
+    def sole_terms(self, k: int, y: Any, legs: Any, v: Any, a: Any) -> Any:
         """Rotation, point, Jacobian of the leg's own joints, twist and acceleration of sole k in the base's
         own frame; and the Jacobian of the joints before them.
         """
-        q = self._embed(ca.SX.zeros(self.base), y[self.base :], legs)
+        q = self.embed(ca.SX.zeros(self.base), y[self.base :], legs)
         rotation, point, jac, twist, acc = self._sole[k](q, v, a)
         return rotation, point, jac[:, -LEG:], twist, acc, jac[:, :-LEG]
 
@@ -200,23 +200,23 @@ class StanceCoordinates:
         """
         k = rates.shape[1]
         if not self.base:
-            return ca.horzcat(*[self._embed(None, rates[:, i], ca.SX(0, 1)) for i in range(k)])
+            return ca.horzcat(*[self.embed(None, rates[:, i], ca.SX(0, 1)) for i in range(k)])
         still = ca.SX.zeros(self.nl)
         q = self.configuration(y, legs)
         nothing = ca.SX.zeros(self.rb.nv)
         base = [
-            self._base_motion(q, self._embed(rates[:6, i], rates[6:, i], still), nothing)[0] for i in range(k)
+            self.base_motion(q, self.embed(rates[:6, i], rates[6:, i], still), nothing)[0] for i in range(k)
         ]
         leg_rates = []
         for s, leg in enumerate(self.legs):
-            jac = self._sole_terms(s, y, legs, nothing, nothing)[2]
+            jac = self.sole_terms(s, y, legs, nothing, nothing)[2]
             twists = [
-                self._sole_terms(s, y, legs, self._embed(b, rates[6:, i], still), nothing)[3]
+                self.sole_terms(s, y, legs, self.embed(b, rates[6:, i], still), nothing)[3]
                 for i, b in enumerate(base)
             ]
             leg_rates.append(solve_in_order(jac, -ca.horzcat(*twists), leg.order)[0])
         parts = ca.vertcat(*leg_rates)
-        return ca.horzcat(*[self._embed(base[i], rates[6:, i], parts[:, i]) for i in range(k)])
+        return ca.horzcat(*[self.embed(base[i], rates[6:, i], parts[:, i]) for i in range(k)])
 
     def motion(self, y: Any, legs: Any, yd: Any, ydd: Any) -> tuple[Any, Any]:
         """Pinocchio v and a (nv,) that keep the held soles at rest, SX.
@@ -226,17 +226,17 @@ class StanceCoordinates:
         """
         v = self.velocity(y, legs, yd)
         if not self.base:
-            return v, self._embed(None, ydd, ca.SX(0, 1))
+            return v, self.embed(None, ydd, ca.SX(0, 1))
         still = ca.SX.zeros(self.nl)
         q = self.configuration(y, legs)
-        a_base = self._base_motion(
-            q, self._embed(yd[:6], yd[6:], still), self._embed(ydd[:6], ydd[6:], still)
-        )[1]
+        a_base = self.base_motion(q, self.embed(yd[:6], yd[6:], still), self.embed(ydd[:6], ydd[6:], still))[
+            1
+        ]
         accs = []
         for s, leg in enumerate(self.legs):
-            _, _, jac, _, acc, _ = self._sole_terms(s, y, legs, v, self._embed(a_base, ydd[6:], still))
+            _, _, jac, _, acc, _ = self.sole_terms(s, y, legs, v, self.embed(a_base, ydd[6:], still))
             accs.append(solve_in_order(jac, -acc, leg.order)[0])
-        return v, self._embed(a_base, ydd[6:], ca.vertcat(*accs))
+        return v, self.embed(a_base, ydd[6:], ca.vertcat(*accs))
 
     def leg_determinants(self, legs: Any) -> Any:
         """Determinant, up to its sign, of each held leg's Jacobian (a leg), SX; zero at a straight knee."""
@@ -244,7 +244,7 @@ class StanceCoordinates:
         nothing, anywhere = ca.SX.zeros(self.rb.nv), ca.SX(self.start)
         out = []
         for s, leg in enumerate(self.legs):
-            jac = self._sole_terms(s, anywhere, legs, nothing, nothing)[2]
+            jac = self.sole_terms(s, anywhere, legs, nothing, nothing)[2]
             out.append(solve_in_order(jac, ca.SX(6, 0), leg.order)[1])
         return ca.vertcat(*out)
 
@@ -254,19 +254,19 @@ class StanceCoordinates:
         They are for leg rates (nl,) that need not be right.
         """
         still, nothing = ca.SX.zeros(self.nl), ca.SX.zeros(self.rb.nv)
-        base = self._base_motion(self.configuration(y, still), self._embed(yd[:6], yd[6:], still), nothing)[0]
-        v = self._embed(base, yd[6:], rates)
-        return ca.vertcat(*[self._sole_terms(k, y, legs, v, nothing)[3] for k in range(len(self.legs))])
+        base = self.base_motion(self.configuration(y, still), self.embed(yd[:6], yd[6:], still), nothing)[0]
+        v = self.embed(base, yd[6:], rates)
+        return ca.vertcat(*[self.sole_terms(k, y, legs, v, nothing)[3] for k in range(len(self.legs))])
 
     def upper_motion(self, y: Any, yd: Any, ydd: Any) -> tuple[Any, Any, Any]:
         """q, v, a (SX) with the leg joints left out (zero): enough for frames that no stance leg carries."""
         still = ca.SX.zeros(self.nl)
         q = self.configuration(y, still)
         if not self.base:
-            return q, self._embed(None, yd, still), self._embed(None, ydd, still)
-        qd, qdd = self._embed(yd[:6], yd[6:], still), self._embed(ydd[:6], ydd[6:], still)
-        v, a = self._base_motion(q, qd, qdd)
-        return q, self._embed(v, yd[6:], still), self._embed(a, ydd[6:], still)
+            return q, self.embed(None, yd, still), self.embed(None, ydd, still)
+        qd, qdd = self.embed(yd[:6], yd[6:], still), self.embed(ydd[:6], ydd[6:], still)
+        v, a = self.base_motion(q, qd, qdd)
+        return q, self.embed(v, yd[6:], still), self.embed(a, ydd[6:], still)
 
     def closure(self, y: Any, legs: Any) -> Any:
         """Pose error of the held soles (6 a sole), SX: position [m], rotation vector [rad] to first order."""
@@ -295,7 +295,7 @@ class StanceCoordinates:
         zero_v, base, leg_tau = ca.SX.zeros(nv), ca.SX.zeros(6), []
         others = [ca.SX(0.0)] * self.robot.n  # on the joints that are coordinates
         for k, leg in enumerate(self.legs):
-            rotation, point, jac, _, _, before = self._sole_terms(k, y, legs, zero_v, zero_v)
+            rotation, point, jac, _, _, before = self.sole_terms(k, y, legs, zero_v, zero_v)
             w = wrenches[6 * k : 6 * k + 6]
             f, n = ca.mtimes(rotation, w[:3]), ca.mtimes(rotation, w[3:])
             base = base + ca.vertcat(f, n + ca.cross(point, f))
@@ -304,7 +304,7 @@ class StanceCoordinates:
             for i, j in enumerate(leg.before):
                 others[j] = others[j] + tau[i]
         of_independent = ca.vertcat(ca.SX(0, 1), *[others[j] for j in self.independent])
-        return self._embed(base, of_independent, ca.vertcat(*leg_tau))
+        return self.embed(base, of_independent, ca.vertcat(*leg_tau))
 
     # ------------------------------------------------------------------ numeric
     @cached_property

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
+
+from impactopt.kinematics.stages import Stage
 
 __all__ = ["LANES", "BlockExpression", "BlockRecipe", "make_block"]
 
@@ -20,7 +22,7 @@ LANES = 8
 class BlockExpression:
     """z (variables), p (parameters), out: SX columns, and the length of each named slice of ``out``.
 
-    through : numbers that ``out`` is written with, and what they are of (z, p).  lanes : of
+    through : numbers that ``out`` is written with, in stages.  lanes : of
         `impactopt.transcription.simd.in_lanes`, about as many as there are instances.
     """
 
@@ -28,7 +30,7 @@ class BlockExpression:
     p: Any
     out: Any
     sizes: dict[str, int]
-    through: tuple[Any, Any] | None = None
+    through: tuple[Stage, ...] = ()
     lanes: int = LANES
 
 
@@ -36,20 +38,22 @@ def make_block(
     z: list[Any],
     p: list[Any],
     out: dict[str, Any],
-    through: list[tuple[Any, Any]] | None = None,
+    through: Sequence[tuple[Any, Any]] = (),
     lanes: int = LANES,
+    stages: Sequence[Stage] = (),
 ) -> BlockExpression:
     """A block from parts of z and of p, and the named slices of its output.
 
-    through : numbers that it is written with, in place of an expression of z and p each.
+    through : numbers that it is written with, in place of an expression of z and p each.  stages : more of
+        them, each of z, p and of those before.
     """
-    inner = None if through is None else tuple(ca.vertcat(*parts) for parts in zip(*through, strict=True))
+    first = [Stage(*(ca.vertcat(*parts) for parts in zip(*through, strict=True)))] if through else []
     return BlockExpression(
         ca.vertcat(*z),
         ca.vertcat(*p),
         ca.vertcat(*out.values()),
         {k: int(v.numel()) for k, v in out.items()},
-        inner,
+        (*first, *stages),
         lanes,
     )
 

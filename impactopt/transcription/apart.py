@@ -225,7 +225,7 @@ def apart_groups() -> list[FunctionGroup]:
 
         def functions(name: str = name, n: int = n) -> list[Any]:
             b = apart(n)
-            return [in_lanes(f, b.lanes) for f in derivative_functions(name, b.z, b.p, b.out, b.through)]
+            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
 
         out.append(FunctionGroup(name=name, recipe=(name,), build=functions))
     return out

@@ -15,6 +15,7 @@ from impactopt.collision.effects import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.stages import Stage, motion_in_stages, velocity_in_stages
 from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
 from impactopt.transcription.contact_blocks import (
@@ -92,7 +93,7 @@ def node(c: StanceCoordinates) -> BlockExpression:
     limit, rate_limit = ca.SX.sym("limit", n), ca.SX.sym("rate_limit", c.nl)
     weight, lever, start = ca.SX.sym("weight"), ca.SX.sym("lever"), ca.SX.sym("start", len(c.legs))
     u, udot = ca.SX.sym("u", ny), ca.SX.sym("udot", ny)
-    v, a = c.motion(y, legs, u, udot)
+    v, a, stages = motion_in_stages(c, y, legs, u, udot)
     rnea = ca.Function("rnea", [c.rb.q, c.rb.v, c.rb.a], [c.rb.rnea(c.rb.v, c.rb.a)])
     tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(y, legs, w)
     out = {
@@ -103,7 +104,8 @@ def node(c: StanceCoordinates) -> BlockExpression:
         "extension": c.leg_determinants(legs) / start,
     }
     through = [(u, y1 / T), (udot, y2 / T**2)]
-    return make_block([y, y1, y2, legs, w, T], [limit, rate_limit, weight, lever, start], out, through)
+    p = [limit, rate_limit, weight, lever, start]
+    return make_block([y, y1, y2, legs, w, T], p, out, through, stages=stages)
 
 
 def contact(c: StanceCoordinates, striker: str) -> BlockExpression:
@@ -173,14 +175,16 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     y, y1, legs, T = ca.SX.sym("y", c.ny), ca.SX.sym("y1", c.ny), ca.SX.sym("legs", c.nl), ca.SX.sym("T")
     rb, u = c.rb, ca.SX.sym("u", c.ny)
     momentum = ca.Function("momentum", [rb.q, rb.v], [rb.com(), rb.centroidal_momentum(rb.v)])
-    com, h = momentum(c.configuration(y, legs), c.velocity(y, legs, u))
+    v, stages = velocity_in_stages(c, y, legs, u)
+    com, h = ca.SX.sym("com", 3), ca.SX.sym("h", 6)
+    stages.append(Stage(ca.vertcat(com, h), ca.vertcat(*momentum(c.configuration(y, legs), v))))
     mass = sum(i.mass for i in c.model.inertias)
     velocity = h[:3] / mass
     capture = com[:2] + velocity[:2] * ca.sqrt(com[2] / 9.81)
     polygon = ca.SX.sym("polygon", 3 * edges)
     e = ca.reshape(polygon, 3, edges).T
     out = {"capture": ca.mtimes(e[:, :2], capture) - e[:, 2], "vertical": velocity[2], "angular": h[3:]}
-    return make_block([y, y1, legs, T], [polygon], out, [(u, y1 / T)], lanes=2)
+    return make_block([y, y1, legs, T], [polygon], out, [(u, y1 / T)], lanes=2, stages=stages)
 
 
 def builders(

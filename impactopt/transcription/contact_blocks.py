@@ -15,6 +15,7 @@ from impactopt.collision.effects import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.stages import Stage, motion_in_stages
 from impactopt.kinematics.striking_point import striker_kinematics
 from impactopt.problem.block import BlockExpression, make_block
 from impactopt.transcription.gain_blocks import Joints, chosen_gains
@@ -123,7 +124,7 @@ def collision(
         if not frozen.bias:
             carried = ca.SX.sym("carried", nw)
             more.append(carried)
-    v, a = _motion(c, *at, ydd, jdot=frozen is None or frozen.jdot)
+    v, a, stages = _motion(c, *at, ydd, jdot=frozen is None or frozen.jdot)
     q = c.configuration(at[0], at[2])
     tau = _inverse_dynamics(c, q, v, a, bias=frozen is None or frozen.bias)
     for k, name in enumerate(strikers):
@@ -152,7 +153,8 @@ def collision(
     }
     z = [y0, u0, *more[: 2 * (frozen is None)], ff, d1, T1, d, T, u, u1, legs, f, w]
     z += [*(more if frozen is not None else []), logs]
-    return make_block(z, [normal, s, after, kp, kd, limit, weight, lever], out, through, lanes=4)
+    p = [normal, s, after, kp, kd, limit, weight, lever]
+    return make_block(z, p, out, through, lanes=4, stages=stages)
 
 
 def _strikers(striker: str, second: str) -> list[str]:
@@ -161,9 +163,9 @@ def _strikers(striker: str, second: str) -> list[str]:
 
 def _motion(
     c: StanceCoordinates, y: Any, u: Any, legs: Any, ydd: Any, *, jdot: bool = True
-) -> tuple[Any, Any]:
-    """v and a (nv) of rates u and second rates on held soles; without dJ/dt v, a as if nothing moved."""
-    return c.motion(y, legs, u, ydd) if jdot else (c.velocity(y, legs, u), c.velocity(y, legs, ydd))
+) -> tuple[Any, Any, list[Stage]]:
+    """v and a (nv) on held soles, and their stages; without dJ/dt v, a as if nothing moved."""
+    return motion_in_stages(c, y, legs, u, ydd) if jdot else (*(c.velocity(y, legs, x) for x in (u, ydd)), [])
 
 
 def _inverse_dynamics(c: StanceCoordinates, q: Any, v: Any, a: Any, *, bias: bool = True) -> Any:

@@ -87,6 +87,6 @@ def _extra(block: BlockExpression | BlockRecipe, problem: ImpactProblem, element
 
 def key_of(block: BlockExpression) -> tuple[Any, ...]:
     """What a block computes, as a short text: a user's own has no name to be known by."""
-    inner, of_z = ([], []) if block.through is None else ([block.through[0]], [block.through[1]])
-    graph = ca.Function("block", [block.z, block.p, *inner], [block.out, *of_z])
+    stages = [stage.symbols for stage in block.through], [stage.expression for stage in block.through]
+    graph = ca.Function("block", [block.z, block.p, *stages[0]], [block.out, *stages[1]])
     return hashlib.sha256(graph.serialize().encode()).hexdigest(), block.lanes

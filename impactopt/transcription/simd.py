@@ -1,37 +1,45 @@
 """Functions of several instances at once: C in which each number of one instance is a vector, a lane each.
 
-CasADi's C takes the instances one after the other, a number at a time. The same operations in the same order
-on vectors need about as many of the CPU's instructions for eight instances as for one.
+CasADi's C takes the instances one after the other, a number at a time. The same operations on vectors need
+about as many of the CPU's instructions for eight instances as for one. They are numbers, which a few loops go
+through (`impactopt.transcription.arranged`): a compiler has the loops to compile, and nothing else.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from itertools import pairwise, zip_longest
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
+import numpy as np
 
 from impactopt.codegen.library import NativeCode
 from impactopt.problem.block import LANES
+from impactopt.transcription.arranged import (
+    LESS_PRODUCT,
+    PRODUCT_LESS,
+    SUM_OF_PRODUCT,
+    Arranged,
+    arranged,
+)
 
 __all__ = ["in_lanes"]
 
-# a compiler takes more than linear time for a long function: it gets parts of so many operations
-_PART = 500
-# what runs one after the other stands one after the other
-_LEVEL = "-O1 -fno-toplevel-reorder"
+# each operation is rounded on its own, as CasADi has it: what cancels there cancels here
+_LEVEL = "-O2 -ffp-contract=off -fno-strict-aliasing"
 
+# of vectors a, b and c
 _OF_VECTORS = {
-    ca.OP_ASSIGN: "{0}",
-    ca.OP_ADD: "{0} + {1}",
-    ca.OP_SUB: "{0} - {1}",
-    ca.OP_MUL: "{0} * {1}",
-    ca.OP_DIV: "{0} / {1}",
-    ca.OP_NEG: "-{0}",
-    ca.OP_TWICE: "{0} + {0}",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_INV: "ALL(1.0) / {0}",
+    ca.OP_ASSIGN: "a",
+    ca.OP_ADD: "a + b",
+    ca.OP_SUB: "a - b",
+    ca.OP_MUL: "a * b",
+    ca.OP_DIV: "a / b",
+    ca.OP_NEG: "-a",
+    ca.OP_INV: "ALL(1.0) / a",
+    SUM_OF_PRODUCT: "a * b + c",
+    PRODUCT_LESS: "a * b - c",
+    LESS_PRODUCT: "c - a * b",
 }
 # of the numbers x and y of each lane
 _IN_EACH_LANE = {
@@ -64,15 +72,20 @@ _IN_EACH_LANE = {
     ca.OP_OR: "x || y",
     ca.OP_IF_ELSE_ZERO: "x ? y : 0",
 }
-_KNOWN = {*_OF_VECTORS, *_IN_EACH_LANE, ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST}
 
-# The passes left out look for what CasADi has found before: without them it compiles in two thirds of the
-# time, and what it makes is as fast.
+
+def _formula(kind: int) -> str:
+    """Of the vectors a, b and c."""
+    return _OF_VECTORS.get(kind) or f"op_{kind}(a, {'b' if 'y' in _IN_EACH_LANE[kind] else 'a'})"
+
+
+_OPERANDS = {k: len({*re.findall(r"\b[abc]\b", _formula(k))}) for k in (*_OF_VECTORS, *_IN_EACH_LANE)}
+
 _HEAD = """#include <math.h>
 #include <stdint.h>
 typedef double vec __attribute__((vector_size(8 * LANES)));
 #define ALL(number) ((vec){0} + (number))
-/* loops over lanes, which the passes that are left out elsewhere make vectors of */
+/* loops over lanes, which are to become vectors */
 #define LOOPS __attribute__((optimize("O3", "no-math-errno", "no-trapping-math")))
 #define IN_EACH_LANE(name, formula) \\
   LOOPS static vec name(vec a, vec b) { \\
@@ -90,118 +103,101 @@ LOOPS static void out_of_lanes(const vec *rows, int count, double *columns) {
     for (int i = 0; i < LANES; i++)
       for (int k = 0; k < count; k++) columns[i * count + k] = rows[k][i];
 }
-/* Code that runs once a call, megabytes of it, has left the caches by the next call: it is asked for a part
-   ahead, or the CPU would wait for every line of it. */
-static inline void fetch(const void *from, const void *to) {
-  for (const char *line = from; line < (const char *)to; line += 64) __builtin_prefetch(line, 0, 2);
-}
-#pragma GCC optimize ("no-tree-dse", "no-dse", "no-tree-fre", "no-tree-forwprop")
+#define OPERANDS_1 vec a = v[p[0]];
+#define OPERANDS_2 vec a = v[p[0]], b = v[p[1]];
+#define OPERANDS_3 vec a = v[p[0]], b = v[p[1]], c = v[p[2]];
+#define RUN(kind, n, formula) \\
+  case kind: \\
+    end = p + count * (n + 1); \\
+    _Pragma("GCC unroll 4") for (; p < end; p += n + 1) { OPERANDS_##n v[p[n]] = formula; } \\
+    break;
 """
+_LOOPS = """static void run(const place *p, const place *stop, vec *v) {
+  while (p < stop) {
+    const place kind = p[0], count = p[1], *end;
+    p += 2;
+    switch (kind) {
+      %s
+    }
+  }
+}
+"""
+# of each byte, how C's text has it
+_LITERAL = [chr(k) if k < 128 and chr(k).isalnum() else f"\\{k:03o}" for k in range(256)]
 
 
-def in_lanes(function: ca.Function, lanes: int = LANES) -> NativeCode | ca.Function:
-    """The function of so many instances, called as ``function.map(lanes)``: an instance a column.
+def in_lanes(functions: Sequence[ca.Function], lanes: int = LANES) -> list[NativeCode | ca.Function]:
+    """The functions of so many instances, called as ``function.map(lanes)``: an instance a column.
 
     lanes : a power of two.
-    function : of SX. One with an operation that is not known here stays as it is, and takes the place of the
-        other where there is no compiler: how many instances a function takes is read off its columns.
+    functions : of SX, which are compiled together. One with an operation that is not known here stays as it
+        is, as all do where there is no compiler: how many instances a function takes is read off its columns.
     """
-    kinds = {function.instruction_id(k) for k in range(function.n_instructions())}
-    if not kinds <= _KNOWN:
-        return function
-    return NativeCode(
-        name=function.name(), code=_code(function, kinds, lanes), graph=lambda: function, level=_LEVEL
-    )
+    programs = {f: found for f in functions if (found := arranged(f, _OPERANDS)) is not None}
+    code = _code(programs, lanes)
+    return [_native(f, code) if f in programs else f for f in functions]
 
 
-def _code(function: ca.Function, kinds: set[int], lanes: int) -> str:
-    """One array of vectors: the registers that CasADi numbers, the inputs, the outputs."""
-    at = int(function.sz_w())
-    places, before, after = [], [], []
+def _native(function: ca.Function, code: str) -> NativeCode:
+    return NativeCode(name=function.name(), code=code, graph=lambda: function, level=_LEVEL)
+
+
+def _code(programs: Mapping[ca.Function, Arranged], lanes: int) -> str:
+    """One translation unit: the loops, and of each function its program."""
+    kinds = sorted({kind for program in programs.values() for kind in program.kinds})
+    short = all(program.places <= 1 << 16 for program in programs.values())
+    head = f"#define LANES {lanes}\n{_HEAD}typedef {'uint16_t' if short else 'uint32_t'} place;"
+    each = [f"IN_EACH_LANE(op_{kind}, {_IN_EACH_LANE[kind]})" for kind in kinds if kind in _IN_EACH_LANE]
+    loops = _LOOPS % "\n      ".join(map(_run, kinds))
+    data = []
+    for k, program in enumerate(programs.values()):
+        words = program.words.astype(np.uint16 if short else np.uint32).tobytes()
+        text = "".join(map(_LITERAL.__getitem__, words))
+        constants = ", ".join(map(_number, program.constants)) or "0"
+        data.append(f"static const double constants_{k}[] = {{{constants}}};")
+        data.append(f'static const char program_{k}[] __attribute__((aligned(64))) = "{text}";')
+    return "\n".join([head, *each, loops, *data, _interface(programs, lanes)])
+
+
+def _body(function: ca.Function, program: Arranged, number: int) -> list[str]:
+    """One array of vectors for all places: inputs', constants', outputs', and those in between."""
+    at, constants, before, after = 0, len(program.constants), [], []
     for i in range(function.n_in()):
-        places.append(f"#define IN_{i} {at}")
-        before.append(f"into_lanes(arg[{i}], {function.nnz_in(i)}, v + IN_{i});")
+        before.append(f"into_lanes(arg[{i}], {function.nnz_in(i)}, v + {at});")
         at += function.nnz_in(i)
+    before.append(f"for (int k = 0; k < {constants}; k++) v[{at} + k] = ALL(constants_{number}[k]);")
+    at += constants
     for i in range(function.n_out()):
-        places.append(f"#define OUT_{i} {at}")
-        after.append(f"out_of_lanes(v + OUT_{i}, {function.nnz_out(i)}, res[{i}]);")
+        after.append(f"out_of_lanes(v + {at}, {function.nnz_out(i)}, res[{i}]);")
         at += function.nnz_out(i)
-    parts = _parts(list(_operations(function)))
-    called = [f"part_{k}" for k in range(len(parts))]
-    ahead = [f"fetch({part}, {end});" for part, end in pairwise(called[1:])]
-    calls = [f"{fetch}\n  {part}(v);" for part, fetch in zip_longest(called, ahead, fillvalue="")]
-    body = [*before, *calls, *after]
-    each = [f"IN_EACH_LANE(op_{kind}, {formula})" for kind, formula in _IN_EACH_LANE.items() if kind in kinds]
-    head = f"#define LANES {lanes}\n{_HEAD}"
-    return "\n".join([head, *each, *places, *parts, _interface(function, body, at, lanes)])
+    start = f"(const place *)program_{number}"
+    return [*before, f"run({start}, {start} + {program.words.size}, v);", *after]
 
 
-Operation = tuple[str, list[int], list[int]]  # in C, with register 5 as a5; the registers read; and written
-
-
-def _operations(function: ca.Function) -> Iterator[Operation]:
-    for k in range(function.n_instructions()):
-        kind, read, write = (
-            function.instruction_id(k),
-            function.instruction_input(k),
-            function.instruction_output(k),
-        )
-        if kind in _OF_VECTORS:
-            value = _OF_VECTORS[kind].format(f"a{read[0]}", f"a{read[-1]}")
-        elif kind in _IN_EACH_LANE:
-            value = f"op_{kind}(a{read[0]}, a{read[-1]})"
-        elif kind == ca.OP_OUTPUT:
-            yield f"v[OUT_{write[0]} + {write[1]}] = a{read[0]};", read, []
-            continue
-        elif kind == ca.OP_INPUT:
-            value, read = f"v[IN_{read[0]} + {read[1]}]", []
-        else:
-            value, read = f"ALL({_number(function.instruction_constant(k))})", []
-        yield f"a{write[0]} = {value};", read, write
+def _run(kind: int) -> str:
+    """The loop over operations of a kind."""
+    return f"RUN({kind}, {_OPERANDS[kind]}, {_formula(kind)})"
 
 
 def _number(value: float) -> str:
     return repr(value).replace("inf", "INFINITY").replace("nan", "NAN")
 
 
-def _parts(operations: list[Operation]) -> list[str]:
-    """C functions to call in turn. Registers are variables in them, and in the array in between."""
-    parts: list[str] = []
-    needed: set[int] = set()  # registers that the parts after this one read
-    starts = range(0, len(operations), _PART)
-    for start in reversed(starts):
-        part = operations[start : start + _PART]
-        last = {r: k for k, (_, _, write) in enumerate(part) for r in write}
-        used: set[int] = set()
-        loaded: set[int] = set()
-        lines = []
-        for k, (text, read, write) in enumerate(part):
-            for r in read:
-                if r not in used:
-                    lines.append(f"a{r} = v[{r}];")
-                    loaded.add(r)
-                    used.add(r)
-            lines.append(text)
-            used.update(write)
-            lines += [f"v[{r}] = a{r};" for r in write if last[r] == k and r in needed]
-        needed = needed - set(last) | loaded
-        variables = ", ".join(f"a{r}" for r in sorted(used))
-        head = f"static __attribute__((noinline)) void part_{len(starts) - 1 - len(parts)}(vec *v) {{"
-        parts.append("\n  ".join([head, f"vec {variables};", *lines]) + "\n}")
-    return parts[::-1]
-
-
-def _interface(function: ca.Function, body: list[str], vectors: int, lanes: int) -> str:
-    """What CasADi writes around a function of as many instances as there are lanes, around this body."""
-    names = function.name_in(), function.name_out()
-    inputs = [ca.SX.sym("x", ca.repmat(function.sparsity_in(i), 1, lanes)) for i in range(function.n_in())]
-    shapes = [ca.repmat(function.sparsity_out(i), 1, lanes) for i in range(function.n_out())]
-    hollow = ca.Function(function.name(), inputs, [ca.SX(ca.DM(shape, 0.0)) for shape in shapes], *names)
+def _interface(programs: Mapping[ca.Function, Arranged], lanes: int) -> str:
+    """What CasADi writes around functions of as many instances as there are lanes, around these bodies."""
     generator = ca.CodeGenerator("c", {"with_header": False})
-    generator.add(hollow)
+    for f in programs:
+        inputs = [ca.SX.sym("x", ca.repmat(f.sparsity_in(i), 1, lanes)) for i in range(f.n_in())]
+        shapes = [ca.repmat(f.sparsity_out(i), 1, lanes) for i in range(f.n_out())]
+        zeros = [ca.SX(ca.DM(shape, 0.0)) for shape in shapes]
+        generator.add(ca.Function(f.name(), inputs, zeros, f.name_in(), f.name_out()))
     code = str(generator.dump())
-    start = code.index("{", code.index("static int casadi_f0(")) + 1
-    end = code.index("\n}\n", start)
     aligned = "vec *v = (vec *)(((uintptr_t)w + sizeof(vec) - 1) / sizeof(vec) * sizeof(vec));"
-    code = code[:start] + "\n  ".join(["", aligned, *body, "return 0;"]) + code[end:]
-    return re.sub(r"(\*sz_w = )\d+", rf"\g<1>{lanes * (vectors + 1)}", code)
+    for number, (f, program) in enumerate(programs.items()):
+        start = code.index("{", code.index(f"static int casadi_f{number}(")) + 1
+        end = code.index("\n}\n", start)
+        code = code[:start] + "\n  ".join(["", aligned, *_body(f, program, number), "return 0;"]) + code[end:]
+        start = code.index(f" {f.name()}_work(")
+        room = re.sub(r"(\*sz_w = )\d+", rf"\g<1>{lanes * (program.places + 1)}", code[start:], count=2)
+        code = code[:start] + room
+    return code

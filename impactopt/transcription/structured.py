@@ -15,8 +15,10 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from impactopt.kinematics.stages import Stage
 from impactopt.solvers.program import Determined
 from impactopt.transcription.batched import Block
+from impactopt.transcription.chain_rule import derivatives
 from impactopt.transcription.layout import Affine, Array, Layout, stack
 from impactopt.transcription.maps import HessianMap, JacobianMap
 from impactopt.transcription.rows import Rows
@@ -183,50 +185,18 @@ class StructuredProgram:
         return self.layout.name(j)
 
 
-def derivative_functions(
-    name: str, z: Any, p: Any, out: Any, through: tuple[Any, Any] | None = None
-) -> list[Any]:
+def derivative_functions(name: str, z: Any, p: Any, out: Any, through: Sequence[Stage] = ()) -> list[Any]:
     """A block's three functions of (z, p).
 
     ``name`` (z, p) -> out, ``name_jac`` (z, p) -> d out/dz,
     ``name_hess`` (z, p, lam) -> lower triangle of d2(lam.out)/dz2.
 
-    through : numbers s, and what they are of (z, p), where ``out`` is written with them: it is then
-        differentiated by them and by z apart, and both put together by the chain rule. That saves operations
-        where many of z have an effect through few numbers only.
+    through : what ``out`` is written with.
     """
     lam = ca.SX.sym("lam", out.numel())
-    out = ca.densify(out)
-    if through is None:
-        jac = ca.jacobian(out, z)
-        hess = ca.jacobian(ca.gradient(ca.dot(lam, out), z), z)
-    else:
-        out, jac, hess = _through(z, out, lam, *through)
-    hess = ca.tril(hess)
-    opts = {"cse": True}
+    out, jac, hess = derivatives(z, ca.densify(out), lam, through)
     return [
-        ca.Function(name, [z, p], [out], opts),
-        ca.Function(f"{name}_jac", [z, p], [jac], opts),
-        ca.Function(f"{name}_hess", [z, p, lam], [hess], opts),
+        ca.Function(name, [z, p], [out]),
+        ca.Function(f"{name}_jac", [z, p], [jac]),
+        ca.Function(f"{name}_hess", [z, p, lam], [ca.tril(hess)]),
     ]
-
-
-def _through(z: Any, out: Any, lam: Any, s: Any, of_z: Any) -> list[Any]:
-    """Value, Jacobian and Hessian of lam.out by z, where s in ``out`` stands for ``of_z``."""
-    n, both = z.numel(), ca.vertcat(z, s)
-    whole = ca.jacobian(out, both)
-    slopes = ca.gradient(ca.dot(lam, out), both)
-    curvature = ca.jacobian(slopes, both)
-    inner, along = ca.jacobian(of_z, z), ca.SX.sym("along", s.numel())
-    bends = ca.jacobian(ca.gradient(ca.dot(along, of_z), z), z)
-    crossed = ca.mtimes(inner.T, curvature[n:, :n])
-    jac = whole[:, :n] + ca.mtimes(whole[:, n:], inner)
-    hess = (
-        curvature[:n, :n]
-        + crossed
-        + crossed.T
-        + ca.mtimes(ca.mtimes(inner.T, curvature[n:, n:]), inner)
-        + ca.substitute(bends, along, slopes[n:])
-    )
-    found: list[Any] = ca.substitute([out, jac, hess], [s], [of_z])
-    return found

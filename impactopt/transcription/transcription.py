@@ -88,8 +88,7 @@ def block_functions(
 
         def functions(block: ExtraBlock = block, name: str = name) -> list[Any]:
             b = block.build()
-            found = derivative_functions(name, b.z, b.p, b.out, b.through)
-            return [in_lanes(function, b.lanes) for function in found]
+            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
 
         groups.append(
             FunctionGroup(name=f"{robot.name}-{name}", recipe=(name, *recipe, *block.key), build=functions)

@@ -18,7 +18,7 @@ from impactopt.codegen.cache import cached
 from impactopt.codegen.compiler import find_compiler
 from impactopt.codegen.library import NativeCode
 from impactopt.errors import NoCompilerWarning
-from impactopt.transcription import simd
+from impactopt.transcription import arranged, simd
 from impactopt.transcription.batched import BatchedFunction
 from impactopt.transcription.simd import LANES, in_lanes
 from impactopt.transcription.start import first_iterate
@@ -26,6 +26,7 @@ from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.transcription import Transcription
 
 Array = NDArray[np.float64]
+JOINED = {arranged.SUM_OF_PRODUCT, arranged.PRODUCT_LESS, arranged.LESS_PRODUCT}
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 
@@ -37,7 +38,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def compiled(*functions: Any, count: int = LANES) -> dict[str, Any]:
-    return cached("lanes", (count,), lambda: [in_lanes(f, count) for f in functions])
+    return cached("lanes", (count,), lambda: in_lanes(functions, count))
 
 
 def every_operation() -> Any:
@@ -61,17 +62,17 @@ def every_operation() -> Any:
 
 
 @needs_compiler
-@pytest.mark.parametrize(("part", "count"), [(3, 8), (10_000, 8), (3, 4), (3, 2)])
+@pytest.mark.parametrize(("window", "count"), [(1, 8), (3, 4), (10_000, 8), (10_000, 2)])
 def test_every_operation_gives_in_lanes_what_it_gives_alone(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, part: int, count: int
+    cache: Path, monkeypatch: pytest.MonkeyPatch, window: int, count: int
 ) -> None:
-    monkeypatch.setattr(simd, "_PART", part)
+    monkeypatch.setattr(arranged, "WINDOW", window)
     functions = derivative_functions("all", *every_operation())
     found, rng = compiled(*functions, count=count), np.random.default_rng(0)
     for plain in functions:
         function = found[plain.name()]
         mapped = plain.map(count)
-        assert isinstance(in_lanes(plain), NativeCode)
+        assert isinstance(in_lanes([plain])[0], NativeCode)
         assert (function.name_in(), function.name_out()) == (plain.name_in(), plain.name_out())
         for i in range(plain.n_in()):
             assert function.sparsity_in(i) == mapped.sparsity_in(i)
@@ -84,6 +85,67 @@ def test_every_operation_gives_in_lanes_what_it_gives_alone(
             expected = np.array(mapped(*arguments).nonzeros())
             assert np.isfinite(expected).all()
             np.testing.assert_allclose(function(*arguments).nonzeros(), expected, rtol=1e-14, atol=1e-14)
+
+
+@needs_compiler
+def test_a_product_and_the_sum_with_it_are_one_operation_and_equal_ones_are_done_once(cache: Path) -> None:
+    a, b, c, d = x = [ca.SX.sym(name) for name in "abcd"]
+    kept = c * d  # needed as it is, too
+    out = [a * b + c, c - d * a, b * c - a, d * c + a, kept, b * a + c]
+    function = ca.Function("f", [ca.vertcat(*x)], [ca.vertcat(*out)])
+    expected = [
+        *[(arranged.SUM_OF_PRODUCT, 1), (arranged.LESS_PRODUCT, 1), (arranged.PRODUCT_LESS, 1)],
+        *[(ca.OP_MUL, 1), (ca.OP_ADD, 1), (ca.OP_ASSIGN, 1)],
+    ]
+    assert sorted(runs(function)) == sorted(expected)
+    given = np.arange(4.0 * LANES).reshape(4, LANES)
+    (fast,) = compiled(function).values()
+    np.testing.assert_array_equal(fast(given), function.map(LANES)(given))
+
+
+def runs(function: Any) -> list[tuple[int, int]]:
+    """Kind and number of operations of each run."""
+    made = arranged.arranged(function, simd._OPERANDS)
+    assert made is not None
+    out, words = [], made.words.tolist()
+    while words:
+        kind, count = words[:2]
+        out.append((kind, count))
+        words = words[2 + count * (simd._OPERANDS[kind] + 1) :]
+    return out
+
+
+@needs_compiler
+def test_operations_of_a_kind_come_together_as_far_as_the_window_reaches(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x = ca.SX.sym("x", 30)
+    out = [f(x[k]) for k in range(30) for f in (ca.sin, ca.exp)]
+    function = ca.Function("f", [x], [ca.vertcat(*out)])
+    assert len(runs(function)) == 2
+    monkeypatch.setattr(arranged, "WINDOW", 10)
+    few = runs(function)
+    assert 4 <= len(few) <= 20
+    monkeypatch.setattr(arranged, "WINDOW", 1)
+    assert len(runs(function)) == 60
+
+
+@needs_compiler
+def test_functions_of_a_block_are_one_library(cache: Path) -> None:
+    compiled(*derivative_functions("all", *every_operation()))
+    (library,) = [path for path in cache.glob("*.so") if "arrange" not in path.name]
+    assert library.name.startswith("all-")
+
+
+@needs_compiler
+def test_more_places_than_a_short_number_can_name(cache: Path) -> None:
+    x, n = ca.SX.sym("x", 70_000), 70_000
+    function = ca.Function("f", [x], [ca.vertcat(2.5 * x, x[0], 3.0, 2.5 * x[1])])
+    (fast,) = compiled(function, count=2).values()
+    given = np.arange(2.0 * n).reshape(2, n).T
+    out = np.array(fast(given))
+    np.testing.assert_array_equal(out[:n], 2.5 * given)
+    np.testing.assert_array_equal(out[n:], [given[0], [3.0, 3.0], 2.5 * given[1]])
 
 
 @needs_compiler
@@ -119,13 +181,14 @@ def test_any_count_of_instances_fills_whole_calls(cache: Path, count: int) -> No
 def test_the_operations_above_are_all() -> None:
     functions = derivative_functions("all", *every_operation())
     kinds = {f.instruction_id(k) for f in functions for k in range(f.n_instructions())}
-    assert kinds >= {*simd._OF_VECTORS, *simd._IN_EACH_LANE} - {ca.OP_ASSIGN}
+    assert kinds >= {*simd._OF_VECTORS, *simd._IN_EACH_LANE} - {ca.OP_ASSIGN, *JOINED}
 
 
 def test_an_unknown_operation_stays_out_of_lanes() -> None:
     x = ca.SX.sym("x", 2)
-    function = ca.Function("f", [x], [ca.erf(x)])
-    assert in_lanes(function) is function
+    function, known = ca.Function("f", [x], [ca.erf(x)]), ca.Function("g", [x], [2 * x])
+    assert in_lanes([function]) == [function]
+    assert in_lanes([function, known])[0] is function
 
 
 def test_without_a_compiler_an_instance_a_call(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

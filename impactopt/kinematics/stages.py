@@ -1,0 +1,85 @@
+"""Motion on held soles, in stages: numbers that functions are written with and differentiated by.
+
+A leg's rates and accelerations depend on its angles and the base's motion alone, the base's motion on its own
+coordinates. An expression in all coordinates at once hides that from whoever differentiates it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from impactopt.kinematics.coordinates import StanceCoordinates
+from impactopt.kinematics.fixed_order import Index, solve_in_order
+
+__all__ = ["Stage", "motion_in_stages", "velocity_in_stages"]
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Symbols (k,), and what they stand for: of variables, parameters and the stages before.
+
+    zero : (k,) of these and the symbols, linear in the symbols, zero where they are right; in place of the
+        derivatives of what they stand for. blocks : the matrices (m, m) of its slope by the symbols that
+        stand on the diagonal, each with its elimination order; there is nothing beside them.
+    """
+
+    symbols: Any
+    expression: Any
+    zero: Any = None
+    blocks: tuple[tuple[Any, tuple[Index, Index]], ...] = ()
+
+
+def velocity_in_stages(c: StanceCoordinates, y: Any, legs: Any, rates: Any) -> tuple[Any, list[Stage]]:
+    """`StanceCoordinates.velocity` of one ydot (ny,): v (nv,), and the stages that it is written with."""
+    if not c.base:
+        return c.velocity(y, legs, rates), []
+    v, _, stages = _in_stages(c, y, legs, rates, None)
+    return v, stages
+
+
+def motion_in_stages(
+    c: StanceCoordinates, y: Any, legs: Any, rates: Any, second: Any
+) -> tuple[Any, Any, list[Stage]]:
+    """`StanceCoordinates.motion`: v and a (nv,), and the stages that they are written with."""
+    return (*c.motion(y, legs, rates, second), []) if not c.base else _in_stages(c, y, legs, rates, second)
+
+
+def _in_stages(
+    c: StanceCoordinates, y: Any, legs: Any, rates: Any, second: Any
+) -> tuple[Any, Any, list[Stage]]:
+    q, still = c.configuration(y, legs), ca.SX.zeros(c.nl)
+    nothing = ca.SX.zeros(c.rb.nv)
+    qd = c.embed(rates[:6], rates[6:], still)
+    qdd = nothing if second is None else c.embed(second[:6], second[6:], still)
+    base = c.base_motion(q, qd, qdd)[: 1 if second is None else 2]
+    of_base = [ca.SX.sym(name, 6) for name in ("base_v", "base_a")[: len(base)]]
+    stages = [Stage(ca.vertcat(*of_base), ca.vertcat(*base))]
+    v, stage = _of_legs(c, "leg_v", lambda x: (c.embed(of_base[0], rates[6:], x), nothing), y, legs, 3)
+    stages += stage
+    if second is None:
+        return v[0], None, stages
+    va, stage = _of_legs(c, "leg_a", lambda x: (v[0], c.embed(of_base[1], second[6:], x)), y, legs, 4)
+    return *va, stages + stage
+
+
+def _of_legs(
+    c: StanceCoordinates, name: str, motion: Any, y: Any, legs: Any, term: int
+) -> tuple[tuple[Any, Any], list[Stage]]:
+    """v and a with symbols for what the legs do, and the stage that says what: they keep the soles at rest.
+
+    motion : v and a of what the legs do (nl,).  term : of `sole_terms`, what has to be zero.
+    """
+    symbols, count = ca.SX.sym(name, c.nl), range(len(c.legs))
+    found = motion(symbols)
+    if not c.legs:
+        return found, []
+    zero = [c.sole_terms(k, y, legs, *found)[term] for k in count]
+    rest = [c.sole_terms(k, y, legs, *motion(ca.SX.zeros(c.nl))) for k in count]
+    blocks = tuple((terms[2], leg.order) for terms, leg in zip(rest, c.legs, strict=True))
+    solved = [
+        solve_in_order(jac, -terms[term], order)[0] for terms, (jac, order) in zip(rest, blocks, strict=True)
+    ]
+    return found, [Stage(symbols, ca.vertcat(*solved), ca.vertcat(*zero), blocks)]

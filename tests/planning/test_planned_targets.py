@@ -36,7 +36,7 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import TargetSpeed
+from impactopt.problem.terms import Slide, TargetSpeed
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Determined, Status, check_program
 from impactopt.solvers.sqp.condense import Condenser, find_eliminations
@@ -441,6 +441,18 @@ def test_the_striker_gives_way_to_a_target_that_comes_on_after_contact() -> None
     x = plan.follow.sample(after)[0][:, 0]
     surface = x[0] + plan.collision.outcome["speed_m_s"] * after
     assert (x[1:] <= (surface - np.minimum(CLEARANCE, HASTE * after))[1:] + 1e-3).all()
+
+
+def test_lifted_variables_are_found_beside_rows_on_demand() -> None:
+    """Which have a block of a name that is there already."""
+    p = ball(-1.0)
+    t = transcribed(dataclasses.replace(p, terms=(*p.terms, TargetSpeed(least=-0.3, most=-0.2), Slide())))
+    x = t.with_lifted(first_iterate(t))
+    rows = t.program.constraints(x)
+    lifted = [
+        i for i in range(t.program.m) if t.program.row_name(i).startswith(("target's way", "target left"))
+    ]
+    assert len(lifted) == 2 and np.abs(rows[lifted]).max() < 1e-9
 
 
 def test_a_catch_starts_from_a_hand_that_goes_back() -> None:

@@ -35,13 +35,13 @@ $(LEAN): pyproject.toml
 			$(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; \
 		fi; \
 	fi
-	@echo "== installing impactopt and what the demo needs into $(VENV)"
+	@echo "== installing impactopt and what the demo needs into $(VENV): some 270 MB to download"
 	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[$(NEEDED)]'
 	@touch $@
 
 # Tests, documents and benches need more than the demo.
 $(STAMP): pyproject.toml $(LEAN)
-	@echo "== installing what all else needs into $(VENV)"
+	@echo "== installing what all else needs into $(VENV): some 280 MB to download"
 	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	@touch $@
 	@echo "== $(VENV) is ready"

@@ -4,7 +4,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+LEAN   := $(VENV)/.demo
 BROWSER := $(VENV)/.browser
+NEEDED := robots,validate
 EXTRAS := robots,validate,qp,peers,sweep,cluster,mcap,live,docs,notebooks,dev
 ARGS   ?=
 
@@ -19,7 +21,7 @@ help: ## list the targets
 venv: $(STAMP) ## make .venv with this project and what it needs
 
 # Where python3 comes without ensurepip, the pip beside it fills a venv made without one.
-$(STAMP): pyproject.toml
+$(LEAN): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 		{ echo "$(PYTHON) is older than 3.10; name a newer one: make PYTHON=python3.12 ..."; exit 1; }
 	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
@@ -33,12 +35,18 @@ $(STAMP): pyproject.toml
 			$(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; \
 		fi; \
 	fi
-	@echo "== installing impactopt and what it needs into $(VENV): some 550 MB to download, a few minutes the first time"
+	@echo "== installing impactopt and what the demo needs into $(VENV): some 270 MB to download"
+	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[$(NEEDED)]'
+	@touch $@
+
+# Tests, documents and benches need more than the demo.
+$(STAMP): pyproject.toml $(LEAN)
+	@echo "== installing what all else needs into $(VENV): some 280 MB to download"
 	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	@touch $@
 	@echo "== $(VENV) is ready"
 
-demo: $(STAMP) ## plan a TALOS punch, replay it in full dynamics, put pictures and numbers in results/punch
+demo: $(LEAN) ## plan a TALOS punch, replay it in full dynamics, put pictures and numbers in results/punch
 	@echo "== planning a punch (the first run compiles the robot's functions, up to two minutes)"
 	@$(BIN)/impactopt solve problems/punch.toml --out results/punch --baseline $(ARGS)
 

@@ -118,13 +118,14 @@ class Batch:
                 if name != "step_error":
                     x[wrong] = np.nan
         impulse, duration = (found[names.index(name)][:, 0] for name in ("impulse", "duration"))
-        nothing = ~np.isfinite(impulse) | without_contact(impulse, duration)
+        separated = found[names.index("separated")][:, 0] > 0.5
+        step = 0.0 if self.model.stepping == "implicit" else self.model.step_length
+        nothing = ~np.isfinite(impulse) | without_contact(impulse, duration, step * separated)
         for name, x in zip(names, found, strict=True):
             if name != "step_error":
                 x[nothing] = np.nan
         # steps that events have used up before the horizon, which `collide` refuses too
-        separated = found[names.index("separated")][:, 0]
-        cut = ~(separated > 0.5) & (duration < self.model.horizon * (1 - 1e-9))
+        cut = ~separated & (duration < self.model.horizon * (1 - 1e-9))
         for name, x in zip(names, found, strict=True):
             if name not in ("separated", "step_error"):
                 x[cut] = np.nan

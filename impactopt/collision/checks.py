@@ -62,9 +62,9 @@ def spoiled(frozen: dict[str, Array]) -> Any:
     return bad
 
 
-def without_contact(impulse: Array, duration: Array) -> Any:
-    """Whether contacts ended so soon that rounding hides their force."""
-    return (impulse < 0) & (duration > 0)
+def without_contact(impulse: Array, duration: Array, step: Any = 0.0) -> Any:
+    """Whether contacts ended so soon that rounding hides their force, or within one explicit step [s]."""
+    return (duration > 0) & ((impulse < 0) | (duration <= step))
 
 
 def check_finite(outputs: dict[str, Array], step: float) -> None:
@@ -123,7 +123,8 @@ def check_course(collision: SteppedModel, result: Collision, error: float) -> No
                 "give one that approaches faster"
             )
         return
-    if result.impulse < 0:
+    within = length if result.separated else 0.0
+    if without_contact(np.array(result.impulse), np.array(result.duration), within):
         raise InputError(
             f"step [s]: the contact ends within {result.duration:.2g} s, too soon for steps of "
             f"{length:g}: give a shorter step, or a v that approaches faster"

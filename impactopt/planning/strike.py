@@ -164,7 +164,8 @@ def optimize_strike(
     budget = budget.started()
     t = METHODS[method](problem, problem.coordinates, functions, *mesh)
     if isinstance(start, StrikeSolution):
-        start = carried_start(t, partial(_program_of, start), start, start.apart).x
+        same = partial(_program_of, start)
+        start = (start.result if method == "shooting" else carried_start(t, same, start, start.apart)).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
@@ -195,7 +196,10 @@ def _program_of(solution: StrikeSolution) -> StrikeTranscription:
     """The program of a solution, without rows between bodies."""
     p, elements = solution.problem, solution.elements
     functions = block_functions(p, p.coordinates, None, elements)
-    return StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
+    t = StrikeTranscription(p, p.coordinates, functions, elements, solution.shares)
+    if t.layout.n != solution.result.x.size:
+        raise InputError('start: a strike by shooting has other variables; give one by method="collocation"')
+    return t
 
 
 def _of_shooting(solver: str, options: Mapping[str, Any] | None) -> dict[str, Any]:

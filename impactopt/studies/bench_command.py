@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from click import get_current_context
 
 from impactopt.studies.report import Report, Say
 from impactopt.studies.running import show_reports
@@ -49,7 +48,7 @@ FEW_DRAWS = 10  # of the bench margins among all others, which has a dozen plans
 FEW_PROBLEMS = 9  # of the bench zoo among all others
 
 
-def _shown(as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
+def _shown(context: typer.Context, as_json: Json = False, out: Out = None, quiet: Quiet = False) -> None:
     """What every command takes."""
 
 
@@ -57,11 +56,14 @@ def _command(name: str) -> Callable[[Callable[..., None]], None]:
     """A command of that name, of a function whose parameters are the bench's options."""
 
     def register(of: Callable[..., None]) -> None:
-        def command(*, as_json: bool, out: Path | None, quiet: bool, **options: Any) -> None:
-            _run([name], {name: options}, as_json, out, quiet)
+        def command(
+            *, context: typer.Context, as_json: bool, out: Path | None, quiet: bool, **options: Any
+        ) -> None:
+            _run([name], {name: options}, context, as_json, out, quiet)
 
         own, shared = (inspect.signature(f, eval_str=True).parameters.values() for f in (of, _shown))
-        command.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
+        first, *others = shared
+        command.__signature__ = inspect.Signature([first, *own, *others])  # type: ignore[attr-defined]
         command.__doc__ = of.__doc__
         app.command(name)(command)
 
@@ -281,6 +283,7 @@ def _zoo(
 
 @app.command("all")
 def _all(
+    context: typer.Context,
     draws: Annotated[int, typer.Option(min=1, help="Number of draws, as of the bench robustness.")] = 200,
     seed: Seed = 0,
     workers: Workers = 2,
@@ -311,12 +314,13 @@ def _all(
         "solve": {"quick": True, "seed": seed},
         "zoo": {"random": FEW_PROBLEMS, "seed": seed},
     }
-    _run(list(BENCHES), options, as_json, out, quiet, together=True)
+    _run(list(BENCHES), options, context, as_json, out, quiet, together=True)
 
 
 def _run(
     names: list[str],
     options: dict[str, dict[str, Any]],
+    context: typer.Context,
     as_json: bool,
     out: Path | None,
     quiet: bool,
@@ -325,9 +329,8 @@ def _run(
 ) -> None:
     """Run benches by name, show each when it is done; ``options`` by bench."""
     if "attack" in names:  # its command lines need the program, which is above this room and hands itself in
-        context = get_current_context(silent=True)  # None: in a test of a bench alone
-        program = None if context is None else context.obj
-        options = {**options, "attack": {**options.get("attack", {}), "program": program}}
+        # none in a test of a bench alone
+        options = {**options, "attack": {**options.get("attack", {}), "program": context.obj}}
 
     def run(name: str, say: Say) -> Report:
         from impactopt.studies.registry import run_bench

@@ -265,7 +265,7 @@ class ContactProgram(ABC):
         """The variables (n,) with lifted ones made equal to what they stand for."""
         x = x.copy()
         for group, outputs in self.builder.lifted:  # in order: one may be a function of one before
-            found = np.concatenate([out.ravel() for out in self.program.outputs(x).values()])[outputs]
+            found = self.program.all_outputs(x)[outputs]
             group.write(x, np.where(np.isfinite(found), found, 0.0))
         return x
 

@@ -1,4 +1,6 @@
-"""The striking point touches the target in contact only: not before, and not after if the target stays."""
+"""The striking point touches the target in contact only: not before, and not after if the target stays, or
+may be slow as its speed after the blow is bounded.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from impactopt.kinematics.striking_point import striking_point
+from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.builder import Builder
-from impactopt.transcription.layout import Affine
+from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.motion_phase import MotionPhase
 from impactopt.transcription.rows import Place, millimetres
 
@@ -16,58 +19,78 @@ from impactopt.transcription.rows import Place, millimetres
 # or away from it: what hovers at the plane would touch it between the nodes
 CLEARANCE, HASTE = 0.02, 0.04
 TOO_NEAR = millimetres("too near")
+GONE = "target's way after contact"
 
 
-def add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase) -> None:
-    """Rows at the nodes of the swing, and at those of the follow-through if the target stays; of all
-    strikers.
+def add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase, state: Affine) -> None:
+    """Rows at the nodes of the swing, and at those of the follow-through if the target stays or may be slow;
+    of all strikers.
+
+    state : of the expected target at separation.
     """
+    gone = _gone(b, follow, state)
     for k, block in enumerate(["approach", "second_approach"][: len(b.problem.strikers)]):
-        _add_clearance(b, swing, follow, block, k)
+        _add_clearance(b, swing, follow, block, k, gone)
 
 
-def _add_clearance(b: Builder, swing: MotionPhase, follow: MotionPhase, block: str, number: int) -> None:
+def _gone(b: Builder, follow: MotionPhase, state: Affine) -> Affine | None:
+    """[m] that the target goes along the normal in the follow-through; None: the striker may follow it."""
+    if b.problem.target.stays:
+        return Affine.zeros(1)
+    if b.problem.extra(TargetSpeed) is None:
+        return None
+
+    def numbers(b: Builder) -> Array:
+        return np.array(list(b.problem.target.parameters.values()))
+
+    at = b.add_block("target_way", [[state, follow.T[0]]], numbers(b))
+    b.follow(lambda b: b.block("target_way").take_parameters(numbers(b)))
+    return b.lift(GONE, np.array([at]), place=follow.place_at(1.0), measure=millimetres("off"))[0]
+
+
+def _add_clearance(
+    b: Builder, swing: MotionPhase, follow: MotionPhase, block: str, number: int, gone: Affine | None
+) -> None:
     p, before, after, start = b.problem, swing.nodes[:-1], follow.nodes, len(b.rows.lower)
     striker, point = b.problem.contacts[number]
     motions = [swing.at(s)[0] for s in before]
-    if p.target.stays:
+    if gone is not None:
         motions += [follow.at(s)[0] for s in after]
     first = b.add_block(block, [[y] for y in motions], p.normal)
     ahead = float(np.mean(p.swing.duration))
     surface, coming = Affine.constant(float(p.normal @ point)), float(p.target.speed_before())
     for i, s in enumerate(before):
         plane = surface - swing.T[0] * (coming * (1 - s))
-        spots = [(first + i, swing.place_at(s), (1 - s) * ahead)]
-        _add_rows(b, "no touch before contact", number, spots, plane)
+        spot = first + i, swing.place_at(s), (1 - s) * ahead
+        _add_row(b, "no touch before contact", number, spot, plane)
     aparts = [(1 - s) * ahead for s in before]
     b.follow(lambda b: _follow(b, number, start, aparts))
-    if not p.target.stays:
+    if gone is None:
         return
-    # the striker has left the target where it is then; a nail that coasts on only makes room
+    # the striker has left the target where it is then, from where it goes on; a nail that coasts on only
+    # makes room
     first, behind, place = first + len(before), float(np.mean(p.follow.duration)), follow.place_at
     name = f"target left by {striker}" if number else "target left"
     there = b.lift(name, np.array([first]), place=place(0.0), measure=TOO_NEAR)[0]
     spots = [(first + i, place(s), s * behind) for i, s in enumerate(after) if i]
     left = len(b.rows.lower)
-    _add_rows(b, "no touch after contact", number, spots, there)
+    for s, spot in zip(after[1:], spots, strict=True):
+        _add_row(b, "no touch after contact", number, spot, there + gone * float(s))
     b.follow(lambda b: _follow(b, number, left, [apart for _, _, apart in spots], planes=False))
 
 
-def _add_rows(
-    b: Builder, term: str, number: int, spots: list[tuple[int, Place, float]], plane: Affine
-) -> None:
-    """``spots``: output, place and time from contact [s]; plane [m]: the target's, along the normal."""
-    nearest = _nearest(b, number)
-    for output, place, apart in spots:
-        b.rows.add(
-            term=term,
-            place=place,
-            components=[b.problem.contacts[number][0]],
-            outputs=np.array([output]),
-            affine=-plane,
-            upper=-min(nearest, HASTE * apart),
-            measure=TOO_NEAR,
-        )
+def _add_row(b: Builder, term: str, number: int, spot: tuple[int, Place, float], plane: Affine) -> None:
+    """``spot``: output, place and time from contact [s]; plane [m]: the target's, along the normal."""
+    output, place, apart = spot
+    b.rows.add(
+        term=term,
+        place=place,
+        components=[b.problem.contacts[number][0]],
+        outputs=np.array([output]),
+        affine=-plane,
+        upper=-min(_nearest(b, number), HASTE * apart),
+        measure=TOO_NEAR,
+    )
 
 
 def _follow(b: Builder, number: int, start: int, aparts: list[float], *, planes: bool = True) -> None:

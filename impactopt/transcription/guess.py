@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
-from scipy.optimize import linprog
+from scipy.optimize import brentq, linprog
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Nail, Target
@@ -30,6 +30,8 @@ AT_ONCE = 1e-6  # [s] a nail that starts with the first touch is pressed for as 
 # a harder one has hammer and nail part before the nail stands
 FASTER, TRIES = 1.3, 12
 CLOSING = 0.5  # [m/s] at which what moves away is met, at least
+FASTEST = 10.0  # [m/s] beyond a start's speed none is looked for
+SLOW = 0.1  # [m/s] that a striker has at least, either way
 DECADES = range(1, 5)  # of stiffness that are tried where bodies part too early
 # a push: durations [s] of compression and restitution, the mass's speed [m/s] at the end, what is left of the
 # robot's; and the shortest blow [s] that it stands for
@@ -58,7 +60,8 @@ def effective_mass(
 ) -> tuple[float, float]:
     """Mass [kg] of a robot on held soles at its striker, along the normal, and the striker's speed [m/s].
 
-    Of several strikers: of each, with the others as fast; and their mean speed.
+    Of several strikers: of each, with the others as fast; and their mean speed. One that goes back is met by
+    what comes; one that hardly moves counts as slow.
     """
     q, v = c.join(y, legs), c.complete_motion(y, rates, np.zeros(c.ny), legs)[1]
     bodies = [Held.at(c.model, q, c.frames, c.robot.striker(name).model_frame) for name in strikers]
@@ -67,7 +70,8 @@ def effective_mass(
     both = np.vstack([held, rows])
     inner = both @ np.linalg.solve(bodies[0].inertia, both.T)
     yields = inner[m:, m:] - inner[m:, :m] @ np.linalg.lstsq(inner[:m, :m], inner[:m, m:], rcond=1e-12)[0]
-    return float(np.linalg.solve(yields, np.ones(len(rows))).mean()), max(speed, 0.1)
+    mass = float(np.linalg.solve(yields, np.ones(len(rows))).mean())
+    return mass, speed if abs(speed) > SLOW else SLOW
 
 
 def mass_at_contact(problem: ImpactProblem) -> float:
@@ -175,7 +179,8 @@ def blow(
 
     x, v, travel, force = rows[0], rows[1], rows[2], rows[-1]
     state = sample(rows[3:-1]) if target.n_states else np.zeros((len(times), 0))
-    if isinstance(target, FreeMass) and ends[-1] > SOFT:
+    comes = float(target.speed_before()) < 0  # through the hand, if it were pushed
+    if isinstance(target, FreeMass) and ends[-1] > SOFT and not comes:
         return push(target, phase, place)
     return Blow(
         durations=np.diff(ends),
@@ -186,6 +191,29 @@ def blow(
         state=state,
         travel=since(travel),
     )
+
+
+def speed_that_leaves(
+    law: ContactLaw, target: Target, mass: float, speed: float, least: float, most: float
+) -> float:
+    """The speed [m/s] nearest to a given one with which a point mass [kg] leaves the target no slower than
+    ``least``, and no faster than ``most`` [m/s].
+    """
+
+    def left(speed: float) -> float:
+        rows = _histories(law, target, mass, speed)[1]
+        return float(target.velocity(rows[3:-1, -1], target.parameters))
+
+    after = left(speed)
+    wanted = min(max(after, least), most)
+    low = high = speed
+    if after > most:
+        low = float(target.speed_before()) + CLOSING
+    else:
+        high = speed + FASTEST
+    if not left(low) <= wanted <= left(high):
+        return speed
+    return float(brentq(lambda v: left(v) - wanted, low, high, xtol=1e-2)) if low < high else speed
 
 
 def natural_durations(law: ContactLaw, target: Target, mass: float) -> Array:

@@ -43,7 +43,8 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
     """Those known, and more where the plan leaves its limits half-way from one node to the next.
 
     That is where it gives up more than half of a margin that it has at the nodes: of the ZMP to the edge of
-    the support polygon, of torques to all that the motors have; and where a gear bears 3 % more than it may.
+    the support polygon, of torques to all that the motors have; where a joint of a held leg is faster than it
+    may be; and where a gear bears 3 % more than it may.
     """
     start = plan.coordinates.split(plan.problem.start_posture)[1]
     swing, legs = _middles_outside(plan, 0, start)
@@ -64,10 +65,12 @@ def _middles_outside(
     curve, begin, nodes, _ = plan.segment(phase, missed=missed)
     places = (nodes[1:] + nodes[:-1]) / 2
     y, yd, ydd, wrench = plan.independent(phase, begin + places * curve.duration, missed=missed)
-    q, _, a, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)
+    q, v, a, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)
     limit, cone = p.term(TorqueLimit).fraction, p.term(ContactWrenchCone)
     ratio = np.abs(torque / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
+    # the others' rates are bounded by their splines' control points
+    outside |= (np.abs(v[:, c.base :]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
     outside |= gear_share(p, torque, a[:, c.base :]) > 1.0 + GEAR
     if len(plan.polygon):
         inside = margin(plan.polygon, zmp(ground)) >= cone.margin - max(_SHARE * cone.margin, _ZMP)

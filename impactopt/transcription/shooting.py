@@ -25,7 +25,8 @@ from impactopt.transcription.batched import Block
 from impactopt.transcription.layout import Affine, Array
 from impactopt.transcription.rows import Index
 
-INSTANTS = 12  # after contact, at which rows hold
+STEPS = 12  # of the horizon
+INSTANTS = STEPS + 1  # at which rows hold: from the first touch on, whose force may be the largest
 FORCE = 100.0  # [N] unit of the peak force among the outputs
 _BEND = 1.0  # [rad/s^2] of differences by the reference's bend, in which the collision is all but linear
 _HORIZONS = (2e-3, 5e-3, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.4)  # [s]: few, as one is compiled in
@@ -98,7 +99,7 @@ class Shooting:
             target=target,
             stance=problem.stance if problem.robot.floating else None,
             horizon=horizon,
-            step=horizon / INSTANTS,
+            step=horizon / STEPS,
             effects=Effects(saturation=False),  # rows keep the torque below its limit
             accuracy=None,
         )
@@ -170,7 +171,7 @@ class Shooting:
         """Outputs of the SDC by name; of histories a row an instant."""
         state = self.state(*self._split(z)[:3])
         found = self._value(**self._inputs(z, state))
-        columns = INSTANTS + 1
+        columns = INSTANTS
         return {
             k: (v.reshape(columns, -1).copy() if v.size > columns else v.copy()) for k, v in found.items()
         }
@@ -186,12 +187,12 @@ class Shooting:
         out, at, c = np.empty(self.n_out), self.parts, self.coordinates
         out[at["impulse"]], out[at["duration"]] = found["impulse"], found["duration"] / self.horizon
         out[at["energy"]], out[at["peak"]] = found["energy"], found["peak_force"] / FORCE
-        demand = found["demand"].reshape(INSTANTS + 1, -1)[1:]
+        demand = found["demand"].reshape(INSTANTS, -1)
         out[at["torque"]] = (demand / self.robot.torque_limit).ravel()
         if len(self._cone):
-            wrench = found["sole_wrench"].reshape(INSTANTS + 1, -1)[1:]
+            wrench = found["sole_wrench"].reshape(INSTANTS, -1)
             out[at["cone"]] = (wrench @ self._cone.T).ravel()
-        speeds = found["joint_velocity"].reshape(INSTANTS + 1, -1)
+        speeds = found["joint_velocity"].reshape(INSTANTS, -1)
         way = _weights(found["time"]) @ speeds
         rates, moved = self._of_joints(speeds[-1], state), self._of_joints(way, state)
         out[at["y"]], out[at["rate"]], out[at["legs"]] = y + moved, rates, legs + way[c.dependent]
@@ -227,26 +228,26 @@ class Shooting:
         ways[c.base + c.dependent, 2 * ny + np.arange(nl)] = 1.0
         ways[nv:, : 2 * ny + nl] = state.slopes
 
-        def by_z(name: str, first: int = 0) -> Array:
+        def by_z(name: str) -> Array:
             parts = (
                 self._jacobian.matrix(f"{name}_by_q"),
                 self._jacobian.matrix(f"{name}_by_v"),
                 by_bend[name],
             )
-            made = np.hstack([part[first:] for part in parts]) @ ways
-            made[:, 2 * ny + nl :] += self._jacobian.matrix(f"{name}_by_feedforward")[first:] * limit
+            made = np.hstack(parts) @ ways
+            made[:, 2 * ny + nl :] += self._jacobian.matrix(f"{name}_by_feedforward") * limit
             return np.asarray(made)
 
         limit = self.robot.torque_limit
         out, at = np.zeros((self.n_out, self.n_in)), self.parts
         out[at["impulse"]], out[at["duration"]] = by_z("impulse"), by_z("duration") / self.horizon
         out[at["energy"]], out[at["peak"]] = by_z("energy"), by_z("peak_force") / FORCE
-        out[at["torque"]] = by_z("demand", self.n) / np.tile(limit, INSTANTS)[:, None]
+        out[at["torque"]] = by_z("demand") / np.tile(limit, INSTANTS)[:, None]
         if len(self._cone):
-            wrench = by_z("sole_wrench", nl).reshape(INSTANTS, nl, self.n_in)
+            wrench = by_z("sole_wrench").reshape(INSTANTS, nl, self.n_in)
             out[at["cone"]] = (self._cone @ wrench).reshape(-1, self.n_in)
-        speeds, times = by_z("joint_velocity").reshape(INSTANTS + 1, self.n, self.n_in), by_z("time")
-        known = found["joint_velocity"].reshape(INSTANTS + 1, -1)
+        speeds, times = by_z("joint_velocity").reshape(INSTANTS, self.n, self.n_in), by_z("time")
+        known = found["joint_velocity"].reshape(INSTANTS, -1)
         way = np.tensordot(_weights(found["time"]), speeds, (0, 0))
         way += (0.5 * (known[1:] + known[:-1])).T @ np.diff(times, axis=0)
         _, rates, moved = self._outputs(z, state, found)

@@ -94,7 +94,7 @@ class Shot:
             self._legs = b.lift(
                 f"{name}legs after contact", self.outputs("legs"), place=place, **limits.of_legs
             )
-        instants = [f"instant {k + 1}" for k in range(INSTANTS)]
+        instants = [f"instant {k}" for k in range(INSTANTS)]
         b.rows.add(
             term=f"{limits.torque.name} in collision",
             place=place,

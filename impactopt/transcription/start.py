@@ -15,9 +15,11 @@ from impactopt.errors import InputError
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline, basis, quintic, rate_weights
 from impactopt.kinematics.statics import static_wrenches
+from impactopt.problem.terms import TargetSpeed
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.finer_contact import carry_contact, same_places
+from impactopt.transcription.guess import effective_mass, speed_that_leaves
 from impactopt.transcription.layout import Array, Group
 from impactopt.transcription.mesh import with_middles
 from impactopt.transcription.strike import StrikeTranscription
@@ -64,7 +66,8 @@ class Contact:
 
 
 def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: int = 0) -> Contact:
-    """The target reached by inverse kinematics, and met at ``speed`` [m/s] where joints are that fast.
+    """The target reached by inverse kinematics, and met at ``speed`` [m/s] where joints are that fast; where
+    the target's speed after the blow is bounded, at the nearest that a point mass may have.
 
     ``noise`` [rad] perturbs the posture, for several starts.
     """
@@ -74,6 +77,10 @@ def reached(t: ContactProgram, *, speed: float = 1.0, noise: float = 0.0, seed: 
     y[c.base :] += noise * rng.standard_normal(c.ny - c.base)
     limits = t.builder.limits
     y = np.clip(y, limits.y_lower, limits.y_upper)
+    bounds = p.extra(TargetSpeed)
+    if bounds is not None:
+        mass = effective_mass(c, p.strikers, p.normal, y, legs, np.zeros(c.ny))[0]
+        speed = speed_that_leaves(p.law, p.target, mass, speed, bounds.least, bounds.most)
     rates = strike_rates(c, p.strikers, y, legs, speed * p.normal)
     return Contact(y, rates * _within(rates[c.base :], 0.8 * limits.rate_limit[c.independent]), legs)
 

@@ -131,8 +131,12 @@ class StructuredProgram:
         return parts
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Every block's outputs, name -> (count, n_out)."""
+        """Every block's outputs, name -> (count, n_out); of several of one name the last's."""
         return {b.name: b.value(z).copy() for b, z in zip(self.blocks, self._lifted(x), strict=True)}
+
+    def all_outputs(self, x: Array) -> Array:
+        """Those of all blocks one after the other, as rows and lifted variables number them."""
+        return np.concatenate([b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)])
 
     def objective(self, x: Array) -> float:
         return float(self._c0 + self._c @ x + 0.5 * (x @ (self._Q @ x)))
@@ -144,10 +148,7 @@ class StructuredProgram:
         t = time.perf_counter()
         g = self._rows_matrix @ x + self._rows_const
         if self.blocks:
-            out = np.concatenate(
-                [b.value(z).ravel() for b, z in zip(self.blocks, self._lifted(x), strict=True)]
-            )
-            g[self._nonlinear] += out[self._row_out[self._nonlinear]]
+            g[self._nonlinear] += self.all_outputs(x)[self._row_out[self._nonlinear]]
         self.seconds += time.perf_counter() - t
         return g
 

@@ -130,7 +130,7 @@ class Transcription(ContactProgram):
         self.torques: list[Affine] = []
         self._add_motions()
         add_touch_rows(b, contact.state)
-        add_clearance(b, self.swing, self.follow)
+        add_clearance(b, self.swing, self.follow, self.hit.expected.target_state)
         self.hit.add_rows()
         self._add_links()
         if coordinates.legs:

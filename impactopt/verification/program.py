@@ -37,7 +37,7 @@ from impactopt.verification.drives import COASTED, Drives, node_torque
 from impactopt.verification.motions import Limits, Way, node_piece, rate_pieces
 from impactopt.verification.robot_motion import GRAVITY, RobotMotion
 from impactopt.verification.variables import Piece, Variables
-from impactopt.verification.worth import orientation_pieces, price_pieces, speed_pieces, worth_pieces
+from impactopt.verification.worth import GONE, orientation_pieces, price_pieces, speed_pieces, worth_pieces
 
 __all__ = ["Claims", "Program"]
 
@@ -120,7 +120,7 @@ class Program:
             self.missing += drives.missing
             rows, worth = worth_pieces(problem, self.blows[0])
             self.worth += worth
-            self.rows += [*rows, *speed_pieces(problem, self.blows[0])]
+            self.rows += [*rows, *speed_pieces(problem, self.blows[0], self.ways[1])]
             self.worth += price_pieces(problem, self.robot, self.ways, self.blows)
 
     # ------------------------------------------------------------------ parts
@@ -269,11 +269,16 @@ class Program:
         ahead, behind = float(np.mean(p.swing.duration)), float(np.mean(p.follow.duration))
         for s in map(float, swing.nodes[:-1]):
             add("no touch before contact", swing, s, (1 - s) * ahead, partial(surface, s))
-        if not p.target.stays:
+        slow = not p.target.stays and p.extra(TargetSpeed) is not None
+        if not (p.target.stays or slow):
             return
         name, first = f"target left by {striker}" if k else "target left", follow.at(0.0)
+
+        def left_at(s: float, v: Variables) -> float:
+            return v.one(name) + (s * v.one(GONE) if slow else 0.0)
+
         for s in map(float, follow.nodes[1:]):
-            add("no touch after contact", follow, s, s * behind, lambda v: v.one(name))
+            add("no touch after contact", follow, s, s * behind, partial(left_at, s))
 
         def left(v: Variables) -> Array:
             return np.array([along(first(v)[0]) - v.one(name)])

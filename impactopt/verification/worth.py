@@ -23,9 +23,10 @@ from impactopt.verification.motions import Way
 from impactopt.verification.robot_motion import RobotMotion
 from impactopt.verification.variables import Piece, Variables
 
-__all__ = ["orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
+__all__ = ["GONE", "orientation_pieces", "price_pieces", "speed_pieces", "worth_pieces"]
 
 Array = NDArray[np.float64]
+GONE = "target's way after contact"  # [m], a variable where the target may be slow then
 PEAK = 100.0  # [N] of which the peak force is a multiple
 
 
@@ -46,17 +47,23 @@ def orientation_pieces(
     return [Piece.of(value, [(term.name, "contact", [problem.striker], 1 / np.tan(angle), np.inf)])]
 
 
-def speed_pieces(problem: ImpactProblem, blow: Blow) -> list[Piece]:
-    """How fast the target is after the blow."""
+def speed_pieces(problem: ImpactProblem, blow: Blow, follow: Way) -> list[Piece]:
+    """How fast the target is after the blow, and how far it gets until the follow-through ends."""
     term, target = problem.extra(TargetSpeed), problem.target
     if term is None:
         return []
     last = len(blow.stages) - 1
 
     def value(v: Variables) -> Array:
-        return np.array([float(target.velocity(blow.get(v, "target state", last)))])
+        return np.array([float(target.velocity(blow.get(v, "target state", last), blow.target))])
 
-    return [Piece.of(value, [(term.name, "separation", ["normal"], term.least, term.most)])]
+    def way(v: Variables) -> Array:
+        return v.one(follow.T) * value(v) - v.one(GONE)
+
+    found = [Piece.of(value, [(term.name, "separation", ["normal"], term.least, term.most)])]
+    if not target.stays:
+        found.append(Piece.of(way, [(GONE, follow.place(1.0), [GONE], 0.0, 0.0)]))
+    return found
 
 
 def worth_pieces(problem: ImpactProblem, blow: Blow) -> tuple[list[Piece], list[Piece]]:

@@ -82,6 +82,16 @@ def test_a_contact_too_fast_for_the_step_is_refused_with_one_that_will_do() -> N
         assert result.impulse == pytest.approx(2.0 / (1 / 2.0 + 1 / 5.0), rel=accuracy)
 
 
+def test_a_contact_that_ends_within_one_explicit_step_is_refused() -> None:
+    """The joint draws a hand of 1e-6 m/s away after some 1e-8 s."""
+    sticky = {"contact_damping": 1e5, "contact_stiffness": 1e4}
+    model = slider(method="rk4", step=1e-5, horizon=0.01)
+    with pytest.raises(InputError, match="too soon for steps of 1e-05"):
+        model.collide([0.0], [1e-6], [-50.0], **sticky)
+    found = model.batch([[0.0]], [[1e-6]], [[-50.0]], outputs=("impulse",), **sticky)
+    assert np.isnan(found["impulse"]).all()
+
+
 def test_too_many_steps_are_refused_with_their_number() -> None:
     with pytest.raises(InputError, match=r"takes 200\d{5} steps"):
         slider(step=1e-8, horizon=0.2)

@@ -285,6 +285,15 @@ def test_hertz_without_damping_in_closed_form():
     assert found[1] == pytest.approx(constant * deepest / speed, abs=2e-5)
 
 
+@pytest.mark.parametrize("depth", [1e-8, 3e-7, 2e-6, 1e-4])
+def test_damped_hertz_separates_where_its_force_is_zero(depth):
+    """Below a micrometre too, where the damper's quarter power is rounded."""
+    law = HertzDamped(stiffness=5e6, damping=6e3)
+    rate = brentq(lambda r: law.branch(depth, r, False), -1.0, 0.0, xtol=1e-18)
+    assert law.separation(depth, rate) == pytest.approx(0.0, abs=1e-9 * law.stiffness * depth)
+    assert law.separation(depth, 0.9 * rate) > 0 > law.separation(depth, 1.1 * rate)
+
+
 @pytest.mark.parametrize("a", [0.1, 0.5, 1.5])
 @pytest.mark.parametrize("speed", [0.3, 3.0])
 def test_damped_hertz_restitution_depends_on_neither_speed_nor_stiffness(a, speed):

@@ -36,12 +36,13 @@ from impactopt.kinematics.stance import FixedBase
 from impactopt.problem.objectives import PeakForce, Penetration
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import TargetSpeed
+from impactopt.problem.terms import Slide, TargetSpeed
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Determined, Status, check_program
 from impactopt.solvers.sqp.condense import Condenser, find_eliminations
 from impactopt.solvers.sqp.kernels import Kernels
 from impactopt.transcription.clearance import CLEARANCE, HASTE
+from impactopt.transcription.guess import speed_that_leaves
 from impactopt.transcription.mesh import contact_mesh
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.start import first_iterate
@@ -430,6 +431,37 @@ def test_what_comes_is_caught_if_its_speed_after_contact_is_to_be_none() -> None
     plan = solved(p)
     assert plan.impulse == pytest.approx(0.5, abs=1e-3)
     assert plan.hand_speed < 0
+
+
+def test_the_striker_gives_way_to_a_target_that_comes_on_after_contact() -> None:
+    """At 0.2 m/s for 3 s: a hand that stops at once would be hit again."""
+    p = ball(-1.0, objectives=(PeakForce(weight=-0.01),), follow=Phase(duration=3.0, intervals=8))
+    plan = solved(dataclasses.replace(p, terms=(*p.terms, TargetSpeed(least=-0.3, most=-0.2))))
+    after = np.linspace(0.0, plan.follow.duration, 50)
+    x = plan.follow.sample(after)[0][:, 0]
+    surface = x[0] + plan.collision.outcome["speed_m_s"] * after
+    assert (x[1:] <= (surface - np.minimum(CLEARANCE, HASTE * after))[1:] + 1e-3).all()
+
+
+def test_lifted_variables_are_found_beside_rows_on_demand() -> None:
+    """Which have a block of a name that is there already."""
+    p = ball(-1.0)
+    t = transcribed(dataclasses.replace(p, terms=(*p.terms, TargetSpeed(least=-0.3, most=-0.2), Slide())))
+    x = t.with_lifted(first_iterate(t))
+    rows = t.program.constraints(x)
+    lifted = [
+        i for i in range(t.program.m) if t.program.row_name(i).startswith(("target's way", "target left"))
+    ]
+    assert len(lifted) == 2 and np.abs(rows[lifted]).max() < 1e-9
+
+
+def test_a_catch_starts_from_a_hand_that_goes_back() -> None:
+    """Closed form: an undamped spring leaves the target at rest where 2 M u = (M - m) times its speed."""
+    law, coming = SpringDamper(stiffness=1e4, damping=0.0), FreeMass(mass=0.5, initial_velocity=-5.0)
+    for given in (-3.0, 1.0):
+        speed = speed_that_leaves(law, coming, MASS, given, -0.01, 0.01)
+        assert speed == pytest.approx((MASS - 0.5) * -5.0 / (2 * MASS), abs=0.05)
+    assert speed_that_leaves(law, coming, MASS, 1.0, -np.inf, np.inf) == 1.0
 
 
 def test_a_bound_on_the_targets_speed_is_kept() -> None:

@@ -105,6 +105,21 @@ def test_the_zmp_between_nodes_by_inverse_dynamics(biped_plan: Planned, margin: 
     assert nodes_to_add(plan, known).total == found.total + 2
 
 
+def test_legs_between_nodes_are_no_faster_than_they_may_be(biped_plan: Planned) -> None:
+    """Their rates follow from the soles', so no control point bounds them."""
+    plan = biped_plan.plan
+    c, robot, places = plan.coordinates, plan.problem.robot, middles(plan.follow_nodes)
+    legs, fastest = c.split(plan.problem.start_posture)[1], []
+    for y, yd, ydd in zip(*plan.follow.sample(places * plan.follow.duration), strict=True):
+        legs = c.solve_legs(y, legs)
+        fastest.append(np.abs(c.complete_motion(y, yd, ydd, legs)[1][c.base + c.dependent]).max())
+    limit = robot.velocity_limit.copy()
+    limit[c.dependent] = np.sort(fastest)[-2] * 1.001
+    slow = dataclasses.replace(plan.problem, robot=dataclasses.replace(robot, velocity_limit=limit))
+    found = nodes_to_add(dataclasses.replace(plan, problem=slow), NO_MORE)
+    assert found.follow == (places[int(np.argmax(fastest))],)
+
+
 def finer(t: Transcription) -> Transcription:
     nodes = MoreNodes(
         swing=tuple(middles(t.swing_nodes)[[1, -1]]), follow=tuple(middles(t.follow_nodes)[[0]])

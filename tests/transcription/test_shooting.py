@@ -61,8 +61,26 @@ def test_it_predicts_what_the_sdc_does() -> None:
     assert hit.impulse == pytest.approx(alone.impulse, rel=1e-5)
     assert hit.compression + hit.restitution == pytest.approx(alone.duration, rel=1e-5)
     assert np.abs(hit.collision.torque / problem.robot.torque_limit).max() <= 0.85 + 1e-6
+    again = optimize_strike(problem, method="shooting", start=found)
+    assert again.impulse == pytest.approx(hit.impulse, rel=1e-4)
+    with pytest.raises(InputError, match="shooting has other variables"):
+        optimize_strike(problem, start=found)
     # the whole equation of motion says the same of a hammer's blow
     assert hit.impulse == pytest.approx(optimize_strike(problem).impulse, rel=0.02)
+
+
+def test_rows_hold_from_the_first_touch_on() -> None:
+    """A damped contact jumps to its force at once, and soles bear most in the milliseconds after that."""
+    t = of(biped_problem())
+    rows = [t.program.row_name(i) for i in range(t.program.m)]
+    x, shot = strike_iterate(t), t.hit.expected
+    found = shot.shooting.collide(shot._z.evaluate(x))
+    assert found["time"][0] == 0.0 and found["force"][0] > 1.0
+    first = shot.shooting.value(shot._z.evaluate(x))[shot.shooting.parts["cone"]]
+    wrench = found["sole_wrench"][0] @ shot.shooting._cone.T
+    np.testing.assert_allclose(first[: len(wrench)], wrench, rtol=1e-9, atol=1e-12)
+    for term in ("contact wrench cone", "torque limit in collision"):
+        assert any(row.startswith(term) and "instant 0" in row for row in rows)
 
 
 def test_what_has_no_slopes_is_refused() -> None:

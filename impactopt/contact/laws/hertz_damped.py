@@ -76,9 +76,13 @@ class HertzDamped(ContactLaw):
         return p["stiffness"] * power(penetration, 1.5) + damper
 
     def separation(self, penetration: Any, rate: Any, parameters: Parameters | None = None) -> Any:
-        """k (x - (d |rate| / k)^0.8): zero with the force, and with a slope there without damping too."""
+        """k (x - (d |rate| / k)^0.8): zero with the force, and with a slope there without damping too.
+
+        Where the quarter power is rounded, d is as much less.
+        """
         p = self.parameters if parameters is None else parameters
-        return p["stiffness"] * (penetration - power(-p["damping"] * rate / p["stiffness"], 0.8))
+        damping = p["damping"] * _rounded_share(penetration)
+        return p["stiffness"] * (penetration - power(-damping * rate / p["stiffness"], 0.8))
 
 
 def _quarter_power(x: Any) -> Any:
@@ -88,3 +92,9 @@ def _quarter_power(x: Any) -> Any:
     s = x / _ROUNDED
     parabola = choose(x > 0, _ROUNDED**0.25 / 4 * s * (7 - 3 * s), 0.0 * s)
     return choose(deep, safe**0.25, parabola)
+
+
+def _rounded_share(x: Any) -> Any:
+    """`_quarter_power` over x^(1/4): 1 above `_ROUNDED`."""
+    s = choose(x > _ROUNDED, 1.0 + 0.0 * x, x / _ROUNDED)
+    return power(s, 0.75) * (7 - 3 * s) / 4

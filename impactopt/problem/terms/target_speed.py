@@ -20,7 +20,8 @@ from impactopt.problem.violation import Measure
 class TargetSpeed(Term):
     """The target's speed at separation is bounded.
 
-    Along the normal: what comes towards the striker has one below zero. Zero at both ends is a catch.
+    Along the normal: what comes towards the striker has one below zero. Zero at both ends is a catch. As it
+    may be slow then, the striker keeps behind it after contact.
     """
 
     name: ClassVar[str] = "target speed"
@@ -34,7 +35,11 @@ class TargetSpeed(Term):
             raise InputError(f"TargetSpeed: least is {self.least:g} m/s, most {self.most:g} m/s; swap them")
 
     def blocks(self, problem: Any, coordinates: Any) -> dict[str, BlockRecipe]:
-        return {"target_speed": BlockRecipe(lambda: speed(problem.target), problem.target.formula())}
+        formula = problem.target.formula()
+        return {
+            "target_speed": BlockRecipe(lambda: speed(problem.target), formula),
+            "target_way": BlockRecipe(lambda: way(problem.target), formula),
+        }
 
     def add_rows(self, program: Any) -> None:
 
@@ -58,6 +63,18 @@ class TargetSpeed(Term):
 
 def speed(target: Target) -> BlockExpression:
     """z = the target's state;  p = its numbers;  out = speed of its surface along the normal [m/s]."""
+    state, numbers, found = _speed(target)
+    return make_block([state], [numbers], {"speed": found}, lanes=2)
+
+
+def way(target: Target) -> BlockExpression:
+    """z = the target's state, T [s];  p = its numbers;  out = how far its surface goes in T [m]."""
+    state, numbers, found = _speed(target)
+    T = ca.SX.sym("T")
+    return make_block([state, T], [numbers], {"way": T * found}, lanes=2)
+
+
+def _speed(target: Target) -> tuple[Any, Any, Any]:
     state, numbers = ca.SX.sym("state", target.n_states), ca.SX.sym("numbers", len(target.parameters))
     named = {name: numbers[i] for i, name in enumerate(target.parameters)}
-    return make_block([state], [numbers], {"speed": ca.SX(target.velocity(state, named))}, lanes=2)
+    return state, numbers, ca.SX(target.velocity(state, named))

@@ -158,7 +158,7 @@ def by_lsoda(
     size = np.full(start.size, 1e-9)
     size[0], size[1] = 1e-9 * speed * 1e-3, 1e-9 * speed / max(m, 1e-9)
     way = solve_ivp(
-        flow, (0.0, model.horizon), start, method="LSODA", rtol=1e-9, atol=np.minimum(size, 1e-9) * 1e-3,
+        flow, (0.0, model.horizon), start, method="LSODA", rtol=1e-12, atol=np.minimum(size, 1e-9) * 1e-3,
         events=over, max_step=model.horizon / 50, first_step=min(1e-9, model.step_length * 1e-3),
     )  # fmt: skip
     return Expected(impulse=float(way.y[1, -1]), duration=float(way.t[-1]), separated=way.status == 1)

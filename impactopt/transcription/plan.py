@@ -14,6 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.kinematics.closed_legs import close_legs
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
@@ -315,12 +316,9 @@ class Plan:
     def closed(self, y: Array) -> Array:
         """Configurations (k, nq) of independent coordinates (k, ny), one near the next."""
         c = self.coordinates
-        legs = c.split(self.problem.start_posture)[1]
-        q = np.zeros((len(y), self.problem.robot.nq))
-        for k, row in enumerate(y):
-            legs = c.solve_legs(row, legs)
-            q[k] = c.join(row, legs)
-        return q
+        legs = close_legs(c, y, c.split(self.problem.start_posture)[1])
+        q = [c.join(*of_instant) for of_instant in zip(y, legs, strict=True)]
+        return np.reshape(q, (len(y), self.problem.robot.nq))
 
     def margins(
         self, trajectory: Trajectory | None = None, collision: PlannedCollision | None = None
@@ -366,9 +364,9 @@ def complete_reference(
     torque, ground = np.zeros((n, robot.n)), np.zeros((n, 6))
     # least correction of the interpolated wrenches, moments dear: the soles share the load as planned
     scale = np.array([1, 1, 1, 10, 10, 10] * len(c.legs))
+    closed = close_legs(c, y, legs)
     for k in range(n):
-        legs = c.solve_legs(y[k], legs)
-        q[k], v[k], a[k] = c.complete_motion(y[k], yd[k], ydd[k], legs)
+        q[k], v[k], a[k] = c.complete_motion(y[k], yd[k], ydd[k], closed[k])
         tau = np.array(pin.rnea(model, data, q[k], v[k], a[k]))
         if c.legs:
             jac, place = c.sole_jacobians(q[k])

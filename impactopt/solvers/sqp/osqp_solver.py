@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from typing import Any
 
 import numpy as np
 import osqp
 import scipy.sparse as sp
 
-from impactopt.solvers.program import Matrix, Vector
+from impactopt.solvers.program import Vector
 from impactopt.solvers.sqp.active_set import ActiveSetSolver
 from impactopt.solvers.sqp.answers import HOPELESS, SMALL, answer, no_answer, split
 from impactopt.solvers.sqp.qp import QPSolution, QPStatus, QuadraticProgram
@@ -134,10 +135,13 @@ class OsqpSolver:
             return refined.x, refined.y, refined.error
         return x, unit, worst
 
-    def _load(self, qp: QuadraticProgram, C: Matrix, lower: Vector, upper: Vector) -> bool:
+    def _load(self, qp: QuadraticProgram, C: Any, lower: Vector, upper: Vector) -> bool:
         """Give OSQP the data, in place while the patterns are those of the last QP. False if refused."""
-        P = sp.csc_matrix(sp.triu(qp.P, format="csc"))
-        P.sort_indices()
+        if qp.dense:
+            P, C = _whole_triangle(qp.P), _rows_and_bounds(C[: qp.m])
+        else:
+            P = sp.csc_matrix(sp.triu(qp.P, format="csc"))
+            P.sort_indices()
         pattern = [P.indptr, P.indices, C.indptr, C.indices]
         if self._solver is not None and all(map(np.array_equal, pattern, self._pattern)):
             self._solver.update(q=qp.q, l=lower, u=upper)
@@ -157,3 +161,20 @@ class OsqpSolver:
         self._solver, self._pattern = solver, pattern
         self.setups += 1
         return True
+
+
+def _whole_triangle(P: np.ndarray) -> Any:
+    """The upper triangle of an array (n, n) as a csc_matrix, zeros with it: the pattern stays."""
+    n = len(P)
+    j, i = np.tril_indices(n)
+    start = np.cumsum([0, *range(1, n + 1)])
+    return sp.csc_matrix((P[i, j], i, start), shape=(n, n))
+
+
+def _rows_and_bounds(A: np.ndarray) -> Any:
+    """[A; I] of an array (m, n) as a csc_matrix, zeros of A with it."""
+    m, n = A.shape
+    data = np.vstack([A, np.ones(n)]).T.ravel()
+    i = np.tile(np.arange(m + 1), (n, 1))
+    i[:, m] += np.arange(n)
+    return sp.csc_matrix((data, i.ravel(), np.arange(n + 1) * (m + 1)), shape=(m + n, n))

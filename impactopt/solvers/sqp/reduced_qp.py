@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 import scipy.sparse as sp
 
 from impactopt.solvers.program import Matrix, Vector, row_violations
@@ -150,15 +151,22 @@ def _elastic(
     elastic = np.concatenate([below, above])
     k, n = elastic.size, c.size
     box = np.full(n, radius)
+    small = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
-        A, c = sp.hstack([sp.csc_array(A), S]), np.concatenate([c, prices[elastic]])
-        B = sp.block_diag([B, sp.diags_array(_SLACK_CURVATURE * prices[elastic])])
+        bend = _SLACK_CURVATURE * prices[elastic]
+        c = np.concatenate([c, prices[elastic]])
+        if small:
+            S = np.zeros((lower.size, k))
+            S[elastic, np.arange(k)] = sign
+            A, B = np.hstack([A, S]), la.block_diag(B, np.diag(bend))
+        else:
+            S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
+            A, B = sp.hstack([sp.csc_array(A), S]), sp.block_diag([B, sp.diags_array(bend)])
     return QuadraticProgram(
-        P=sp.csc_array(B),
+        P=B if small else sp.csc_array(B),
         q=c,
-        A=sp.csc_array(A),
+        A=A if small else sp.csc_array(A),
         lower=lower,
         upper=upper,
         x_lower=np.concatenate([-box, np.zeros(k)]),

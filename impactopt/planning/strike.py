@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.gears import gear_caution
-from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
+from impactopt.planning.keeping_apart import FAR, NEAR, Margins, Rows, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     Budget,
@@ -220,17 +220,34 @@ def clear_strike(
     not, and on from there; its result has the effort of all.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
-    interior = budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
-    if interior and not t.coordinates.soles:
+    if _interior(budget) and not t.coordinates.soles:
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
         return _settled(budget, t, budget.run(t.program, x0))
-    known = {} if known is None else known
-    t = t.with_apart({**rows_near(t, x0, margins, FAR), **known})
-    t, result = _settled(budget, t, budget.run(t.program, x0))
-    exact = t, result  # the last one that is solved to its end; the others lead there
+    known, before = {} if known is None else known, list[SolverResult]()
+    for within in (NEAR, FAR):  # few rows are sooner met, and cost less; where they lead nowhere, all at once
+        first = t.with_apart({**rows_near(t, x0, margins, within), **known})
+        found, result = _round_by_round(budget, margins, first, x0, known)
+        result = one_after_the_other(before.pop(), result) if before else result
+        if result.status not in _STUCK or budget.left == 0:
+            break
+        before.append(result)
+    return found, result
+
+
+def _round_by_round(
+    budget: Budget, margins: Margins, t: StrikeTranscription, x0: Array, known: Rows
+) -> tuple[StrikeTranscription, SolverResult]:
+    """A program with its first rows between bodies, and then with those that its solutions lack, which
+    ``known`` gets too.
+
+    The interior-point method goes a part of the way only, as long as there will be more rows.
+    """
+    interior = _interior(budget)
+    t, result = _settled(budget, t, (_roughly(budget) if interior else budget).run(t.program, x0))
+    exact = None if interior else (t, result)  # the last one that is solved to its end; others lead there
     for again in reversed(range(ROUNDS)):
-        rough = result is not exact[1]
+        rough = exact is None or result is not exact[1]
         if not result.status.usable or (budget.left == 0 and not rough):
             break
         more = missing_rows(t, result.x, margins, all_along=True)
@@ -242,18 +259,23 @@ def clear_strike(
         roughly = interior and deep and again > 0
         solving = _roughly(budget) if roughly else budget
         new = solving.run(finer.program, carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
-        if new.status in _STUCK and budget.left != 0:
+        if interior and new.status in _STUCK and budget.left != 0:  # from there, but without multipliers
             roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
         steps, t, result = new.iterations, finer, one_after_the_other(result, new)
         if new.status is Status.INTERRUPTED:
             break
         if not new.status.usable:  # what is too near stays so
-            return exact[0], with_effort_of(exact[1], result)
+            return (t, result) if exact is None else (exact[0], with_effort_of(exact[1], result))
         if not roughly:
             exact = t, result
             if not steps:
                 break  # new rows are met, as they are rounded: the next ones would be the same
     return t, result
+
+
+def _interior(budget: Budget) -> bool:
+    """Whether the solver is the interior-point method."""
+    return budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
 
 
 def _clean_strike(

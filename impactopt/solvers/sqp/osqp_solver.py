@@ -138,7 +138,7 @@ class OsqpSolver:
     def _load(self, qp: QuadraticProgram, C: Any, lower: Vector, upper: Vector) -> bool:
         """Give OSQP the data, in place while the patterns are those of the last QP. False if refused."""
         if qp.dense:
-            P, C = _whole_triangle(qp.P), _rows_and_bounds(C[: qp.m])
+            P, C = sp.csc_matrix(np.triu(qp.P)), sp.csc_matrix(C)
         else:
             P = sp.csc_matrix(sp.triu(qp.P, format="csc"))
             P.sort_indices()
@@ -147,7 +147,7 @@ class OsqpSolver:
             self._solver.update(q=qp.q, l=lower, u=upper)
             self._solver.update(Px=P.data, Ax=C.data)
             return True
-        solver = osqp.OSQP()
+        solver = osqp.OSQP(algebra="builtin")  # to look for others takes longer than a small QP
         try:
             solver.setup(
                 P, qp.q, sp.csc_matrix(C), lower, upper,
@@ -161,20 +161,3 @@ class OsqpSolver:
         self._solver, self._pattern = solver, pattern
         self.setups += 1
         return True
-
-
-def _whole_triangle(P: np.ndarray) -> Any:
-    """The upper triangle of an array (n, n) as a csc_matrix, zeros with it: the pattern stays."""
-    n = len(P)
-    j, i = np.tril_indices(n)
-    start = np.cumsum([0, *range(1, n + 1)])
-    return sp.csc_matrix((P[i, j], i, start), shape=(n, n))
-
-
-def _rows_and_bounds(A: np.ndarray) -> Any:
-    """[A; I] of an array (m, n) as a csc_matrix, zeros of A with it."""
-    m, n = A.shape
-    data = np.vstack([A, np.ones(n)]).T.ravel()
-    i = np.tile(np.arange(m + 1), (n, 1))
-    i[:, m] += np.arange(n)
-    return sp.csc_matrix((data, i.ravel(), np.arange(n + 1) * (m + 1)), shape=(m + n, n))

@@ -64,12 +64,20 @@ class ReducedQP:
         """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
         return self._rows(point)[np.flatnonzero(np.abs(self._unit) > _ACTIVE)]
 
+    def weigh(self, point: Point) -> None:
+        """Weigh rows in the merit function by what the free variables change them, so that a price suits all
+        alike: rows of gears change ten thousand times as fast with accelerations, which other rows determine.
+        """
+        self._rows(point)
+        self._program.weigh(point)
+        self._program.weights[self._reduction.rows] = 1.0 / np.clip(self._norms, 1.0, 1e6)
+
     def _rows(self, point: Point) -> Matrix:
         """Unit rows (k, r): those that are not eliminated, then of the bounds."""
         if self._at is not point:
-            reduction, T = self._reduction, self._reduction.T
-            unit = sp.diags_array(1.0 / point.row_norms[reduction.rows])
-            own, bounds = unit @ (point.jacobian.tocsr()[reduction.rows] @ T), T[reduction.bounded]
+            reduction = self._reduction
+            own, self._norms = reduction.rows_by_free(point.jacobian)
+            own, bounds = sp.diags_array(1.0 / self._norms) @ own, reduction.T[reduction.bounded]
             self._at = point
             self._every = sp.vstack([own, bounds], "csr") if reduction.sparse else np.vstack([own, bounds])
         return self._every
@@ -85,17 +93,16 @@ class ReducedQP:
         time_limit: float | None,
     ) -> Solved | None:
         """The step where rows are g (m,) and have the point's slopes; None if the QP solver fails."""
-        p, reduction, norms = self._program, self._reduction, point.row_norms
+        p, reduction, every = self._program, self._reduction, self._rows(point)
         rows, bounded, T = reduction.rows, reduction.bounded, reduction.T
         d0 = reduction.normal(g)
         longest = (_CAREFUL if self.careful or not model.leads else _LARGEST) * radius
         d0 *= min(1.0, longest / max(float(np.abs(d0).max(initial=0.0)), 1e-300))
-        after, scale = g + point.jacobian @ d0, norms[rows]
+        after, scale = g + point.jacobian @ d0, self._norms
         x = point.x + d0
         lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
         upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
-        prices = price * np.concatenate([(p.weights * norms)[rows], np.ones(bounded.size)])
-        every = self._rows(point)
+        prices = price * np.concatenate([p.weights[rows] * scale, np.ones(bounded.size)])
         reach = radius * abs(every).sum(axis=1)  # how much a row can change
         off = np.maximum(lower, -upper)
         soft = off > _SOFT

@@ -112,11 +112,9 @@ class _LegChain:
         found[left] = False
         return found
 
-    def _off(
-        self, rotation: Array, position: Array, joints: Array, legs: Array
-    ) -> tuple[Array, Array]:
-        """Twists (k, 6) that would lead the sole to its place, in its own frame, and the Jacobian (k, 6, 6) of
-        the leg's joints in it.
+    def _off(self, rotation: Array, position: Array, joints: Array, legs: Array) -> tuple[Array, Array]:
+        """Twists (k, 6) that would lead the sole to its place, in its own frame, and the Jacobian (k, 6, 6)
+        of the leg's joints in it.
         """
         axes, points = np.zeros((6, len(legs), 3)), np.zeros((6, len(legs), 3))
         slides = np.zeros(6, dtype=bool)
@@ -153,7 +151,7 @@ def _turned(axis: Array, angle: Array) -> Array:
 
 
 def _logarithm(rotation: Array, shift: Array) -> Array:
-    """Twists (k, 6) that lead along the placements of rotations (k, 3, 3) and shifts (k, 3) in a unit of time,
+    """Twists (k, 6) that lead to the placements of rotations (k, 3, 3) and shifts (k, 3) in a unit of time,
     for turns by less than half of a circle.
     """
     half = 0.5 * (rotation - rotation.transpose(0, 2, 1))

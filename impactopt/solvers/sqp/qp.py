@@ -19,16 +19,16 @@ class QuadraticProgram:
 
     Attributes
     ----------
-    P : full symmetric, positive semidefinite (n, n): csc_array; or an array, where the QP is small, and A too.
+    P : full symmetric, positive semidefinite (n, n): csc_array, or, as A, an array where the QP is small.
     q : (n,).
     A : (m, n), as P.
     lower, upper : (m,), equal for equalities, +-inf for none.
     x_lower, x_upper : (n,), likewise.
     """
 
-    P: Matrix | np.ndarray
+    P: Matrix
     q: Vector
-    A: Matrix | np.ndarray
+    A: Matrix
     lower: Vector
     upper: Vector
     x_lower: Vector

@@ -84,9 +84,7 @@ def active_set(qp: QuadraticProgram, x: Vector, y: Vector) -> np.ndarray:
     return np.where(high, 1, np.where(y + (v - lower) < 0, -1, 0))
 
 
-def solve_equality_qp(
-    P: Matrix | np.ndarray, q: Vector, A: Matrix | np.ndarray, b: Vector
-) -> tuple[Vector, Vector] | None:
+def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vector, Vector] | None:
     """Minimize 1/2 x'Px + q'x subject to A x = b, also with dependent rows: regularized, then refined."""
     n, m = q.size, b.size
     K: Any

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.gears import gear_caution
-from impactopt.planning.keeping_apart import FAR, NEAR, Margins, Rows, rows_near, spots_of
+from impactopt.planning.keeping_apart import FAR, NEAR, Margins, Rows, Spots, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     Budget,
@@ -44,7 +44,7 @@ from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-ROUNDS = 6  # of more rows between bodies
+ROUNDS = 10  # of more rows between bodies
 AGAIN = 3  # from the start, with all rows that are known by then
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
 # solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
@@ -250,10 +250,11 @@ def _round_by_round(
         rough = exact is None or result is not exact[1]
         if not result.status.usable or (budget.left == 0 and not rough):
             break
-        more = missing_rows(t, result.x, margins, all_along=True)
+        spots = spots_of(t, result.x)
+        more = missing_rows(t, result.x, margins, all_along=True, spots=spots)
         if not more and not rough:
             break
-        deep = bool(more) and _depth(t, result.x, margins, more) > 0
+        deep = bool(more) and _depth(spots, margins, more) > 0
         known |= more
         finer = t.with_apart({**t.apart_rows, **more}) if more else t
         roughly = interior and deep and again > 0
@@ -288,8 +289,9 @@ def _clean_strike(
         result = one_after_the_other(before.pop(), result) if before else result
         if margins is None or not result.status.usable:
             return t, result
-        left = missing_rows(t, result.x, margins, all_along=True)
-        depth = _depth(t, result.x, margins, left)
+        spots = spots_of(t, result.x)
+        left = missing_rows(t, result.x, margins, all_along=True, spots=spots)
+        depth = _depth(spots, margins, left)
         if depth <= 0:
             return t, result
         known |= left
@@ -315,9 +317,8 @@ def _roughly(budget: Budget) -> Budget:
     return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in ROUGHLY.items()}})
 
 
-def _depth(t: StrikeTranscription, x: Array, margins: Margins, rows: Iterable[ApartRow]) -> float:
+def _depth(spots: Spots, margins: Margins, rows: Iterable[ApartRow]) -> float:
     """[m] that any two of these bodies are in each other."""
-    spots = spots_of(t, x)
     places = ((spots.names.index(row.place), (row.joint, row.other)) for row in rows)
     return max((-margins.bodies.exact(spots.at, k, pair) for k, pair in places), default=0.0)
 

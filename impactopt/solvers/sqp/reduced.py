@@ -86,17 +86,17 @@ class ReducedRun(Run):
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
         try:
-            return self._attempts(start, y, z) if self._weighed(start) else Status.FAILED
+            return self._attempts(start, y, z) if self._weighed(start, y) else Status.FAILED
         finally:
             self._reduction.release()
 
-    def _weighed(self, start: Point) -> bool:
+    def _weighed(self, start: Point, y: Vector) -> bool:
         """Weigh the rows at the start; False: they do not determine their variables there."""
         try:
             self._reduction.load(start)
         except np.linalg.LinAlgError:
             return False
-        self._qp.weigh(start)
+        self._qp.weigh(start, y, self.options.price)
         return True
 
     def _attempts(self, start: Point, y: Vector, z: Vector) -> Status:

@@ -18,6 +18,7 @@ from impactopt.solvers.sqp.reduction import Reduction
 _NEAR, _NEAREST = 0.1, 2
 _MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
 _SLACK_CURVATURE = 1e-4  # of the price
+_ABOVE = 2.0  # times a multiplier that is known: a price
 _ACTIVE = 1e-4  # multiplier of a unit row that holds
 _SOFT = 1e-9  # violation where t = 0 of rows that may stay violated
 _BEYOND = 0.5  # of the way that a row can change inside the radius: what is violated by more is given up
@@ -64,13 +65,18 @@ class ReducedQP:
         """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
         return self._rows(point)[np.flatnonzero(np.abs(self._unit) > _ACTIVE)]
 
-    def weigh(self, point: Point) -> None:
-        """Weigh rows in the merit function by what the free variables change them, so that a price suits all
-        alike: rows of gears change ten thousand times as fast with accelerations, which other rows determine.
+    def weigh(self, point: Point, y: Vector, price: float) -> None:
+        """Weigh rows in the merit function, so that a price suits all alike.
+
+        By what the free variables change them, if that is less than all do: rows of gears change ten thousand
+        times as fast with accelerations, which other rows determine. And by known multipliers y (m,), which a
+        price has to exceed.
         """
         self._rows(point)
         self._program.weigh(point)
-        self._program.weights[self._reduction.rows] = 1.0 / np.clip(self._norms, 1.0, 1e6)
+        weights, rows = self._program.weights, self._reduction.rows
+        by_free = 1.0 / np.clip(self._norms, 1.0, 1e6)
+        weights[rows] = np.maximum(np.maximum(weights[rows], by_free), _ABOVE * np.abs(y[rows]) / price)
 
     def _rows(self, point: Point) -> Matrix:
         """Unit rows (k, r): those that are not eliminated, then of the bounds."""

@@ -218,16 +218,24 @@ def clear_strike(
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
     not, and on from there; its result has the effort of all.
+
+    start : variables (n,); or a result of this program but for other rows, such as those on demand: then it
+        goes on from there, and begins anew only where that leads nowhere.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
+    goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m
     if _interior(budget) and not t.coordinates.soles:
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
-        return _settled(budget, t, budget.run(t.program, x0))
+        return _settled(budget, t, budget.run(t.program, start if goes_on else x0, BARRIER_DEEP))
     known, before = {} if known is None else known, list[SolverResult]()
-    for within in (NEAR, FAR):  # few rows are sooner met, and cost less; where they lead nowhere, all at once
-        first = t.with_apart({**rows_near(t, x0, margins, within), **known})
-        found, result = _round_by_round(budget, margins, first, x0, known)
+    # few rows are sooner met, and cost less; where they lead nowhere, all at once
+    for within in (None, NEAR, FAR) if goes_on and not known else (NEAR, FAR):
+        if within is None:
+            found, result = _round_by_round(budget, margins, t, start, known)
+        else:
+            first = t.with_apart({**rows_near(t, x0, margins, within), **known})
+            found, result = _round_by_round(budget, margins, first, x0, known)
         result = one_after_the_other(before.pop(), result) if before else result
         if result.status not in _STUCK or budget.left == 0:
             break
@@ -236,7 +244,7 @@ def clear_strike(
 
 
 def _round_by_round(
-    budget: Budget, margins: Margins, t: StrikeTranscription, x0: Array, known: Rows
+    budget: Budget, margins: Margins, t: StrikeTranscription, start: Array | SolverResult, known: Rows
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A program with its first rows between bodies, and then with those that its solutions lack, which
     ``known`` gets too.
@@ -244,7 +252,8 @@ def _round_by_round(
     The interior-point method goes a part of the way only, as long as there will be more rows.
     """
     interior = _interior(budget)
-    t, result = _settled(budget, t, (_roughly(budget) if interior else budget).run(t.program, x0))
+    first = (_roughly(budget) if interior else budget).run(t.program, start, BARRIER_DEEP)
+    t, result = _settled(budget, t, first)
     exact = None if interior else (t, result)  # the last one that is solved to its end; others lead there
     for again in reversed(range(ROUNDS)):
         rough = exact is None or result is not exact[1]

@@ -181,3 +181,17 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     monkeypatch.setattr(strikes, "clear_strike", lambda *_: (strike, solved))
     _, result = strikes._clean_strike(budget, Margins(strike.problem), strike, strike_iterate(strike))
     assert result.status is Status.FAILED and "12.0 mm in each other" in result.message
+
+
+def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(
+    strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: {})
+    ends = Status.SOLVED, Status.FAILED, Status.SOLVED, Status.SOLVED
+    budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
+    solved = budget.run(strike.program, strike_iterate(strike))
+    _, result = strikes.clear_strike(budget, Margins(strike.problem), strike, solved)
+    _, on, anew, _ = budget.asked
+    assert on["given"] is solved and on["from"] == strikes.BARRIER_DEEP
+    assert anew["given"] is None, "where that leads nowhere"
+    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS

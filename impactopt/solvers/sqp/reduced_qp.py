@@ -62,8 +62,12 @@ class ReducedQP:
         self._unit = np.concatenate([y[reduction.rows], z[reduction.bounded]])
 
     def active(self, point: Point) -> Matrix:
-        """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
-        return self._rows(point)[np.flatnonzero(np.abs(self._unit) > _ACTIVE)]
+        """Rows (a, r) of what held in the last QP, in the directions that are left; of all variables their
+        gradients would be one long, as those that cease to hold are not to be held by the model's curvature.
+        """
+        every, which = self._rows(point), np.flatnonzero(np.abs(self._unit) > _ACTIVE)
+        own = self._norms / point.row_norms[self._reduction.rows]
+        return sp.diags_array(np.append(own, np.ones(every.shape[0] - own.size))[which]) @ every[which]
 
     def weigh(self, point: Point, y: Vector, price: float) -> None:
         """Weigh rows in the merit function, so that a price suits all alike.

@@ -14,7 +14,7 @@ from support.small_plans import changed
 
 from impactopt.bodies.shapes import Obstacle
 from impactopt.planning import strike as strikes
-from impactopt.planning.keeping_apart import Margins, rows_near
+from impactopt.planning.keeping_apart import FAR, NEAR, Margins, rows_near
 from impactopt.planning.multistart import Budget
 from impactopt.planning.too_near import missing_rows
 from impactopt.solvers.program import SolverResult, Status
@@ -128,12 +128,17 @@ def test_where_few_rows_lead_nowhere_it_begins_with_those_of_all_that_is_far(
     strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     within = list[float]()
-    monkeypatch.setattr(strikes, "rows_near", lambda *given: within.append(given[-1]) or {})
+
+    def near(*given: Any) -> dict[Any, Any]:
+        within.append(given[-1])
+        return {}
+
+    monkeypatch.setattr(strikes, "rows_near", near)
     monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: {})
     ends = Status.FAILED, Status.SOLVED, Status.SOLVED
     budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
     _, result = strikes.clear_strike(budget, Margins(strike.problem), strike, strike_iterate(strike))
-    assert within == [strikes.NEAR, strikes.FAR]
+    assert within == [NEAR, FAR]
     assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS, "the effort of all is told"
 
 

@@ -70,13 +70,11 @@ class Places:
     def of(cls, robot: Robot, q: Array, travel: Array, phase: Index) -> Places:
         """Of configurations q (k, nq)."""
         model, data = robot.model, robot.model.createData()
-        rotation = np.zeros((len(q), model.njoints, 3, 3))
-        translation = np.zeros((len(q), model.njoints, 3))
+        placements = np.zeros((len(q), model.njoints, 4, 4))
         for k, posture in enumerate(q):
             pin.forwardKinematics(model, data, posture)
-            for j in range(1, model.njoints):
-                rotation[k, j], translation[k, j] = data.oMi[j].rotation, data.oMi[j].translation
-        rotation[:, 0] = np.eye(3)
+            placements[k] = [joint.homogeneous for joint in data.oMi]
+        rotation, translation = placements[..., :3, :3].copy(), placements[..., :3, 3].copy()
         return cls(rotation=rotation, translation=translation, travel=travel, phase=phase)
 
     def __len__(self) -> int:
@@ -100,8 +98,10 @@ class Near:
     def least(self) -> Near:
         """Of each instant and pair the sphere that is nearest."""
         order = np.argsort(self.gap, kind="stable")
-        keys = np.column_stack([self.at, self.joint, self.other])[order]
-        return self.only(order[np.unique(keys, axis=0, return_index=True)[1]])
+        key = np.zeros(len(order), dtype=np.int64)
+        for part in (self.at, self.joint, self.other) if len(order) else ():  # one number, in their order
+            key = key * (int(np.ptp(part)) + 1) + (part - part.min())
+        return self.only(order[np.unique(key[order], return_index=True)[1]])
 
     def only(self, chosen: NDArray[Any]) -> Near:
         """These of them, by number or by mask."""

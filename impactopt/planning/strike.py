@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.gears import gear_caution
-from impactopt.planning.keeping_apart import FAR, Margins, rows_near, spots_of
+from impactopt.planning.keeping_apart import FAR, NEAR, Margins, Rows, Spots, rows_near, spots_of
 from impactopt.planning.models import carried_start, climbed, model_error
 from impactopt.planning.multistart import (
     Budget,
@@ -44,7 +44,7 @@ from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-ROUNDS = 6  # of more rows between bodies
+ROUNDS = 10  # of more rows between bodies
 AGAIN = 3  # from the start, with all rows that are known by then
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
 # solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
@@ -222,42 +222,74 @@ def clear_strike(
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
     not, and on from there; its result has the effort of all.
+
+    start : variables (n,); or a result of this program but for other rows, such as those on demand: then it
+        goes on from there, and begins anew only where that leads nowhere.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
-    interior = budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
-    if interior and not t.coordinates.soles:
+    goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m
+    if _interior(budget) and not t.coordinates.soles:
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
     if margins is None:
-        return _settled(budget, t, budget.run(t.program, x0))
-    known = {} if known is None else known
-    t = t.with_apart({**rows_near(t, x0, margins, FAR), **known})
-    t, result = _settled(budget, t, budget.run(t.program, x0))
-    exact = t, result  # the last one that is solved to its end; the others lead there
+        return _settled(budget, t, budget.run(t.program, start if goes_on else x0, BARRIER_DEEP))
+    known, before = {} if known is None else known, list[SolverResult]()
+    # few rows are sooner met, and cost less; where they lead nowhere, all at once
+    for within in (None, NEAR, FAR) if goes_on and not known else (NEAR, FAR):
+        if within is None:
+            found, result = _round_by_round(budget, margins, t, start, known)
+        else:
+            first = t.with_apart({**rows_near(t, x0, margins, within), **known})
+            found, result = _round_by_round(budget, margins, first, x0, known)
+        result = one_after_the_other(before.pop(), result) if before else result
+        if result.status not in _STUCK or budget.left == 0:
+            break
+        before.append(result)
+    return found, result
+
+
+def _round_by_round(
+    budget: Budget, margins: Margins, t: StrikeTranscription, start: Array | SolverResult, known: Rows
+) -> tuple[StrikeTranscription, SolverResult]:
+    """A program with its first rows between bodies, and then with those that its solutions lack, which
+    ``known`` gets too.
+
+    The interior-point method goes a part of the way only, as long as there will be more rows.
+    """
+    interior = _interior(budget)
+    first = (_roughly(budget) if interior else budget).run(t.program, start, BARRIER_DEEP)
+    t, result = _settled(budget, t, first)
+    exact = None if interior else (t, result)  # the last one that is solved to its end; others lead there
     for again in reversed(range(ROUNDS)):
-        rough = result is not exact[1]
+        rough = exact is None or result is not exact[1]
         if not result.status.usable or (budget.left == 0 and not rough):
             break
-        more = missing_rows(t, result.x, margins, all_along=True)
+        spots = spots_of(t, result.x)
+        more = missing_rows(t, result.x, margins, all_along=True, spots=spots)
         if not more and not rough:
             break
-        deep = bool(more) and _depth(t, result.x, margins, more) > 0
+        deep = bool(more) and _depth(spots, margins, more) > 0
         known |= more
         finer = t.with_apart({**t.apart_rows, **more}) if more else t
         roughly = interior and deep and again > 0
         solving = _roughly(budget) if roughly else budget
         new = solving.run(finer.program, carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
-        if new.status in _STUCK and budget.left != 0:
+        if interior and new.status in _STUCK and budget.left != 0:  # from there, but without multipliers
             roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
         steps, t, result = new.iterations, finer, one_after_the_other(result, new)
         if new.status is Status.INTERRUPTED:
             break
         if not new.status.usable:  # what is too near stays so
-            return exact[0], with_effort_of(exact[1], result)
+            return (t, result) if exact is None else (exact[0], with_effort_of(exact[1], result))
         if not roughly:
             exact = t, result
             if not steps:
                 break  # new rows are met, as they are rounded: the next ones would be the same
     return t, result
+
+
+def _interior(budget: Budget) -> bool:
+    """Whether the solver is the interior-point method."""
+    return budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
 
 
 def _clean_strike(
@@ -270,8 +302,9 @@ def _clean_strike(
         result = one_after_the_other(before.pop(), result) if before else result
         if margins is None or not result.status.usable:
             return t, result
-        left = missing_rows(t, result.x, margins, all_along=True)
-        depth = _depth(t, result.x, margins, left)
+        spots = spots_of(t, result.x)
+        left = missing_rows(t, result.x, margins, all_along=True, spots=spots)
+        depth = _depth(spots, margins, left)
         if depth <= 0:
             return t, result
         known |= left
@@ -297,9 +330,8 @@ def _roughly(budget: Budget) -> Budget:
     return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in ROUGHLY.items()}})
 
 
-def _depth(t: StrikeTranscription, x: Array, margins: Margins, rows: Iterable[ApartRow]) -> float:
+def _depth(spots: Spots, margins: Margins, rows: Iterable[ApartRow]) -> float:
     """[m] that any two of these bodies are in each other."""
-    spots = spots_of(t, x)
     places = ((spots.names.index(row.place), (row.joint, row.other)) for row in rows)
     return max((-margins.bodies.exact(spots.at, k, pair) for k, pair in places), default=0.0)
 

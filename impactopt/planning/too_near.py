@@ -108,12 +108,14 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
     return Violated(new, deepest, pairs, deep, nodes.all)
 
 
-def missing_rows(t: ContactProgram, x: Array, margins: Margins, *, all_along: bool = False) -> Rows:
+def missing_rows(
+    t: ContactProgram, x: Array, margins: Margins, *, all_along: bool = False, spots: Spots | None = None
+) -> Rows:
     """Rows for the bodies that are too near at the places of a program themselves.
 
-    all_along : and for these bodies wherever they are near.
+    all_along : and for these bodies wherever they are near.  spots : the places, if they are known.
     """
-    spots, bodies = spots_of(t, x), margins.bodies
+    spots, bodies = spots_of(t, x) if spots is None else spots, margins.bodies
     near, wanted = bodies.near(spots.at, margins.most + bodies.slack).least(), _Wanted(t, spots, margins)
     for k, joint, other in zip(near.at, near.joint, near.other, strict=True):
         pair = bodies.known(int(joint), int(other))

@@ -26,12 +26,14 @@ class Contacts:
     contact : what all collisions start from.
     expected, scenarios : the collisions; who completes this makes them. All of them, the expected one first,
         are `collisions`.
-    elements, shares, guarded : of a collocated contact, see `Hit`; others have none.
+    elements, stages, shares, guarded, first : of a collocated contact, see `Hit`; others have none.
     """
 
     expected: Any
     scenarios: Sequence[Any]
     elements: Elements = ()
+    stages: Sequence[Any] = ()
+    first: Sequence[Any] = ()
     shares: Shares = ()
     guarded = False
 

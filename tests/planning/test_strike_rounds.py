@@ -14,7 +14,7 @@ from support.small_plans import changed
 
 from impactopt.bodies.shapes import Obstacle
 from impactopt.planning import strike as strikes
-from impactopt.planning.keeping_apart import Margins, rows_near
+from impactopt.planning.keeping_apart import FAR, NEAR, Margins, rows_near
 from impactopt.planning.multistart import Budget
 from impactopt.planning.too_near import missing_rows
 from impactopt.solvers.program import SolverResult, Status
@@ -67,7 +67,7 @@ def rounds(
     each other. The rows are those of near bodies, which its first program is kept from having.
     """
 
-    def run(*ends: Status, deep: tuple[bool, ...]) -> Any:
+    def run(*ends: Status, deep: tuple[bool, ...] = (), options: dict[str, Any] | None = None) -> Any:
         margins = Margins(strike.problem)
         x = strike_iterate(strike)
         rows = list(rows_near(strike, x, margins, 1.0).items())
@@ -76,7 +76,7 @@ def rounds(
         monkeypatch.setattr(strikes, "rows_near", lambda *_: {})
         monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: left.pop(0) if left else {})
         monkeypatch.setattr(strikes, "_depth", lambda *_: 0.01 * how.pop(0))
-        budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
+        budget = Scripted(solver="sqp", options=options, time_limit=None, callback=None, ends=ends)
         t, result = strikes.clear_strike(budget, margins, strike, x)
         return t, result, budget.asked
 
@@ -102,7 +102,7 @@ def test_bodies_in_each_other_are_led_out_roughly_and_the_end_is_exact(rounds: A
 def test_the_last_round_is_exact_however_deep_bodies_are(rounds: Any) -> None:
     n = strikes.ROUNDS
     _, _, asked = rounds(*[Status.SOLVED] * (n + 1), deep=(True,) * n)
-    assert ["kkt_tolerance" in each for each in asked] == [False, *[True] * (n - 1), False]
+    assert ["kkt_tolerance" in each for each in asked] == [*[True] * n, False]
 
 
 def test_a_round_that_is_stuck_begins_again_without_multipliers(rounds: Any) -> None:
@@ -112,15 +112,43 @@ def test_a_round_that_is_stuck_begins_again_without_multipliers(rounds: Any) -> 
 
 
 def test_what_no_round_mends_is_a_result_of_its_own_program(rounds: Any) -> None:
-    t, result, _ = rounds(Status.SOLVED, Status.FAILED, Status.INFEASIBLE, deep=(False,))
+    t, result, _ = rounds(*[Status.SOLVED] * 2, Status.FAILED, Status.INFEASIBLE, deep=(False, False))
     assert result.status is Status.SOLVED
-    assert result.multipliers.size == t.program.m and not t.apart_rows
+    assert result.multipliers.size == t.program.m and len(t.apart_rows) == 1
+
+
+def test_solvers_of_whole_qps_do_not_repeat_a_round_that_has_failed(rounds: Any) -> None:
+    ends = Status.SOLVED, Status.FAILED
+    _, result, asked = rounds(*ends, deep=(False,), options={"qp_solver": "osqp"})
+    assert result.status is Status.SOLVED and len(asked) == 2
+    assert not any("kkt_tolerance" in each for each in asked), "they go on from a solution in a few steps"
+
+
+def test_where_few_rows_lead_nowhere_it_begins_with_those_of_all_that_is_far(
+    strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    within = list[float]()
+
+    def near(*given: Any) -> dict[Any, Any]:
+        within.append(given[-1])
+        return {}
+
+    monkeypatch.setattr(strikes, "rows_near", near)
+    monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: {})
+    ends = Status.FAILED, Status.SOLVED, Status.SOLVED
+    budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
+    _, result = strikes.clear_strike(budget, Margins(strike.problem), strike, strike_iterate(strike))
+    assert within == [NEAR, FAR]
+    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS, "the effort of all is told"
 
 
 def test_a_rough_result_is_never_told_as_a_solution(rounds: Any) -> None:
-    t, result, _ = rounds(Status.SOLVED, Status.SOLVED, Status.TIME_LIMIT, deep=(True,))
-    assert not t.apart_rows and result.multipliers.size == t.program.m, "but the one before it"
-    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS
+    ends = *[Status.SOLVED] * 3, Status.TIME_LIMIT
+    t, result, _ = rounds(*ends, deep=(False, True))
+    assert len(t.apart_rows) == 1 and result.multipliers.size == t.program.m, "but the one before it"
+    assert result.status is Status.SOLVED and result.iterations == 4 * ITERATIONS
+    _, result, _ = rounds(Status.SOLVED, Status.TIME_LIMIT, deep=(True,))
+    assert result.status is Status.TIME_LIMIT
     t, result, _ = rounds(Status.SOLVED, Status.SOLVED, Status.INTERRUPTED, deep=(True,))
     assert result.status is Status.INTERRUPTED and result.multipliers.size == t.program.m
 
@@ -158,3 +186,17 @@ def test_a_strike_whose_bodies_stay_in_each_other_is_none(
     monkeypatch.setattr(strikes, "clear_strike", lambda *_: (strike, solved))
     _, result = strikes._clean_strike(budget, Margins(strike.problem), strike, strike_iterate(strike))
     assert result.status is Status.FAILED and "12.0 mm in each other" in result.message
+
+
+def test_with_rows_on_demand_it_goes_on_from_the_solution_without_them(
+    strike: StrikeTranscription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(strikes, "missing_rows", lambda *_, **__: {})
+    ends = Status.SOLVED, Status.FAILED, Status.SOLVED, Status.SOLVED
+    budget = Scripted(solver="sqp", options=None, time_limit=None, callback=None, ends=ends)
+    solved = budget.run(strike.program, strike_iterate(strike))
+    _, result = strikes.clear_strike(budget, Margins(strike.problem), strike, solved)
+    _, on, anew, _ = budget.asked
+    assert on["given"] is solved and on["from"] == strikes.BARRIER_DEEP
+    assert anew["given"] is None, "where that leads nowhere"
+    assert result.status is Status.SOLVED and result.iterations == 3 * ITERATIONS

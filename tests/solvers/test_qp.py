@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -64,6 +65,19 @@ def assert_solves(problem, solution, tolerance=1e-5):
     assert np.abs(P @ x + problem.q + A.T @ y + z).max() <= tolerance * scale
     assert (v[multipliers > tolerance * scale] >= (upper - 1e-3)[multipliers > tolerance * scale]).all()
     assert (v[multipliers < -tolerance * scale] <= (lower + 1e-3)[multipliers < -tolerance * scale]).all()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_arrays_are_solved_as_sparse_matrices_are(name):
+    sparse = random_qp(5, 6, 9, 2)
+    small = dataclasses.replace(sparse, P=sparse.P.toarray(), A=sparse.A.toarray())
+    solver = make_qp_solver(name)
+    found, expected = solver.solve(small), solver.solve(sparse)
+    assert found.status is QPStatus.SOLVED
+    assert small.error(found.x, found.y, found.z) <= 1e-6
+    np.testing.assert_allclose(found.x, expected.x, atol=1e-6)
+    again = solver.solve(small, start=(found.x, found.y, found.z))
+    np.testing.assert_allclose(again.x, expected.x, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -188,3 +188,45 @@ def test_a_structure_is_kept_for_the_next_program_that_has_it() -> None:
     assert made[1]._condenser is made[0]._condenser
     other = Reduction(second, second.point(x).jacobian, Chain.determined)
     assert other._condenser is not made[1]._condenser  # as that is in use
+
+
+class Geared(Textbook):
+    """x1 follows from x0; a row bounds x0, and changes ten thousand times as fast with what x1 is off by."""
+
+    determined = (Determined((0,), np.array([1])),)
+
+
+def geared(price: float = 1.0) -> Geared:
+    return Geared(
+        2,
+        lambda a, b: -price * a + 0.5 * price * (a - 1) ** 2,
+        lambda a, b: [(0, b - a, 0), (-INF, 1e4 * (b - a) + a, 0.5)],
+        lower=-3,
+        upper=3,
+    )
+
+
+def test_rows_count_by_what_the_free_variables_change_and_by_their_multipliers() -> None:
+    program = TimedProgram(geared())
+    point = program.point(np.array([0.2, 0.2]))
+    reduction = Reduction(program, point.jacobian, Geared.determined)
+    reduction.load(point)
+    qp = ReducedQP(program, reduction, make_qp_solver("osqp"))
+    assert point.row_norms[1] > 1e4
+    qp.weigh(point, np.zeros(2), 100.0)
+    assert program.weights[1] == pytest.approx(1.0)
+    qp.weigh(point, np.array([0.0, 300.0]), 100.0)
+    assert program.weights[1] * 100.0 > 300.0
+
+
+def test_a_violated_row_of_a_long_gradient_is_met_at_once() -> None:
+    violations: list[float] = []
+    result = solve_sqp(
+        geared(price=10.0),
+        [0.6, 0.6],
+        options=WAYS["osqp"],
+        callback=lambda record: violations.append(record.max_violation),
+    )
+    assert result.status is Status.SOLVED
+    assert result.x[0] == pytest.approx(0.5, abs=1e-6)
+    assert max(violations) <= 0.1 + 1e-9, "the objective does not lead away from it first"

@@ -12,9 +12,10 @@ from support.small_plans import arm_problem, biped_problem, transcribed
 from impactopt import load_problem, optimize_strike
 from impactopt.collision import SDC
 from impactopt.errors import InputError
+from impactopt.planning.keeping_apart import Margins, rows_near
 from impactopt.problem.objectives import Penetration
 from impactopt.problem.problem import ImpactProblem
-from impactopt.transcription.start import strike_iterate
+from impactopt.transcription.start import carried_over, strike_iterate
 from impactopt.transcription.strike import ShootingStrike
 from impactopt.transcription.transcription import block_functions
 
@@ -40,6 +41,17 @@ def test_slopes_agree_with_differences(robot: str) -> None:
         column = (program.constraints(x + e) - program.constraints(x - e)) / (2 * h)
         # what is left of the collision's own steps is a relative 1e-7, over h
         np.testing.assert_allclose(slopes[:, j], column, rtol=2e-3, atol=2e-3)
+
+
+def test_a_result_starts_a_program_with_more_rows_between_bodies() -> None:
+    t = of(load_problem("arm_planar"))
+    x = strike_iterate(t)
+    rows = rows_near(t, x, Margins(t.problem), 1.0)
+    finer, multipliers = t.with_apart(rows), np.arange(1.0, t.program.m + 1)
+    new, y, _ = carried_over(finer, t, x, multipliers, np.zeros(len(x)))
+    assert rows
+    np.testing.assert_allclose(new, x, atol=1e-9)
+    np.testing.assert_array_equal(y, [*multipliers, *np.zeros(len(rows))])
 
 
 def test_it_predicts_what_the_sdc_does() -> None:

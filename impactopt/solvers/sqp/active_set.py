@@ -34,13 +34,13 @@ class ActiveSetSolver:
         time_limit: float | None = None,
     ) -> QPSolution:
         """Solve the QP from the active set of the guess (x, y, z)."""
-        C, lower, upper = qp.stacked
+        (P, C), (_, lower, upper) = qp.arrays, qp.stacked
         size = qp.m + qp.n
         nothing = QPSolution(
             x=np.zeros(qp.n), y=np.zeros(qp.m), z=np.zeros(qp.n), status=QPStatus.FAILED, iterations=0
         )
         try:
-            method = _DualActiveSet(qp.P.toarray(), qp.q, C.toarray(), lower, upper)
+            method = _DualActiveSet(P, qp.q, C, lower, upper)
         except la.LinAlgError:  # P is not positive definite
             return nothing
         guess = np.zeros(size) if start is None else np.concatenate(start[1:])
@@ -51,7 +51,7 @@ class ActiveSetSolver:
             # The factors carry the condition of P; the KKT system, solved afresh, does not.
             held = method.rows
             target = np.where(method.signs > 0, upper[held], lower[held])
-            sharp = solve_equality_qp(qp.P, qp.q, C.tocsr()[held], target)
+            sharp = solve_equality_qp(P, qp.q, C[held], target)
             if sharp is not None:
                 sharp_unit = np.zeros(size)
                 sharp_unit[held] = sharp[1]

@@ -61,7 +61,7 @@ def refusal(qp: QuadraticProgram) -> QPStatus | None:
         return QPStatus.INFEASIBLE
     if qp.n > SMALL:
         return None
-    P = qp.P.toarray()
+    P, _ = qp.arrays
     shift = 1e-9 * max(float(np.abs(P).max(initial=0.0)), 1e-300)
     try:
         la.cholesky(P + shift * np.eye(qp.n), lower=True, check_finite=False)

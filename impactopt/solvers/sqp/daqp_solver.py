@@ -40,15 +40,15 @@ class DaqpSolver:
         refused = refusal(qp)
         if refused is not None:
             return no_answer(qp, refused)
-        C, lower, upper = qp.stacked
+        (P, C), (_, lower, upper) = qp.arrays, qp.stacked
         m, n = qp.m, qp.n
         first = np.roll(np.arange(m + n), n)  # DAQP has the bounds of the variables before the rows
         low, high = np.maximum(lower[first], -_NONE), np.minimum(upper[first], _NONE)
         guess = None if start is None else (np.concatenate(start[1:]) / qp.row_scale)[first]
         x, _, flag, info = daqp.solve(
-            qp.P.toarray(),
+            P,
             qp.q,
-            C[:m].toarray(),
+            C[:m],
             high,
             low,
             np.where(low == high, _EQUALITY, 0).astype(np.intc),

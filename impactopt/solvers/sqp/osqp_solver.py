@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from typing import Any
 
 import numpy as np
 import osqp
 import scipy.sparse as sp
 
-from impactopt.solvers.program import Matrix, Vector
+from impactopt.solvers.program import Vector
 from impactopt.solvers.sqp.active_set import ActiveSetSolver
 from impactopt.solvers.sqp.answers import HOPELESS, SMALL, answer, no_answer, split
 from impactopt.solvers.sqp.qp import QPSolution, QPStatus, QuadraticProgram
@@ -134,16 +135,19 @@ class OsqpSolver:
             return refined.x, refined.y, refined.error
         return x, unit, worst
 
-    def _load(self, qp: QuadraticProgram, C: Matrix, lower: Vector, upper: Vector) -> bool:
+    def _load(self, qp: QuadraticProgram, C: Any, lower: Vector, upper: Vector) -> bool:
         """Give OSQP the data, in place while the patterns are those of the last QP. False if refused."""
-        P = sp.csc_matrix(sp.triu(qp.P, format="csc"))
-        P.sort_indices()
+        if qp.dense:
+            P, C = sp.csc_matrix(np.triu(qp.P)), sp.csc_matrix(C)
+        else:
+            P = sp.csc_matrix(sp.triu(qp.P, format="csc"))
+            P.sort_indices()
         pattern = [P.indptr, P.indices, C.indptr, C.indices]
         if self._solver is not None and all(map(np.array_equal, pattern, self._pattern)):
             self._solver.update(q=qp.q, l=lower, u=upper)
             self._solver.update(Px=P.data, Ax=C.data)
             return True
-        solver = osqp.OSQP()
+        solver = osqp.OSQP(algebra="builtin")  # to look for others takes longer than a small QP
         try:
             solver.setup(
                 P, qp.q, sp.csc_matrix(C), lower, upper,

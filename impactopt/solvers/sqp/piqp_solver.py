@@ -57,8 +57,8 @@ class PiqpSolver:
         held = np.flatnonzero(equal)
         rows = np.flatnonzero(~equal[: qp.m])
         free = equal[qp.m :]  # of bounds: an equality has no interior, and is a row
-        C = C.tocsr()
-        matrices = {"P": qp.P, "A": C[held], "G": C[rows]}
+        C = sp.csr_array(C)
+        matrices = {"P": sp.csc_array(qp.P), "A": C[held], "G": C[rows]}
         vectors = {
             "c": qp.q,
             "b": lower[held],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,9 +19,9 @@ class QuadraticProgram:
 
     Attributes
     ----------
-    P : full symmetric, positive semidefinite, csc_array (n, n).
+    P : full symmetric, positive semidefinite (n, n): csc_array, or, as A, an array where the QP is small.
     q : (n,).
-    A : csc_array (m, n).
+    A : (m, n), as P.
     lower, upper : (m,), equal for equalities, +-inf for none.
     x_lower, x_upper : (n,), likewise.
     """
@@ -44,17 +44,31 @@ class QuadraticProgram:
         """Number of rows of A; the variables' bounds are not counted."""
         return int(self.lower.size)
 
+    @property
+    def dense(self) -> bool:
+        """Whether its matrices are arrays."""
+        return isinstance(self.A, np.ndarray)
+
     @cached_property
-    def stacked(self) -> tuple[Matrix, Vector, Vector]:
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """P, and C of `stacked`, as arrays."""
+        C = self.stacked[0]
+        return (self.P, C) if self.dense else (self.P.toarray(), C.toarray())
+
+    @cached_property
+    def stacked(self) -> tuple[Any, Vector, Vector]:
         """(C, l, u) with bounds as rows, l <= C x <= u, C = [A; I], rows of norm 1 (zero rows stay zero).
 
         First-order solvers live by the norms of the rows; `row_scale` brings their multipliers back.
         """
-        C = sp.csc_array(
-            sp.diags_array(self.row_scale)
-            @ sp.vstack([self.A, sp.diags_array(np.ones(self.n))], format="csc")
-        )
-        C.sort_indices()
+        if self.dense:
+            C: Any = np.vstack([self.row_scale[: self.m, None] * self.A, np.eye(self.n)])
+        else:
+            C = sp.csc_array(
+                sp.diags_array(self.row_scale)
+                @ sp.vstack([self.A, sp.diags_array(np.ones(self.n))], format="csc")
+            )
+            C.sort_indices()
         lower = np.concatenate([self.lower, self.x_lower]) * self.row_scale
         upper = np.concatenate([self.upper, self.x_upper]) * self.row_scale
         return C, lower, upper
@@ -62,7 +76,8 @@ class QuadraticProgram:
     @cached_property
     def row_scale(self) -> Vector:
         """What each row of [A; I] is multiplied by in `stacked`, (m + n,)."""
-        norms = np.sqrt(np.asarray(self.A.multiply(self.A).sum(axis=1)).ravel())
+        squares = self.A**2 if self.dense else self.A.multiply(self.A)
+        norms = np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
         return np.concatenate([1.0 / np.where(norms > 1e-12, norms, 1.0), np.ones(self.n)])
 
     def residuals(self, x: Vector, y: Vector, z: Vector) -> tuple[float, float, float]:

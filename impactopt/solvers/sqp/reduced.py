@@ -34,6 +34,9 @@ _ROUNDING = 1e-11
 # solutions of the violation alone differ, so where one way ends in such a point the next is tried
 _ATTEMPTS = (0.15, False), (0.5, False), (0.15, True), (0.5, True)
 _CLOSE = 0.1  # violation of a start from which there is one way only
+# most violation of a point: times that of the start, and at least; near a start with multipliers, which is a
+# solution but for new rows, first: beyond them the objective leads where nothing leads back
+_MOST, _MOST_WARM = (1.5, 1.0), (3.0, 0.05)
 _PATIENCE = 40  # iterations without less violation, or a better objective
 _LESS, _BETTER = 0.97, 1e-3  # of a violation, of an objective
 _GAIN = 0.1  # less of the objective for each unit of violation of a point that the filter takes
@@ -78,21 +81,30 @@ class ReducedRun(Run):
         if not self.point.differentiable:
             return Status.FAILED
         start, y, z = self.point, self.y.copy(), self.z.copy()
-        self.program.weigh(start)
-        self._most = max(1.5 * start.violation, 1.0)
         dense = self.options.hessian == "bfgs"
         self._reduction = Reduction(self.program, start.jacobian, self._determined, dense=dense)
         self._model = make_model(self.program, self.options, self._reduction)
         self._qp = ReducedQP(self.program, self._reduction, make_qp_solver(self.options.qp_solver))
         try:
-            return self._attempts(start, y, z)
+            return self._attempts(start, y, z) if self._weighed(start, y) else Status.FAILED
         finally:
             self._reduction.release()
 
+    def _weighed(self, start: Point, y: Vector) -> bool:
+        """Weigh the rows at the start; False: they do not determine their variables there."""
+        try:
+            self._reduction.load(start)
+        except np.linalg.LinAlgError:
+            return False
+        self._qp.weigh(start, y, self.options.price)
+        return True
+
     def _attempts(self, start: Point, y: Vector, z: Vector) -> Status:
         status = Status.INFEASIBLE
-        far = start.violation > _CLOSE
-        for wide, careful in _ATTEMPTS if far else _ATTEMPTS[:1]:
+        far, warm = start.violation > _CLOSE, bool(np.any(y) or np.any(z))
+        ways = [(*way, _MOST) for way in (_ATTEMPTS if far else _ATTEMPTS[:1])]
+        for wide, careful, (times, least) in [(*_ATTEMPTS[0], _MOST_WARM), *ways] if warm else ways:
+            self._most = max(times * start.violation, least)
             self.point, self.y, self.z, self._filter = start, y.copy(), z.copy(), []
             self._qp.start_from(y, z)
             self._patient = (wide, careful) == _ATTEMPTS[-1]  # the last way may creep

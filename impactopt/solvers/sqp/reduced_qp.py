@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg as la
 import scipy.sparse as sp
 
 from impactopt.solvers.program import Matrix, Vector, row_violations
@@ -17,6 +18,7 @@ from impactopt.solvers.sqp.reduction import Reduction
 _NEAR, _NEAREST = 0.1, 2
 _MISSED, _ROUNDS, _MORE = 1e-7, 12, 15  # violation of a row left out; times rows are added; so many at least
 _SLACK_CURVATURE = 1e-4  # of the price
+_ABOVE = 2.0  # times a multiplier that is known: a price
 _ACTIVE = 1e-4  # multiplier of a unit row that holds
 _SOFT = 1e-9  # violation where t = 0 of rows that may stay violated
 _BEYOND = 0.5  # of the way that a row can change inside the radius: what is violated by more is given up
@@ -60,15 +62,32 @@ class ReducedQP:
         self._unit = np.concatenate([y[reduction.rows], z[reduction.bounded]])
 
     def active(self, point: Point) -> Matrix:
-        """Unit rows (a, r) of what held in the last QP, in the directions that are left."""
-        return self._rows(point)[np.flatnonzero(np.abs(self._unit) > _ACTIVE)]
+        """Rows (a, r) of what held in the last QP, in the directions that are left; of all variables their
+        gradients would be one long, as those that cease to hold are not to be held by the model's curvature.
+        """
+        every, which = self._rows(point), np.flatnonzero(np.abs(self._unit) > _ACTIVE)
+        own = self._norms / point.row_norms[self._reduction.rows]
+        return sp.diags_array(np.append(own, np.ones(every.shape[0] - own.size))[which]) @ every[which]
+
+    def weigh(self, point: Point, y: Vector, price: float) -> None:
+        """Weigh rows in the merit function, so that a price suits all alike.
+
+        By what the free variables change them, if that is less than all do: rows of gears change ten thousand
+        times as fast with accelerations, which other rows determine. And by known multipliers y (m,), which a
+        price has to exceed.
+        """
+        self._rows(point)
+        self._program.weigh(point)
+        weights, rows = self._program.weights, self._reduction.rows
+        by_free = 1.0 / np.clip(self._norms, 1.0, 1e6)
+        weights[rows] = np.maximum(np.maximum(weights[rows], by_free), _ABOVE * np.abs(y[rows]) / price)
 
     def _rows(self, point: Point) -> Matrix:
         """Unit rows (k, r): those that are not eliminated, then of the bounds."""
         if self._at is not point:
-            reduction, T = self._reduction, self._reduction.T
-            unit = sp.diags_array(1.0 / point.row_norms[reduction.rows])
-            own, bounds = unit @ (point.jacobian.tocsr()[reduction.rows] @ T), T[reduction.bounded]
+            reduction = self._reduction
+            own, self._norms = reduction.rows_by_free(point.jacobian)
+            own, bounds = sp.diags_array(1.0 / self._norms) @ own, reduction.T[reduction.bounded]
             self._at = point
             self._every = sp.vstack([own, bounds], "csr") if reduction.sparse else np.vstack([own, bounds])
         return self._every
@@ -84,17 +103,16 @@ class ReducedQP:
         time_limit: float | None,
     ) -> Solved | None:
         """The step where rows are g (m,) and have the point's slopes; None if the QP solver fails."""
-        p, reduction, norms = self._program, self._reduction, point.row_norms
+        p, reduction, every = self._program, self._reduction, self._rows(point)
         rows, bounded, T = reduction.rows, reduction.bounded, reduction.T
         d0 = reduction.normal(g)
         longest = (_CAREFUL if self.careful or not model.leads else _LARGEST) * radius
         d0 *= min(1.0, longest / max(float(np.abs(d0).max(initial=0.0)), 1e-300))
-        after, scale = g + point.jacobian @ d0, norms[rows]
+        after, scale = g + point.jacobian @ d0, self._norms
         x = point.x + d0
         lower = np.concatenate([(p.g_lower - after)[rows] / scale, (p.x_lower - x)[bounded]])
         upper = np.concatenate([(p.g_upper - after)[rows] / scale, (p.x_upper - x)[bounded]])
-        prices = price * np.concatenate([(p.weights * norms)[rows], np.ones(bounded.size)])
-        every = self._rows(point)
+        prices = price * np.concatenate([p.weights[rows] * scale, np.ones(bounded.size)])
         reach = radius * abs(every).sum(axis=1)  # how much a row can change
         off = np.maximum(lower, -upper)
         soft = off > _SOFT
@@ -150,15 +168,22 @@ def _elastic(
     elastic = np.concatenate([below, above])
     k, n = elastic.size, c.size
     box = np.full(n, radius)
+    small = isinstance(A, np.ndarray)
     if k:
         sign = np.where(np.arange(k) < below.size, 1.0, -1.0)
-        S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
-        A, c = sp.hstack([sp.csc_array(A), S]), np.concatenate([c, prices[elastic]])
-        B = sp.block_diag([B, sp.diags_array(_SLACK_CURVATURE * prices[elastic])])
+        bend = _SLACK_CURVATURE * prices[elastic]
+        c = np.concatenate([c, prices[elastic]])
+        if small:
+            S = np.zeros((lower.size, k))
+            S[elastic, np.arange(k)] = sign
+            A, B = np.hstack([A, S]), la.block_diag(B, np.diag(bend))
+        else:
+            S = sp.csc_array((sign, (elastic, np.arange(k))), shape=(lower.size, k))
+            A, B = sp.hstack([sp.csc_array(A), S]), sp.block_diag([B, sp.diags_array(bend)])
     return QuadraticProgram(
-        P=sp.csc_array(B),
+        P=B if small else sp.csc_array(B),
         q=c,
-        A=sp.csc_array(A),
+        A=A if small else sp.csc_array(A),
         lower=lower,
         upper=upper,
         x_lower=np.concatenate([-box, np.zeros(k)]),

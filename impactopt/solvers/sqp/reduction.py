@@ -28,6 +28,7 @@ Index = npt.NDArray[np.intp]
 _KEPT = 4  # structures
 _LARGE = 300  # free variables: beyond, QPs stay sparse, with the equalities that are left as rows
 _NOTHING = 1e-13  # what rounding leaves of a zero
+_SHORT = 1e-6  # of a row's length: what rounding may leave of it by the free variables
 _RANK = 1e-9  # of the equalities left: what is this much smaller than the largest depends on the others
 
 
@@ -99,13 +100,14 @@ class Reduction:
         A = self._of_left @ Z
         if not self.left.size:
             self._Y, self._R, self._order = np.zeros((self.free.size, 0)), np.zeros((0, 0)), self.left
-            self.T = Z
+            self.T, self._within = Z, None
             return
         Q, R, self._order = la.qr(A.T, pivoting=True, check_finite=False)
         sizes = np.abs(np.diagonal(R))
         rank = int((sizes > _RANK * max(float(sizes.max(initial=0.0)), 1e-300)).sum())
         self._Y, self._R = Q[:, :rank], R[:rank]
-        self.T = Z @ Q[:, rank:]
+        self._within = Q[:, rank:]
+        self.T = Z @ self._within
 
     def _of_equations(self, jacobian: Matrix) -> Matrix:
         return jacobian.tocsr()[self._equations].tocsc()
@@ -141,6 +143,18 @@ class Reduction:
         """(n, f) what all variables do with each of the free ones."""
         return self._Z
 
+    def rows_by_free(self, jacobian: Matrix) -> tuple[Any, Vector]:
+        """`rows` along the columns of `T` (k, r), and their norms (k,) by the free variables: what a row
+        changes with these, those that they determine with them. Its gradient by all variables may be
+        thousands of times as long. 1 for rows that nothing changes.
+        """
+        own = jacobian.tocsr()[self.rows]
+        by_free = own @ self._Z
+        norms, whole = _norms(by_free), _norms(own)
+        norms = np.maximum(norms, _SHORT * whole)
+        along = by_free if self._within is None else by_free @ self._within
+        return along, np.where(norms > 1e-12, norms, 1.0)
+
     def gradient(self, dual: Vector) -> Vector:
         """(f,) of what the free variables change, those that they determine with them; dual (n,)."""
         return np.asarray(self._Z.T @ dual)
@@ -162,6 +176,11 @@ def _key(equations: Matrix, determined: Sequence[Determined]) -> bytes:
     for array in (equations.indptr, equations.indices, *[variables for _, variables in determined]):
         digest.update(np.ascontiguousarray(array, dtype=np.int64).tobytes())
     return digest.digest()
+
+
+def _norms(rows: Any) -> Vector:
+    squares = rows.multiply(rows) if sp.issparse(rows) else rows**2
+    return np.sqrt(np.asarray(squares.sum(axis=1)).ravel())
 
 
 def _without_zeros(Z: np.ndarray) -> Matrix:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -44,7 +45,7 @@ def refine(qp: QuadraticProgram, x: Vector, y: Vector, *, rounds: int = 10) -> R
     The best point found, or None where no active set gave a system that could be solved.
     """
     C, lower, upper = qp.stacked
-    rows = C.tocsr()
+    rows = C if qp.dense else C.tocsr()
     best: Refined | None = None
     seen: set[bytes] = set()
     for _ in range(rounds):
@@ -86,11 +87,18 @@ def active_set(qp: QuadraticProgram, x: Vector, y: Vector) -> np.ndarray:
 def solve_equality_qp(P: Matrix, q: Vector, A: Matrix, b: Vector) -> tuple[Vector, Vector] | None:
     """Minimize 1/2 x'Px + q'x subject to A x = b, also with dependent rows: regularized, then refined."""
     n, m = q.size, b.size
-    K = sp.csc_array(sp.block_array([[P, A.T], [A, None]] if m else [[P]], format="csc"))
+    K: Any
+    if isinstance(A, np.ndarray):
+        K = np.zeros((n + m, n + m))
+        K[:n, :n], K[n:, :n], K[:n, n:] = P, A, A.T
+    else:
+        K = sp.csc_array(sp.block_array([[P, A.T], [A, None]] if m else [[P]], format="csc"))
     shift = _REGULARIZATION * np.concatenate([np.ones(n), -np.ones(m)])
     right = np.concatenate([-q, b])
-    if n + m <= _DENSE:
-        lu, pivots, info = la.lapack.dgetrf(K.toarray() + np.diag(shift))
+    if n + m <= _DENSE or isinstance(K, np.ndarray):
+        whole = K.copy() if isinstance(K, np.ndarray) else K.toarray()
+        whole[np.diag_indices(n + m)] += shift
+        lu, pivots, info = la.lapack.dgetrf(whole, overwrite_a=True)
         if info != 0:
             return None
         solve: Callable[[Vector], Vector] = lambda r: la.lapack.dgetrs(lu, pivots, r)[0]  # noqa: E731

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -75,6 +77,24 @@ def test_every_room_says_what_lives_there() -> None:
     entries = [file for file in FILES if file.name == "__init__.py"]
     assert len(entries) >= len(ROOMS_IN_ORDER) - 1  # errors is a file
     assert [str(file) for file in entries if not ast.get_docstring(ast.parse(file.read_text("utf-8")))] == []
+
+
+# what comes with a declared dependency that cannot do without it, or is called otherwise
+BROUGHT_BY = {
+    "PIL": "matplotlib",
+    "annotated_types": "pydantic",
+    "coal": "pin",
+    "mcap_ros2": "mcap-ros2-support",
+    "pinocchio": "pin",
+}
+
+
+def test_what_is_imported_is_declared() -> None:
+    text = (PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8")
+    declared = set(re.findall(r'"([A-Za-z][\w-]*)[>=;]', text))
+    known = {*sys.stdlib_module_names, "impactopt", *(name.replace("-", "_") for name in declared)}
+    tops = {name.split(".")[0] for file in FILES for name in imports(file)}
+    assert {name for name in tops - known if BROUGHT_BY.get(name) not in declared} == set()
 
 
 def test_no_file_is_longer_than_400_lines() -> None:

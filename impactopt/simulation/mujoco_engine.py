@@ -87,7 +87,7 @@ class _Replay(MujocoRobot):
         """What the servo follows from now on."""
         world = self.perturbation
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
-        self.reference_q, self.over = np.asarray(reference.q), float(reference.contact_end)
+        self.reference_q = np.asarray(reference.q)
         if self.floating:
             self.upright = _upright(self.reference_q[:, 3:7].T)
 
@@ -216,8 +216,9 @@ class _Replay(MujocoRobot):
             return ""
         times = self.servo.time
         row = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
-        late = self.wbc is not None and self.wbc.target.recovers(t)
-        since = min(int(np.searchsorted(times, self.over)), row) if late else row
+        since = row
+        if self.wbc is not None and self.wbc.target.recovers(t):
+            since = min(int(np.searchsorted(times, self.wbc.target.contact[1])), row)
         lean = float(self.base_errors(slice(since, row + 1)).min())
         height, planned = self.data.qpos[2], float(self.reference_q[since : row + 1, 2].min())
         if lean > FALLEN_TILT:

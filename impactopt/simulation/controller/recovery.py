@@ -26,6 +26,7 @@ LARGEST = 0.2  # [rad] of one
 SMALLEST = 1e-3  # singular value that counts, of the largest
 PARTS = (1.0, 0.75, 0.5, 0.25)  # of the shift, the most that keeps links apart
 CLEAR = 3e-3  # [m] between links
+SAFE = 0.015  # [m] of the capture point to the soles' edges
 LOOK = 0.05  # [s] at which that is looked at
 BRAKING = 0.15  # [s] from the plan's pace to the slower one
 _AXES = pin.LOCAL_WORLD_ALIGNED
@@ -74,11 +75,16 @@ class Recovery:
 
 def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float:
     """How much of a shift (nv,) of the postures after the blow leaves links as far apart as planned, or by
-    `CLEAR`: legs that shift the body may bring thighs together.
+    `CLEAR`: legs that shift the body may bring thighs together. All of it, if the plan's capture point comes
+    nearer to the soles' edges than `SAFE`: a robot that touches itself still stands.
     """
     time, postures = np.asarray(reference.time), np.asarray(reference.q)
     looked = np.arange(float(reference.contact_end), float(time[-1]) + LOOK, LOOK)
-    q = postures[np.searchsorted(time, looked).clip(0, len(time) - 1)]
+    rows = np.searchsorted(time, looked).clip(0, len(time) - 1)
+    q = postures[rows]
+    capture = [_capture_point(model, *state) for state in zip(q, np.asarray(reference.v)[rows], strict=True)]
+    if distance_inside(scene.polygon, np.array(capture)).min() < SAFE:
+        return 1.0
     links = scene.solids.links_between(model, shift)
     least = np.minimum(links.apart(model, q), CLEAR)
     for part in PARTS:
@@ -86,6 +92,13 @@ def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float
         if np.all(links.apart(model, moved) >= least):
             return part
     return 0.0
+
+
+def _capture_point(model: Any, q: Array, v: Array) -> Array:
+    """(2,) [m] on the ground."""
+    data = model.createData()
+    com = pin.centerOfMass(model, data, q, v)
+    return np.asarray(com[:2] + data.vcom[0][:2] * np.sqrt(com[2] / 9.81))
 
 
 def _inside(scene: Scene, com: Array, margin: float) -> Array:

@@ -47,7 +47,7 @@ $(STAMP): pyproject.toml $(LEAN)
 	@echo "== $(VENV) is ready"
 
 demo: $(LEAN) ## plan a TALOS punch, replay it in full dynamics, put pictures and numbers in results/punch
-	@echo "== planning a punch (the first run compiles the robot's functions, up to two minutes)"
+	@echo "== planning a punch (the first run compiles the robot's functions)"
 	@$(BIN)/impactopt solve problems/punch.toml --out results/punch --baseline $(ARGS)
 
 # Only tests open pages in a browser.

@@ -17,7 +17,7 @@ from support.small_robots import arm, biped
 from impactopt.errors import InputError
 from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
-from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco
+from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco, solids
 from impactopt.simulation.controller import controller_of
 from impactopt.simulation.controller.cones import cone_of
 from impactopt.simulation.controller.estimate import StateEstimate
@@ -28,6 +28,7 @@ from impactopt.simulation.controller.sensors import Sensors
 from impactopt.simulation.controller.target import Target
 from impactopt.simulation.mujoco_engine import _Replay
 from impactopt.simulation.mujoco_world import MujocoOptions
+from impactopt.simulation.solids import Solid, Solids
 
 Array = NDArray[np.float64]
 QUIET = ControllerSettings(noise=0.0)
@@ -324,3 +325,38 @@ def test_who_recovers_comes_late_through_what_is_planned_and_has_not_fallen() ->
     assert replay.fallen(2.0) == ""
     replay.start(back)
     assert replay.fallen(2.0).startswith("fell"), "nobody planned that"
+
+
+# ---- a recovery leaves room between links
+
+
+def test_links_are_as_far_apart_as_their_hulls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tetrahedra so small that they are points."""
+    robot = biped()
+    q = np.asarray(still(robot)[0].q[0])
+    model, data = robot.model, robot.model.createData()
+    small = 1e-5 * np.vstack([np.zeros(3), np.eye(3)])
+    joints = [int(model.frames[model.getFrameId(name)].parentJoint) for name in still(robot)[1].soles]
+    near = tuple(Solid(name=f"foot {k}", joint=j, vertices=small) for k, j in enumerate(joints))
+    feet = Solids(solids=near, pairs=((0, 1),))
+    turned = pin.integrate(model, q, 1e-2 * np.ones(robot.nv))
+    expected = []
+    for posture in (q, turned):
+        pin.forwardKinematics(model, data, posture)
+        expected.append(np.linalg.norm(data.oMi[joints[0]].translation - data.oMi[joints[1]].translation))
+    monkeypatch.setattr(solids, "NEAR", 10.0)  # [m]: feet are near each other
+    np.testing.assert_allclose(feet.apart(model, np.array([q, turned])), expected, atol=5e-5)
+
+
+def test_only_links_that_a_shift_brings_nearer_are_looked_at() -> None:
+    """Two of a foot keep their distance; a foot and the trunk do not, if a leg's joint moves."""
+    robot = biped()
+    model = robot.model
+    foot = int(model.frames[model.getFrameId(still(robot)[1].soles[0])].parentJoint)
+    corners = np.vstack([np.zeros(3), np.eye(3)])
+    three = tuple(Solid(name=str(k), joint=j, vertices=corners) for k, j in enumerate((foot, foot, 1)))
+    all_pairs = Solids(solids=three, pairs=((0, 1), (0, 2), (1, 2)))
+    moves = np.zeros(robot.nv)
+    moves[model.joints[foot].idx_v] = 0.1
+    assert all_pairs.links_between(model, moves).pairs == ((0, 2), (1, 2))
+    assert all_pairs.links_between(model, np.r_[np.ones(6), np.zeros(robot.nv - 6)]).pairs == ()

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["Closing", "base_motion"]
 
 Array = NDArray[np.float64]
+_STEPS = 50  # of Newton, at most
 _LONGEST = 0.3  # [rad] of a Newton step
 _NEAR = 1e-7  # [m, rad]: Newton's next step leaves its square, so it is the last
 _OFF = 1e-6  # [m, rad] and no more, where Newton ends without getting there
@@ -43,14 +44,14 @@ class Closing:
         turning = all(joint.nq == 1 for joint in joints)  # no joint without limits, which has two numbers
         self._places = np.array([joint.idx_q for joint in joints], dtype=np.intp) if turning else None
 
-    def legs(self, y: Array, guess: Array, iterations: int = 50) -> Array:
+    def legs(self, y: Array, guess: Array) -> Array:
         """`StanceCoordinates.solve_legs`."""
         legs = np.array(guess, dtype=float)
         if not self._limbs:
             return legs
         model, data, worst = self._model, self._data, np.inf
         q = self._c.join(y, legs)
-        for _ in range(iterations):
+        for _ in range(_STEPS):
             if self._places is None:
                 q = self._c.join(y, legs)
             else:

@@ -315,7 +315,7 @@ def test_the_best_of_several_starts_is_kept_and_all_are_told(
 def test_a_start_that_meets_its_rows_goes_before_one_that_does_not(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plain start is stopped at once; the others may go on."""
+    """The first start is solved, the second is stopped in its first iterations: the first one is kept."""
     alone: list[int] = []  # iterations of the first start, which may take several runs
 
     def watch(record: Any) -> bool:

@@ -68,13 +68,14 @@ class Cones:
         """C (m, n + 1) and c (m,), C x >= c, of x: n torques over their limits, and what the cones may be
         left by, over the weight.
 
-        B (6 a sole, n), b0 : wrenches in world axes, B x + b0.  places : of the soles.
+        B (6 a frame, n), b0 : wrenches in world axes, B x + b0.  places : of the frames.  Those of the soles
+        come first, and are looked at alone.
         """
         turn, local = self._turn, self._local
-        for k, place in enumerate(places):
+        for k, place in enumerate(places[: self._soles]):
             at, back = 6 * k, place.rotation.T
             turn[at : at + 3, at : at + 3] = turn[at + 3 : at + 6, at + 3 : at + 6] = back
-        local[:, :-1], local[:, -1] = turn @ B, turn @ b0
+        local[:, :-1], local[:, -1] = turn @ B[: len(turn)], turn @ b0[: len(turn)]
         C = self._rows @ local
         c = self._least - C[:, -1]
         C[:, -1] = 1.0

@@ -25,8 +25,9 @@ class HeldDynamics:
     """A robot on soles, at a state; h points of it strike.
 
     A (nv, n), a0 (nv,) : accelerations.  B (6 a sole and a hand that holds on, n), b0 : wrenches of the
-    ground on the frames at their origins, in world axes.  places : of them.  hands (h, 3, nv) : Jacobians of
-    the striking points; places and accelerations without the joints' (h, 3).
+    ground on the frames at their origins, in world axes.  places : of these frames.
+    hands (h, 3, nv) : Jacobians of the striking points.  hand_places (h, 3) [m] : where they are.
+    hand_drift (h, 3) [m/s^2] : their accelerations where joints have none.
     back : the part of b0 that would bring soles back to where they stood.
     recoil (nv, h) : how velocities change by a unit impulse against the normal at each.
     """

@@ -82,7 +82,8 @@ def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float
     looked = np.arange(float(reference.contact_end), float(time[-1]) + LOOK, LOOK)
     rows = np.searchsorted(time, looked).clip(0, len(time) - 1)
     q = postures[rows]
-    capture = [_capture_point(model, *state) for state in zip(q, np.asarray(reference.v)[rows], strict=True)]
+    v, data = np.asarray(reference.v)[rows], model.createData()
+    capture = [_capture_point(model, data, *state) for state in zip(q, v, strict=True)]
     if distance_inside(scene.polygon, np.array(capture)).min() < SAFE:
         return 1.0
     links = scene.solids.links_between(model, shift)
@@ -94,9 +95,8 @@ def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float
     return 0.0
 
 
-def _capture_point(model: Any, q: Array, v: Array) -> Array:
+def _capture_point(model: Any, data: Any, q: Array, v: Array) -> Array:
     """(2,) [m] on the ground."""
-    data = model.createData()
     com = pin.centerOfMass(model, data, q, v)
     return np.asarray(com[:2] + data.vcom[0][:2] * np.sqrt(com[2] / 9.81))
 

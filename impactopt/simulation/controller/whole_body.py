@@ -153,8 +153,7 @@ class WholeBodyController:
         P.flat[: n * (n + 1) : n + 2] += effort
         g[:n] -= effort * feed
         P[n, n], g[n] = SQUARE, PRICE
-        soles = 6 * len(self.scene.soles)
-        C, c = self.cones.look(held.places[: len(self.scene.soles)], B[:soles], held.b0[:soles])
+        C, c = self.cones.look(held.places, B, held.b0)
         begun = time.process_time()
         x = self.qp.solve(P, g, C, c, self.low, self.high)
         self.seconds.append(time.process_time() - begun)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,7 +59,7 @@ def reference(model: SymbolicModel, case: Case) -> tuple[Expected, float, str]:
     except (InputError, RuntimeError, FloatingPointError):
         pass
     try:
-        return _agreed(model, frozen, v, given, values, scale), scale, "LSODA"
+        return _agreed(functools.partial(by_scipy, model, frozen, v, given, values), scale), scale, "LSODA"
     except TakesTooLong:
         if model.stepping != "implicit":
             raise
@@ -102,14 +103,7 @@ def frozen_numbers(model: SymbolicModel, q: Array, v: Array, values: dict[str, A
     return {name: np.array(x) for name, x in zip(function.name_out(), found, strict=True)}
 
 
-def _agreed(
-    model: SymbolicModel,
-    frozen: dict[str, Array],
-    v: Array,
-    torque: Array | None,
-    values: dict[str, Array],
-    scale: float,
-) -> Expected:
+def _agreed(solve: Callable[..., Expected], scale: float) -> Expected:
     """What LSODA says at two tolerances; where these are apart, that of the two which Radau's method says.
 
     A target's switches lead LSODA astray at either of them, now and then.
@@ -118,11 +112,11 @@ def _agreed(
     ------
     TakesTooLong : no two of them agree.
     """
-    found = [by_scipy(model, frozen, v, torque, values, rtol=rtol) for rtol in _TOLERANCES]
+    found = [solve(rtol=rtol) for rtol in _TOLERANCES]
     close = _CLOSE * max(abs(found[-1].impulse), scale)
     if abs(found[0].impulse - found[1].impulse) <= close:
         return found[-1]
-    third = by_scipy(model, frozen, v, torque, values, method="Radau", rtol=_TOLERANCES[0])
+    third = solve(method="Radau", rtol=_TOLERANCES[0])
     nearest = min(found, key=lambda one: abs(one.impulse - third.impulse))
     if abs(nearest.impulse - third.impulse) > close:
         raise TakesTooLong

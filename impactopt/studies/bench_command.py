@@ -101,6 +101,10 @@ def _baselines(
     seed: Seed = 0,
     workers: Workers = 2,
     controller: Controller = ControllerName.servo,
+    crocoddyl: Annotated[
+        Path | None,
+        typer.Option(metavar="PYTHON", help="Interpreter with crocoddyl: a plan by it, too."),
+    ] = None,
 ) -> None:
     """What people do today, on the same robot and in the same limits, beside our plans."""
 

@@ -21,11 +21,13 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Balance
 from impactopt.simulation import ControllerSettings, Simulation, simulate
 from impactopt.simulation.robustness import robustness
+from impactopt.studies.bench.crocoddyl_peer import crocoddyl_plan
 from impactopt.studies.bench.planning import DEMO, controller_in, plan_of
 from impactopt.studies.report import Report, Say, columns_table
 from impactopt.transcription.plan import Trajectory
 
 TIME_LIMIT = 120.0  # [s] of the solver
+CROCODDYL = "Crocoddyl, rigid impulse"
 ANY_BALANCE = Balance(capture_margin=None, vertical_speed=np.inf, angular_momentum=np.inf)
 OURS = ("punch_strongest.toml", "punch_robust.toml")  # beside the demo, where they are
 
@@ -48,10 +50,14 @@ def run(
     seed: int = 0,
     workers: int = 2,
     controller: str = "servo",
+    crocoddyl: Path | None = None,
 ) -> Report:
-    """One row a method; ``draws`` perturbations are drawn for each.  controller : "servo" or "wbc"."""
+    """One row a method; ``draws`` perturbations are drawn for each.
+
+    controller : "servo" or "wbc".  crocoddyl : an interpreter that has it, for a plan by it.
+    """
     rows, settings = [], controller_in(file, controller)
-    for name, make in methods(file, say):
+    for name, make in methods(file, say, crocoddyl):
         try:
             rows.append(row(make(), say, draws, seed, workers, settings))
         except InputError as error:  # a method that finds no plan stays in
@@ -77,12 +83,16 @@ COLUMNS = (
 KEYS = (*(key for _, key, _ in COLUMNS), "reason")
 
 
-def methods(file: Path, say: Say) -> Iterator[tuple[str, Callable[[], Method]]]:
+def methods(
+    file: Path, say: Say, crocoddyl: Path | None = None
+) -> Iterator[tuple[str, Callable[[], Method]]]:
     """Names, and what plans them."""
     ours = plan_of(file, say)
     problem = ours.problem
     loose = tuple(t for t in problem.terms if not isinstance(t, Balance))
     yield "minimum-jerk reach", lambda: _minimum_jerk(problem)
+    if crocoddyl is not None:
+        yield CROCODDYL, lambda: _crocoddyl(problem, crocoddyl, say)
     for kind, label in (("rigid", "rigid impact"), ("virtual-mass", "virtual-mass collision")):
         for terms, what in (((*loose, ANY_BALANCE), ""), (problem.terms, ", balance after it")):
             changed = replace(problem, collision=kind, terms=terms, scenarios=())
@@ -100,6 +110,13 @@ def _minimum_jerk(problem: ImpactProblem) -> Method:
     return Method(
         name="minimum-jerk reach", problem=problem, reference=found.reference, impulse=found.impulse
     )
+
+
+def _crocoddyl(problem: ImpactProblem, python: Path, say: Say) -> Method:
+    found = crocoddyl_plan(problem, python)
+    how = "solved" if found.solved else "stopped"
+    say(f"{CROCODDYL}: {how} after {found.iterations} iterations, {found.seconds:.1f} s")
+    return Method(name=CROCODDYL, problem=problem, reference=found.reference, impulse=found.impulse)
 
 
 def _of(name: str, solution: Solution) -> Method:

@@ -24,6 +24,10 @@ _STATUS = {
 }
 _SILENT = {"print_header": False, "print_iteration": False, "print_status": False, "print_time": False}
 _QP_OPTIONS: dict[str, dict[str, Any]] = {
+    "osqp": {
+        "osqp": {"verbose": False, "eps_abs": 1e-7, "eps_rel": 1e-7, "polish": True},
+        "error_on_fail": False,
+    },
     "qpoases": {"printLevel": "none"},
     "piqp": {},
 }

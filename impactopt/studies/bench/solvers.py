@@ -45,6 +45,12 @@ def _uno(program: NonlinearProgram, x0: Vector, time_limit: float, *, preset: st
     return solve_uno(program, x0, time_limit, preset=preset)
 
 
+def _pounce(program: NonlinearProgram, x0: Vector, time_limit: float) -> SolverResult:
+    from impactopt.studies.bench.pounce_peer import solve_pounce
+
+    return solve_pounce(program, x0, time_limit)
+
+
 def _casadi(program: NonlinearProgram, x0: Vector, time_limit: float, *, qp: str) -> SolverResult:
     from impactopt.studies.bench.casadi_peer import solve_sqpmethod
 
@@ -64,7 +70,8 @@ def _table() -> dict[str, Solver]:
         Solver(name="ipopt", qp="", run=partial(_ipopt, linear="mumps")),
         Solver(name="ipopt-spral", qp="", run=partial(_ipopt, linear="spral")),
         *(Solver(name=f"uno-{n}", qp="", run=partial(_uno, preset=n)) for n in ("filtersqp", "ipopt")),
-        *(Solver(name="sqpmethod", qp=qp, run=partial(_casadi, qp=qp)) for qp in ("qpoases", "piqp")),
+        Solver(name="pounce", qp="", run=_pounce),
+        *(Solver(name="sqpmethod", qp=qp, run=partial(_casadi, qp=qp)) for qp in ("osqp", "qpoases", "piqp")),
         *(Solver(name=n, qp="", run=partial(_scipy, method=n)) for n in ("slsqp", "trust-constr")),
     ]
     return {solver.label: solver for solver in (*ours, *others)}

@@ -110,13 +110,16 @@ def _agreed(solve: Callable[..., Expected], scale: float) -> Expected:
 
     Raises
     ------
-    TakesTooLong : no two of them agree.
+    TakesTooLong : no two of them agree, or Radau's method breaks down.
     """
     found = [solve(rtol=rtol) for rtol in _TOLERANCES]
     close = _CLOSE * max(abs(found[-1].impulse), scale)
     if abs(found[0].impulse - found[1].impulse) <= close:
         return found[-1]
-    third = solve(method="Radau", rtol=_TOLERANCES[0])
+    try:
+        third = solve(method="Radau", rtol=_TOLERANCES[0])
+    except ValueError as error:  # its slopes are no numbers any more
+        raise TakesTooLong from error
     nearest = min(found, key=lambda one: abs(one.impulse - third.impulse))
     if abs(nearest.impulse - third.impulse) > close:
         raise TakesTooLong

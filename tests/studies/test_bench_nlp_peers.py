@@ -1,4 +1,4 @@
-"""Uno as a peer in the bench of solvers: its presets on our functions, signs, clock and errors."""
+"""Uno and POUNCE as peers in the bench of solvers: our functions, signs, clock and errors."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from impactopt.solvers.program import Status, max_violation
 from impactopt.studies.bench.attempts import judged
 from impactopt.studies.bench.solvers import SOLVERS
 
-PRESETS = ("uno-filtersqp", "uno-ipopt")
+PEERS = {"uno-filtersqp": "unopy", "uno-ipopt": "unopy", "pounce": "pounce"}  # and what they are imported as
 
 
 def banana(x: Any, y: Any) -> Any:
     return 100 * (y - x**2) ** 2 + (1 - x) ** 2
 
 
-def test_without_unopy_it_is_told_what_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "unopy", None)
-    with pytest.raises(InputError, match=r"Uno needs the package unopy.*\.\[peers\]"):
-        SOLVERS["uno-ipopt"].run(Textbook(2, banana), np.zeros(2), 1.0)
+@pytest.mark.parametrize("solver", PEERS)
+def test_without_its_package_it_is_told_what_brings_it(solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, PEERS[solver], None)
+    with pytest.raises(InputError, match=r"(Uno|POUNCE) needs the package .*\.\[peers\]"):
+        SOLVERS[solver].run(Textbook(2, banana), np.zeros(2), 1.0)
 
 
 # rows on either side and equalities; bounds that hold; no rows; ten variables
 @pytest.mark.parametrize("name", ["HS1", "HS15", "HS34", "HS78", "HS113"])
-@pytest.mark.parametrize("solver", PRESETS)
-def test_presets_solve_what_is_asked(solver: str, name: str) -> None:
-    pytest.importorskip("unopy")
+@pytest.mark.parametrize("solver", PEERS)
+def test_they_solve_what_is_asked(solver: str, name: str) -> None:
+    pytest.importorskip(PEERS[solver])
     case = BOOK[name]
     program = case.build()
     result = SOLVERS[solver].run(program, np.array(case.x0), 20.0)
@@ -47,9 +48,9 @@ def test_presets_solve_what_is_asked(solver: str, name: str) -> None:
     assert 0 < result.seconds_functions < result.seconds
 
 
-@pytest.mark.parametrize("solver", PRESETS)
+@pytest.mark.parametrize("solver", PEERS)
 def test_it_stops_in_time_with_the_best_point(solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("unopy")
+    pytest.importorskip(PEERS[solver])
     case = BOOK["HS15"]
     program, x0 = case.build(), np.array(case.x0)
     ticks = itertools.count()
@@ -61,9 +62,9 @@ def test_it_stops_in_time_with_the_best_point(solver: str, monkeypatch: pytest.M
     assert result.max_violation < max_violation(program, x0, program.constraints(x0))
 
 
-@pytest.mark.parametrize("solver", PRESETS)
+@pytest.mark.parametrize("solver", PEERS)
 def test_what_cannot_be_computed_shortens_the_step(solver: str) -> None:
-    pytest.importorskip("unopy")
+    pytest.importorskip(PEERS[solver])
 
     class Narrow(Textbook):
         """Not defined where x is above 1.5, where the first Newton step ends; best at x = 1."""
@@ -83,9 +84,9 @@ def test_what_cannot_be_computed_shortens_the_step(solver: str) -> None:
     assert result.x == pytest.approx([1.0], abs=1e-5)
 
 
-@pytest.mark.parametrize("solver", PRESETS)
+@pytest.mark.parametrize("solver", PEERS)
 def test_a_bug_in_the_program_is_not_hidden(solver: str) -> None:
-    pytest.importorskip("unopy")
+    pytest.importorskip(PEERS[solver])
 
     class Faulty(Textbook):
         def hessian(self, x: Any, sigma: float, y: Any) -> Any:
@@ -97,8 +98,8 @@ def test_a_bug_in_the_program_is_not_hidden(solver: str) -> None:
         SOLVERS[solver].run(Faulty(2, banana), np.array([-1.2, 1.0]), 10.0)
 
 
-@pytest.mark.parametrize("solver", PRESETS)
+@pytest.mark.parametrize("solver", PEERS)
 def test_it_tells_an_infeasible_program(solver: str) -> None:
-    pytest.importorskip("unopy")
+    pytest.importorskip(PEERS[solver])
     program, x0 = infeasible()
     assert SOLVERS[solver].run(program, x0, 10.0).status is Status.INFEASIBLE

@@ -31,6 +31,7 @@ from impactopt.cli.options import (
     Starts,
     TimeLimit,
     Verbose,
+    Workers,
     check_loudness,
     check_time_limit,
     command_line,
@@ -117,6 +118,7 @@ def solve(
         Start, typer.Option(help="What to start from: a plain reach, or the hardest strike near it.")
     ] = Start.reach,
     starts: Starts = 1,
+    workers: Workers = 1,
     seed: Seed = 0,
     store: Annotated[
         Path | None,
@@ -153,8 +155,8 @@ def solve(
             problem = read.build()
             directory = make_directory(out if out is not None else Path("results") / file.stem)
             progress.say("building the program (compiles for some ten seconds the first time)")
-            chosen |= {"start": start.value, "starts": starts, "seed": seed}
-            chosen |= {"report": progress.say, "callback": progress.iteration}
+            chosen |= {"start": start.value, "starts": starts, "workers": workers, "seed": seed}
+            chosen |= {"report": progress.say, "callback": progress.iteration if workers == 1 else None}
             if store is None:
                 solution = plan(problem, **chosen)
             else:

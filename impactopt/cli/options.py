@@ -90,6 +90,9 @@ TimeLimit = Annotated[
 Starts = Annotated[
     int, typer.Option(min=1, help="Multistart: number of starts, all but the first drawn; the best is kept.")
 ]
+Workers = Annotated[
+    int, typer.Option(min=1, help="Processes that solve the starts side by side; progress is told by start.")
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the starts that are drawn.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, no tables.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]

@@ -19,6 +19,7 @@ from impactopt.cli.options import (
     Starts,
     TimeLimit,
     Verbose,
+    Workers,
     check_loudness,
     check_time_limit,
     command_line,
@@ -37,6 +38,7 @@ def strike(
         str, typer.Option(metavar="METHOD", help="Of the contact: collocation, or shooting (by the SDC).")
     ] = "collocation",
     starts: Starts = 4,
+    workers: Workers = 1,
     seed: Seed = 0,
     solver: SolverName = None,
     time_limit: TimeLimit = None,
@@ -71,9 +73,10 @@ def strike(
                 problem,
                 method=method,
                 starts=starts,
+                workers=workers,
                 seed=seed,
                 report=progress.say,
-                callback=progress.iteration,
+                callback=progress.iteration if workers == 1 else None,
                 **chosen,
             )
             progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")

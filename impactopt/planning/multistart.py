@@ -193,7 +193,7 @@ def solve_from(
         attempts.append(attempt_of(program, name, result))
         if result.status is Status.INTERRUPTED or budget.left == 0:
             break
-    order = [_rank(result) for _, result in found]
+    order = [rank_of(result) for _, result in found]
     best = order.index(min(order))
     attempts[best] = replace(attempts[best], kept=True)
     t, result = found[best]
@@ -228,7 +228,8 @@ def violations_of(t: ContactProgram, x: Array, rows: Array) -> tuple[Violation, 
     return tuple(worst_rows(t.program, x, rows, tolerance=VIOLATED, count=NAMED))
 
 
-def _rank(result: SolverResult) -> tuple[bool, float]:
+def rank_of(result: SolverResult) -> tuple[bool, float]:
+    """Less is better: those that meet their rows by their objective, then the others by their violation."""
     met = result.status.usable or result.max_violation <= VIOLATED
     return not met, result.objective if met else result.max_violation
 

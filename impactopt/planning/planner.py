@@ -28,6 +28,7 @@ from impactopt.planning.multistart import (
 )
 from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
 from impactopt.planning.rounds import Refining
+from impactopt.planning.side_by_side import best_side_by_side, check_workers
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
 from impactopt.planning.verdict import with_reason
@@ -56,6 +57,7 @@ def solve(
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
+    workers: int = 1,
     refine: bool = True,
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
@@ -72,6 +74,8 @@ def solve(
         drawn by ``seed``. The best motion is kept; ``Solution.attempts`` has all. Where all end with bodies
         in each other, up to two more are tried.
     options : the solver's own.  time_limit [s] : of all starts together, without compiling functions.
+    workers : processes that the starts are solved on, side by side. Then no callback is asked, and no more
+        starts are tried than were asked for.
     refine : whether the mesh is refined. Nodes are added where a motion uses up more than half of a margin
         between two nodes, and it is solved again from the solution, at most three times (``Solution.nodes``).
         The contact gets finer elements while theirs make an error of more than half a per cent of the impulse
@@ -87,9 +91,15 @@ def solve(
     """
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=not isinstance(start, str))
+    check_workers(workers, callback)
+    if isinstance(start, str) and start not in STARTS:
+        near = did_you_mean(start, STARTS)
+        raise InputError(
+            f"unknown start {start!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
+        )
     if problem.collision == "auto":
         common: dict[str, Any] = {"solver": solver, "options": options, "refine": refine}
-        common |= {"report": report, "callback": callback}
+        common |= {"workers": workers, "report": report, "callback": callback}
 
         def run(chosen: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
             if other is not None:
@@ -97,6 +107,24 @@ def solve(
             return solve(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
 
         return climbed(problem, run, time_limit=time_limit, report=report)
+    if workers > 1 and starts > 1:
+        block_functions(roomy(problem), problem.coordinates, report)  # compiled here, not by each
+        run_one = partial(_planned, problem, start, 0, seed, refine)
+        return best_side_by_side(run_one, budget, starts=starts, workers=workers, report=report)
+    return _planned(problem, start, _MORE, seed, refine, budget, range(starts), report)
+
+
+def _planned(
+    problem: ImpactProblem,
+    start: str | ArrayLike | Solution,
+    more: int,
+    seed: int,
+    refine: bool,
+    budget: Budget,
+    which: range,
+    report: Callable[[str], None] | None,
+) -> Solution:
+    """The best motion from these starts, and up to so many more; or from the given one."""
     given: str | Array | SolverResult
     nodes: MoreNodes = NO_MORE
     elements: Elements = ()
@@ -109,11 +137,6 @@ def solve(
             apart = start.apart
     else:
         given = start if isinstance(start, str) else check_array("start", start, (None,))
-    if isinstance(given, str) and given not in STARTS:
-        near = did_you_mean(given, STARTS)
-        raise InputError(
-            f"unknown start {given!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
-        )
     began, problem = time.perf_counter(), roomy(problem)
     functions = block_functions(problem, problem.coordinates, report, elements)
     budget = budget.started()
@@ -123,13 +146,13 @@ def solve(
     if not isinstance(given, str):
         check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
     if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
+        report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     refining = Refining(budget, margins, apart, report)
     # limbs that are in each other, or gears that break, say nothing of what a start is worth: each is led to
     # its end before they compare
     each = partial(_led, refining, refine and margins is not None)
-    of_start = _starts(t, given, starts, seed, partial(clear_strike, budget, margins), refining)
+    of_start = _starts(t, given, which, more, seed, partial(clear_strike, budget, margins), refining)
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
@@ -204,7 +227,8 @@ def _on(refining: Refining, t: Transcription, fields: dict[str, Any]) -> tuple[T
 def _starts(
     t: Transcription,
     start: str | Array | SolverResult,
-    starts: int,
+    which: range,
+    more: int,
     seed: int,
     hit: Callable[[StrikeTranscription, Array], tuple[StrikeTranscription, SolverResult]],
     refining: Refining,
@@ -221,11 +245,12 @@ def _starts(
     if start == "strike":
         strike = StrikeTranscription(t.problem, t.coordinates, t.functions)
     blocked = True
-    for k, draw in enumerate(drawn(starts + _MORE, seed)):
-        if k >= starts and not blocked:
+    draws = drawn(which.stop + more, seed)
+    for k in range(which.start, which.stop + more):
+        if k >= which.stop and not blocked:
             return
 
-        def make(draw: dict[str, Any] = draw) -> Array:
+        def make(draw: dict[str, Any] = draws[k]) -> Array:
             if strike is None:
                 return first_iterate(t, **draw)
             found, result = hit(strike, strike_iterate(strike, **draw))

@@ -29,6 +29,7 @@ from impactopt.planning.multistart import (
     with_effort_of,
 )
 from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
+from impactopt.planning.side_by_side import best_side_by_side, check_workers
 from impactopt.planning.solution import Solved, blow_numbers, versions
 from impactopt.planning.too_near import missing_rows
 from impactopt.planning.verdict import with_reason
@@ -101,6 +102,7 @@ def optimize_strike(
     start: ArrayLike | StrikeSolution | None = None,
     options: Mapping[str, Any] | None = None,
     time_limit: float | None = None,
+    workers: int = 1,
     report: Callable[[str], None] | None = None,
     callback: Callback | None = None,
 ) -> StrikeSolution:
@@ -121,6 +123,7 @@ def optimize_strike(
         the SQP with a QP solver: DAQP if it is installed, else OSQP, unless `options` name one.
     starts : reaches to start from, the first one plain, the others with perturbed postures and other speeds,
         drawn by ``seed``; the best strike is kept. ``StrikeSolution.attempts`` has all.
+    workers : processes that these starts are solved on, side by side; then no callback is asked.
     start : to start from instead: solver variables (n,), or the solution of a neighbouring problem.
 
     Raises
@@ -140,12 +143,14 @@ def optimize_strike(
         options = _of_shooting(solver, options)
     budget = Budget(solver=solver, options=options, time_limit=time_limit, callback=callback)
     check_starts(starts, seed, given=start is not None)
+    check_workers(workers, callback)
     if all(o.whole_motion for o in problem.objectives):
         raise InputError("no objective of this problem is one of a strike; add what it is for: Impulse()")
     if problem.collision == "auto" and method == "collocation":
         common: dict[str, Any] = {
             "solver": solver,
             "options": options,
+            "workers": workers,
             "report": report,
             "callback": callback,
         }
@@ -156,6 +161,23 @@ def optimize_strike(
             return optimize_strike(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
 
         return climbed(problem, run, time_limit=time_limit, report=report)
+    if workers > 1 and starts > 1:
+        block_functions(roomy(problem), problem.coordinates, report)  # compiled here, not by each
+        run = partial(_optimized, problem, method, None, seed)
+        return best_side_by_side(run, budget, starts=starts, workers=workers, report=report)
+    return _optimized(problem, method, start, seed, budget, range(starts), report)
+
+
+def _optimized(
+    problem: ImpactProblem,
+    method: str,
+    start: ArrayLike | StrikeSolution | None,
+    seed: int,
+    budget: Budget,
+    which: range,
+    report: Callable[[str], None] | None,
+) -> StrikeSolution:
+    """The best strike from these starts, or from the given one."""
     began, problem = time.perf_counter(), roomy(problem)
     if isinstance(start, StrikeSolution):
         problem = with_rows(problem, rows_on_demand(start.problem))
@@ -168,12 +190,12 @@ def optimize_strike(
         start = (start.result if method == "shooting" else carried_start(t, same, start, start.apart)).x
     given = None if start is None else check_array("start", start, (t.program.n,))
     if report is not None:
-        report(f"program of {t.program.n} variables and {t.program.m} rows; {solver} starts")
+        report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
     work = partial(_clean_strike, budget, margins)
     if method != "shooting":
         work = partial(_bounded_strike, work, report)
-    t, fields = solve_from(t, _starts(t, given, starts, seed), budget, began, work)
+    t, fields = solve_from(t, _starts(t, given, which, seed), budget, began, work)
     t, fields = settled(t, fields, budget, report)
     result = fields["result"] = with_reason(t, fields["result"])
     held = held_blow(t, result.x) if result.status.usable else None
@@ -355,10 +377,11 @@ def _settled(
     return t, result
 
 
-def _starts(t: StrikeTranscription, given: Array | None, starts: int, seed: int) -> Starts:
+def _starts(t: StrikeTranscription, given: Array | None, which: range, seed: int) -> Starts:
     """Names of the starts, and what makes them."""
     if given is not None:
         yield "given", lambda: given
         return
-    for k, draw in enumerate(drawn(starts, seed)):
-        yield f"reach {k + 1}", partial(strike_iterate, t, **draw)
+    draws = drawn(which.stop, seed)
+    for k in which:
+        yield f"reach {k + 1}", partial(strike_iterate, t, **draws[k])

@@ -152,6 +152,10 @@ class ImpactProblem:
         """One line; `describe` has more."""
         return f"<ImpactProblem {self.name!r}: {self.striker} of {self.robot.name} on {self.target!r}>"
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but its coordinates, whose symbols CasADi does not pickle: they are made anew when needed."""
+        return {name: value for name, value in vars(self).items() if name != "coordinates"}
+
     def __post_init__(self) -> None:
         found = Mistakes()
         found.attempt(lambda: check_name("the problem", self.name, empty=True))
@@ -199,9 +203,7 @@ class ImpactProblem:
             raise InputError(f"scenarios must be a tuple of Scenario, not {self.scenarios!r}")
         object.__setattr__(self, "scenarios", tuple(self.scenarios))
         if self.scenarios and not self.lasts:
-            raise InputError(
-                f'scenarios need a contact that lasts, as collision="full", not {self.collision!r}'
-            )
+            raise InputError(f'scenarios need a contact that lasts, as "full", not {self.collision!r}')
         check_apart("scenario", [s.name for s in self.scenarios])
 
     def _check_world(self) -> None:
@@ -228,9 +230,9 @@ class ImpactProblem:
             raise InputError("HitCone takes the place of Incidence: give one of them")
 
     def _check_objectives(self) -> None:
-        stands = self.robot.floating
         turns = not isinstance(self.target, Target) or self.target.turns
-        checked = check_objectives(self.objectives, contact=self.lasts, turns=turns, balance=stands)
+        allowed = {"contact": self.lasts, "turns": turns, "balance": self.robot.floating}
+        checked = check_objectives(self.objectives, **allowed)
         object.__setattr__(self, "objectives", checked)
 
     def _check_start(self) -> None:

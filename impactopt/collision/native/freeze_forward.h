@@ -1,13 +1,20 @@
-/* Tangents of what is frozen; see freeze.h and forward.h. With B the roots of joints and hand, U = B - W_c P and
-   E = dB - dW_c P,
+/* Tangents of what is frozen, of a vector of directions after the other; see freeze.h and forward.h. With B the roots of
+   joints and hand, U = B - W_c P and E = dB - dW_c P,
 
        dQ = U' E + E' U,    dP = G^-1 (dW_c' U + W_c' E),    G the Delassus matrix, P = G^-1 W_c' B */
 
 typedef struct {
   FrozenTangent frozen;
-  vec E[NV][N + 1][VD], root[ROOT_NONZEROS][VD], held[AT_LEAST_1(HELD_NONZEROS)][VD];
-  vec U[NV][V], P[C1][V], identity[NV][VD], none[NV][VD];
-  double parts[TREE_PARTS];
+  vec U[NV][V], P[C1][V];
+  double tree_parts[TREE_PARTS], approach_parts[APPROACH_PARTS];
+  /* of the meeting, and of the drifts there */
+  double impulse, yielding, inner[NV], change[NV], bias[NV], L_0[C1], rest[NV];
+#if BIAS || JDOT
+  double drift_parts[DRIFT_PARTS];
+#endif
+  /* of a vector: directions of q and of v, derivatives of the roots, E, and of P and of the soles */
+  vec by_q[NV], by_v[NV], root[ROOT_NONZEROS], held[AT_LEAST_1(HELD_NONZEROS)];
+  vec E[NV][COLUMNS_OF_V], P_by[C1][N + 1], soles[AT_LEAST_1(3 * SOLES)], unmodelled[SIX], L_0_by[C1];
 } FreezeForward;
 
 #define ROW_OF_ROOT(i) (ROOT_AT[i] / (VF * LANES))
@@ -17,40 +24,22 @@ typedef struct {
 /* which of v a column of `root` is of; the hand's is none */
 #define VELOCITY(c) ((c) < N ? (c) + NV - N : (c) - N - 1)
 
-/* x := G^-1 x, a row of directions each */
-static void by_delassus(const Frozen *F, vec *x, int stride) {
-  FOR(c, C) FOR_EACH(k) {
-    vec s = x[c * stride + k];
-    FOR(b, c) s -= F->R[c][b] * x[b * stride + k];
-    x[c * stride + k] = s * F->R[c][c];
+/* x := G^-1 x, rows of directions */
+static void by_delassus(const Frozen *F, vec *x, int width) {
+  FOR(c, C) FOR(j, width) {
+    vec s = x[c * width + j];
+    FOR(b, c) s -= F->R[c][b] * x[b * width + j];
+    x[c * width + j] = s * F->R[c][c];
   }
-  for (int c = C - 1; c >= 0; c--) FOR_EACH(k) {
-    vec s = x[c * stride + k];
-    for (int b = c + 1; b < C; b++) s -= F->R[b][c] * x[b * stride + k];
-    x[c * stride + k] = s * F->R[c][c];
+  for (int c = C - 1; c >= 0; c--) FOR(j, width) {
+    vec s = x[c * width + j];
+    for (int b = c + 1; b < C; b++) s -= F->R[b][c] * x[b * width + j];
+    x[c * width + j] = s * F->R[c][c];
   }
 }
 
-static void roots_forward(const double *q, const double *v, const double *normal, const Frozen *F, FreezeForward *w) {
-  FrozenTangent *t = &w->frozen;
-  memset(w->identity, 0, sizeof w->identity);
-  memset(w->none, 0, sizeof w->none);
-  memset(t->unmodelled, 0, sizeof t->unmodelled);
-  memset(t->hand_speed, 0, sizeof t->hand_speed);
-  FOR(i, NV) *lane(w->identity[i], i) = 1.0;
-  const double *in[] = {q, v, normal};
-  double *parts[] = {w->parts};
-  const vec *seed[] = {w->identity[0]};
-  vec *by_q[] = {w->root[0], w->held[0], t->hand_speed[BY_Q], t->soles[0], t->unmodelled[BY_Q][0]};
-  vec *by_v[] = {t->hand_speed[BY_V], t->unmodelled[BY_V][0]};
-  tree_parts(in, parts, 0, 0, 0);
-  tree_forward(w->parts, seed, by_q, VD);
-  double few[APPROACH_PARTS];
-  parts[0] = few;
-  approach_parts(in, parts, 0, 0, 0);
-  approach_forward(few, seed, by_v, VD);
-
-  /* P, U, E */
+/* ------------------------------------------------------------ what all directions share */
+static void roots_shared(const Frozen *F, FreezeForward *w) {
   memcpy(w->P, F->Z, sizeof w->P);
   FOR(i, V) for (int c = C - 1; c >= 0; c--) {
     vec s = w->P[c][i];
@@ -62,138 +51,239 @@ static void roots_forward(const double *q, const double *v, const double *normal
     FOR(c, C) FOR(i, V) w->U[r][i] -= ((double *)F->held[r])[c] * w->P[c][i];
     for (int i = N + 1; i < ROWS_OF_V; i++) ((double *)w->U[r])[i] = 0.0;
   }
-  memset(w->E, 0, sizeof w->E);
-  FOR(i, ROOT_NONZEROS) if (COLUMN_OF_ROOT(i) <= N)
-    FOR_EACH(k) w->E[ROW_OF_ROOT(i)][COLUMN_OF_ROOT(i)][k] += w->root[i][k];
-  FOR(i, HELD_NONZEROS) {
-    const double *P = (const double *)w->P[COLUMN_OF_HELD(i)];
-    FOR(j, N + 1) FOR_EACH(k) w->E[ROW_OF_HELD(i)][j][k] -= P[j] * w->held[i][k];
-  }
 }
 
-static void inverse_inertia_forward(const Frozen *F, FreezeForward *w) {
-  FrozenTangent *t = &w->frozen;
-  memset(t->Q, 0, sizeof t->Q);
-  add_product((const vec(*)[V])w->U, NV, w->E[0][0], (N + 1) * VD, t->Q[0][0]);
-  FOR(i, N + 1) FOR(j, i + 1) FOR_EACH(k) t->Q[i][j][k] = t->Q[j][i][k] = t->Q[i][j][k] + t->Q[j][i][k];
-  /* without wrenches, the hand's column alone */
-  const int first = HELD_HISTORY ? 0 : N;
-  memset(t->P, 0, sizeof t->P);
-  FOR(i, HELD_NONZEROS) {
-    const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
-    const double *U = (const double *)w->U[r], by = ((const double *)F->held[r])[c];
-    for (int j = first; j <= N; j++) FOR_EACH(k) t->P[c][j][k] += U[j] * w->held[i][k] + by * w->E[r][j][k];
-  }
-  for (int j = first; j <= N; j++) by_delassus(F, t->P[0][j], (N + 1) * VD);
-}
-
-/* the velocity that drifts are frozen at */
-static void meeting_forward(double yields, const Frozen *F, const FreezeForward *w, vec velocity[2][NV][VD]) {
-  const FrozenTangent *t = &w->frozen;
-  const double yielding = ((double *)F->Q[N])[N] + yields;
-  const double impulse = (F->closing < 0.0 ? 0.0 : F->closing) / yielding;
-  double inner[NV], change[NV];
-  vec hand[NV][VD];
-  FOR(r, NV) {
-    inner[r] = ((const double *)w->U[r])[N];
-    FOR_EACH(k) hand[r][k] = w->E[r][N][k];
-  }
-  FOR(i, HELD_NONZEROS) {
-    const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
-    FOR_EACH(k) hand[r][k] -= ((const double *)F->held[r])[c] * t->P[c][N][k];
-  }
-  times_root_transposed(F, inner, change);
-  memset(velocity[BY_Q], 0, sizeof velocity[BY_Q]);
-  memcpy(velocity[BY_V], w->identity, sizeof velocity[BY_V]);
-  FOR(i, ROOT_NONZEROS) {
-    const int r = ROW_OF_ROOT(i), c = COLUMN_OF_ROOT(i);
-    if (c == N) continue;
-    const double by = ((const double *)F->root[r])[c] * impulse;
-    FOR_EACH(k) velocity[BY_Q][VELOCITY(c)][k] -= by * hand[r][k] + inner[r] * impulse * w->root[i][k];
-  }
-  FOR(kind, 2) {
-    vec more[VD];
-    FOR_EACH(k) {
-      more[k] = either(F->closing < 0.0, (vec){0}, t->hand_speed[kind][k] / yielding);
-      if (kind == BY_Q) more[k] -= t->Q[N][N][k] * (impulse / yielding);
-    }
-    FOR(i, NV) FOR_EACH(k) velocity[kind][i][k] -= change[i] * more[k];
-  }
-}
-
-static void drifts_forward(const double *q, const double *normal, double yields, const Frozen *F, FreezeForward *w) {
-  FrozenTangent *t = &w->frozen;
-  memset(t->drift, 0, sizeof t->drift);
-  memset(t->L_0, 0, sizeof t->L_0);
+static void drifts_shared(const double *q, const double *normal, double yields, const Frozen *F, FreezeForward *w) {
 #if BIAS || JDOT
-  vec velocity[2][NV][VD], of_bias[NV][VD], of_hand[VD], of_held[C1][VD];
-  double parts[DRIFT_PARTS], bias[NV], at_hand, at_held[C1], L_0[C1], rest[NV];
+  w->yielding = ((double *)F->Q[N])[N] + yields;
+  w->impulse = (F->closing < 0.0 ? 0.0 : F->closing) / w->yielding;
+  FOR(r, NV) w->inner[r] = ((const double *)w->U[r])[N];
+  times_root_transposed(F, w->inner, w->change);
+  double at_hand, at_held[C1];
   const double *in[] = {q, F->drift_velocity, normal};
-  double *to[] = {parts}, *out[] = {
+  double *to[] = {w->drift_parts}, *out[] = {
 #if BIAS
-    bias,
+    w->bias,
 #endif
 #if JDOT
     &at_hand, at_held
 #endif
   };
-  meeting_forward(yields, F, w, velocity);
   drift(in, out, 0, 0, 0);
   drift_parts(in, to, 0, 0, 0);
-  memcpy(L_0, F->push, sizeof L_0);
-  SOLVE_TRANSPOSED(F, L_0, double)
+  memcpy(w->L_0, F->push, sizeof w->L_0);
+  SOLVE_TRANSPOSED(F, w->L_0, double)
   FOR(r, NV) {
-    rest[r] = -F->bias_root[r];
-    FOR(c, C) rest[r] += ((const double *)F->held[r])[c] * L_0[c];
+    w->rest[r] = -F->bias_root[r];
+    FOR(c, C) w->rest[r] += ((const double *)F->held[r])[c] * w->L_0[c];
   }
-  FOR(kind, 2) {
-    const vec *seed[] = {kind == BY_Q ? w->identity[0] : w->none[0], velocity[kind][0]};
-    vec *moved[] = {
-#if BIAS
-      of_bias[0],
+#else
+  memset(w->L_0, 0, sizeof w->L_0);
 #endif
-#if JDOT
-      of_hand, of_held[0]
+}
+
+static void reactions_shared(const Frozen *F, FreezeForward *w) {
+#if HELD_HISTORY
+  memset(w->frozen.by, 0, sizeof w->frozen.by);
+  FOR(j, N + 1) {
+    double x[C1];
+    FOR(c, C) x[c] = ((const double *)w->P[c])[j];
+#if HELD_ASKED
+    FOR(c, C) w->frozen.by[c / SIX][j][c % SIX] = x[c];
 #endif
-    };
-    drift_forward(parts, seed, moved, VD);
-    vec root[NV][VD], (*push)[VD] = t->L_0[kind], (*sum)[VD] = t->drift[kind];
-    memset(root, 0, sizeof root);
-#if BIAS
-    FOR(i, ROOT_NONZEROS) {
-      const int r = ROW_OF_ROOT(i), c = COLUMN_OF_ROOT(i);
-      if (c == N) continue;
-      const double by = ((const double *)F->root[r])[c], of = kind == BY_Q ? bias[VELOCITY(c)] : 0.0;
-      FOR_EACH(k) root[r][k] += by * of_bias[VELOCITY(c)][k] + of * w->root[i][k];
+#if GROUND_ASKED
+    double *sum = w->frozen.by[WRENCHES_ASKED - 1][j];
+    FOR(s, SOLES) FOR(i, SIX) {
+      const int a = (i + 1) % 3, b = (i + 2) % 3;
+      const double *p = F->soles + 3 * s, *f = x + SIX * s;
+      sum[i] += f[i];
+      if (i >= 3) sum[i] += p[a] * f[b] - p[b] * f[a];
     }
 #endif
-    /* less dW_c L_0: then the wrenches have G^-1 W_c' of it */
-    if (kind == BY_Q) FOR(i, HELD_NONZEROS) FOR_EACH(k)
-      root[ROW_OF_HELD(i)][k] -= L_0[COLUMN_OF_HELD(i)] * w->held[i][k];
-    FOR(i, HELD_NONZEROS) {
-      const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
-      const double by = ((const double *)F->held[r])[c];
-      FOR_EACH(k) push[c][k] += by * root[r][k];
-      if (kind == BY_Q) FOR_EACH(k) push[c][k] -= rest[r] * w->held[i][k];
-    }
-    if (kind == BY_Q) FOR(r, NV) FOR(j, N + 1) FOR_EACH(k) sum[j][k] += rest[r] * w->E[r][j][k];
-    FOR(r, NV) FOR_EACH(k) root[r][k] = -root[r][k];
-    add_product((const vec(*)[V])w->U, NV, root[0], VD, sum[0]);
-#if JDOT
-    FOR(c, C) FOR_EACH(k) {
-      push[c][k] -= of_held[c][k];
-      FOR(j, N + 1) sum[j][k] -= ((const double *)w->P[c])[j] * of_held[c][k];
-    }
-    FOR_EACH(k) sum[N][k] += of_hand[k];
-#endif
-    by_delassus(F, push[0], VD);
   }
 #endif
 }
 
+/* ------------------------------------------------------------ of a vector of directions */
+static void roots_forward(int k, FreezeForward *w) {
+  FrozenTangent *t = &w->frozen;
+  vec speed, wrench[SIX] = {0};
+  const vec *moves[] = {w->by_v};
+  vec *by_v[] = {&speed, wrench};
+  memset(w->unmodelled, 0, sizeof w->unmodelled);
+  memset(w->soles, 0, sizeof w->soles);
+  if (k < VECTORS_OF_Q) {
+    const vec *turns[] = {w->by_q};
+    vec *by_q[] = {w->root, w->held, &t->hand_speed[k], w->soles, w->unmodelled};
+    tree_forward(w->tree_parts, turns, by_q);
+    memset(w->E, 0, sizeof w->E);
+    FOR(i, ROOT_NONZEROS) if (COLUMN_OF_ROOT(i) <= N) w->E[ROW_OF_ROOT(i)][COLUMN_OF_ROOT(i)] += w->root[i];
+    FOR(i, HELD_NONZEROS) {
+      const double *P = (const double *)w->P[COLUMN_OF_HELD(i)];
+      FOR(j, N + 1) w->E[ROW_OF_HELD(i)][j] -= P[j] * w->held[i];
+    }
+  }
+  approach_forward(w->approach_parts, moves, by_v);
+  t->hand_speed[k] += speed;
+  FOR(i, SIX) w->unmodelled[i] += wrench[i];
+}
+
+static void inverse_inertia_forward(int k, const Frozen *F, FreezeForward *w) {
+  vec(*Q)[COLUMNS_OF_V] = w->frozen.Q[k];
+  FOR(j, N + 1) {
+    vec column[NV], sum[ROWS_OF_V];
+    FOR(r, NV) column[r] = w->E[r][j];
+    add_product((const vec(*)[V])w->U, NV, column, 0, sum);
+    FOR(i, ROWS_OF_V) Q[i][j] = sum[i];
+  }
+  FOR(i, N + 1) FOR(j, i + 1) Q[i][j] = Q[j][i] = Q[i][j] + Q[j][i];
+  /* without wrenches, the hand's column alone */
+  const int first = HELD_HISTORY ? 0 : N;
+  memset(w->P_by, 0, sizeof w->P_by);
+  FOR(i, HELD_NONZEROS) {
+    const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
+    const double *U = (const double *)w->U[r], by = ((const double *)F->held[r])[c];
+    for (int j = first; j <= N; j++) w->P_by[c][j] += U[j] * w->held[i] + by * w->E[r][j];
+  }
+  by_delassus(F, w->P_by[0], N + 1);
+}
+
+#if BIAS || JDOT
+/* the velocity that drifts are frozen at */
+static void meeting_forward(int k, const Frozen *F, const FreezeForward *w, vec *velocity) {
+  const FrozenTangent *t = &w->frozen;
+  vec more = either(F->closing < 0.0, (vec){0}, t->hand_speed[k] / w->yielding);
+  memcpy(velocity, w->by_v, sizeof w->by_v);
+  if (k < VECTORS_OF_Q) {
+    vec hand[NV];
+    FOR(r, NV) hand[r] = w->E[r][N];
+    FOR(i, HELD_NONZEROS) {
+      const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
+      hand[r] -= ((const double *)F->held[r])[c] * w->P_by[c][N];
+    }
+    FOR(i, ROOT_NONZEROS) {
+      const int r = ROW_OF_ROOT(i), c = COLUMN_OF_ROOT(i);
+      if (c == N) continue;
+      const double by = ((const double *)F->root[r])[c] * w->impulse;
+      velocity[VELOCITY(c)] -= by * hand[r] + w->inner[r] * w->impulse * w->root[i];
+    }
+    more -= t->Q[k][N][N] * (w->impulse / w->yielding);
+  }
+  FOR(i, NV) velocity[i] -= w->change[i] * more;
+}
+#endif
+
+static void drifts_forward(int k, const Frozen *F, FreezeForward *w) {
+  FrozenTangent *t = &w->frozen;
+  vec *sum = t->drift[k], *push = w->L_0_by;
+  memset(push, 0, sizeof w->L_0_by);
+#if BIAS || JDOT
+  vec velocity[NV], of_bias[NV], of_hand, of_held[C1], root[NV];
+  meeting_forward(k, F, w, velocity);
+  const vec *seed[] = {w->by_q, velocity};
+  vec *moved[] = {
+#if BIAS
+    of_bias,
+#endif
+#if JDOT
+    &of_hand, of_held
+#endif
+  };
+  drift_forward(w->drift_parts, seed, moved);
+  memset(root, 0, sizeof root);
+#if BIAS
+  FOR(i, ROOT_NONZEROS) {
+    const int r = ROW_OF_ROOT(i), c = COLUMN_OF_ROOT(i);
+    if (c == N) continue;
+    root[r] += ((const double *)F->root[r])[c] * of_bias[VELOCITY(c)];
+    if (k < VECTORS_OF_Q) root[r] += w->bias[VELOCITY(c)] * w->root[i];
+  }
+#endif
+  /* less dW_c L_0: then the wrenches have G^-1 W_c' of it */
+  if (k < VECTORS_OF_Q) {
+    FOR(i, HELD_NONZEROS) {
+      const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
+      root[r] -= w->L_0[c] * w->held[i];
+      push[c] -= w->rest[r] * w->held[i];
+    }
+    FOR(r, NV) FOR(j, N + 1) sum[j] += w->rest[r] * w->E[r][j];
+  }
+  FOR(i, HELD_NONZEROS) {
+    const int r = ROW_OF_HELD(i), c = COLUMN_OF_HELD(i);
+    push[c] += ((const double *)F->held[r])[c] * root[r];
+  }
+  FOR(r, NV) root[r] = -root[r];
+  add_product((const vec(*)[V])w->U, NV, root, sum, sum);
+#if JDOT
+  FOR(c, C) {
+    push[c] -= of_held[c];
+    FOR(j, N + 1) sum[j] -= ((const double *)w->P[c])[j] * of_held[c];
+  }
+  sum[N] += of_hand;
+#endif
+  by_delassus(F, push, 1);
+#endif
+}
+
+/* of the wrenches that columns ask for */
+static void reactions_forward(int k, const Frozen *F, FreezeForward *w) {
+#if HELD_HISTORY
+  FrozenTangent *t = &w->frozen;
+  const int moves = k < VECTORS_OF_Q;
+#if HELD_ASKED
+  FOR(c, C) {
+    t->wrench_begin[k][c / SIX][c % SIX] = w->L_0_by[c];
+    if (moves) FOR(j, N + 1) t->wrench_by[k][c / SIX][j][c % SIX] = w->P_by[c][j];
+  }
+#endif
+#if GROUND_ASKED
+  const int last = WRENCHES_ASKED - 1;
+  vec *begin = t->wrench_begin[k][last], (*by)[SIX] = t->wrench_by[k][last];
+  memcpy(begin, w->unmodelled, sizeof w->unmodelled);
+  if (moves) memset(by, 0, sizeof t->wrench_by[k][last]);
+  FOR(s, SOLES) FOR(i, SIX) {
+    const int a = (i + 1) % 3, b = (i + 2) % 3, turns = i >= 3;
+    const double *p = F->soles + 3 * s, *f = w->L_0 + SIX * s;
+    const vec *dp = w->soles + 3 * s, *df = w->L_0_by + SIX * s;
+    begin[i] += df[i];
+    if (turns) begin[i] += p[a] * df[b] - p[b] * df[a] + f[b] * dp[a] - f[a] * dp[b];
+    const vec(*P)[V] = (const vec(*)[V])w->P + SIX * s;
+    const vec(*dP)[N + 1] = (const vec(*)[N + 1])w->P_by + SIX * s;
+    if (moves) FOR(j, N + 1) {
+      by[j][i] += dP[i][j];
+      if (turns) by[j][i] += p[a] * dP[b][j] - p[b] * dP[a][j]
+                             + ((const double *)P[b])[j] * dp[a] - ((const double *)P[a])[j] * dp[b];
+    }
+  }
+#endif
+#endif
+}
+
+/* of the vectors that are wanted */
 static void freeze_forward(const double *q, const double *v, const double *normal, double yields, const Frozen *F,
-                           FreezeForward *w) {
-  roots_forward(q, v, normal, F, w);
-  inverse_inertia_forward(F, w);
-  drifts_forward(q, normal, yields, F, w);
+                           const int *wanted, FreezeForward *w) {
+  const double *in[] = {q, v, normal};
+  double *tree_out[] = {w->tree_parts}, *approach_out[] = {w->approach_parts};
+  tree_parts(in, tree_out, 0, 0, 0);
+  approach_parts(in, approach_out, 0, 0, 0);
+  memset(w->frozen.drift, 0, sizeof w->frozen.drift);
+  memset(w->frozen.hand_speed, 0, sizeof w->frozen.hand_speed);
+  memset(w->frozen.wrench_begin, 0, sizeof w->frozen.wrench_begin);
+  roots_shared(F, w);
+  drifts_shared(q, normal, yields, F, w);
+  reactions_shared(F, w);
+  FOR(k, VECTORS_OF_V) {
+    if (!wanted[k]) continue;
+    memset(w->by_q, 0, sizeof w->by_q);
+    memset(w->by_v, 0, sizeof w->by_v);
+    FOR(l, LANES) {
+      const int direction = k * LANES + l;
+      if (direction < NV) ((double *)&w->by_q[direction])[l] = 1.0;
+      else if (direction < 2 * NV) ((double *)&w->by_v[direction - NV])[l] = 1.0;
+    }
+    roots_forward(k, w);
+    if (k < VECTORS_OF_Q) inverse_inertia_forward(k, F, w);
+    drifts_forward(k, F, w);
+    reactions_forward(k, F, w);
+  }
 }

@@ -1,20 +1,27 @@
 /* Tangents of the implicit steps, one step after the other: the same stages with what J changes by on their right-hand
    side. Lengths and phases are constants; where an event ends the step, the part of it that was gone is a root of the
-   series, and moves with it. A name that begins with d is the tangent of what has the rest for its name. */
+   series, and moves with it. All are of one vector of
+   directions, k. A name that begins with d is the tangent of what has the rest for its name. */
 
-/* of Series, without what only the state needs */
+/* of Series, without what only the state needs, and what follows from the speeds; the terms of a number lie side by side */
+typedef vec Terms[TERMS];
 typedef struct {
-  vec speeds[TERMS][ROWS_OF_V][VD], demand[TERMS][N1][VD];
-  vec impulse[TERMS][VD], penetration[TERMS][VD], rate[TERMS][VD], force[TERMS][VD], target[TERMS][NZ1][VD];
+  Terms speeds[ROWS_OF_V], impulse, penetration, rate, force, target[NZ1];
 } SeriesTangent;
+
+/* of a state, and what one sees of it; in columns no impulse, and of speeds only those that are asked for, and the hand's */
+typedef struct {
+  vec speeds[ROWS_OF_V], demand[N1], target[NZ1];
+  vec impulse, penetration, time, peak, rate, force, target_speed;
+} StateTangent;
 
 /* of the right-hand side of a stage, and what it gives */
 typedef struct {
-  vec torque[N1][VD], deviation[N1][VD], impulse[VD], penetration[VD], target[NZ1][VD];
+  vec torque[N1], deviation[N1], impulse, penetration, target[NZ1];
 } RightTangent;
 
 typedef struct {
-  vec speeds[ROWS_OF_V][VD], impulse[VD], penetration[VD], rate[VD], force[VD], target[NZ1][VD];
+  vec speeds[ROWS_OF_V], impulse, penetration, rate, force, target[NZ1];
 } LeftTangent;
 
 /* of a step: what it is made of */
@@ -25,205 +32,218 @@ typedef struct {
   const Resolvent *resolvent;
   const Bend *bend;
   const State *begin;
-  vec dQ[STAGES][N + 1][VD];   /* times (T, -p) of each term but the first */
+  double x[N + 1][STAGES];         /* (T, -p) of the two terms that each stage is made of */
   /* of the joints: 1 but for saturated ones; friction's slope */
   double free[ROWS_OF_V] __attribute__((aligned(64))), slide[ROWS_OF_V] __attribute__((aligned(64)));
+  vec known[STAGES][ROWS_OF_V]; /* of a vector of directions: speeds that dQ and the drift add in each stage */
 } Linear;
 
-/* dQ times the terms' (T, -p), which are columns of x */
-static void times_Q(const FrozenTangent *t, const double (*x)[STAGES], vec (*out)[N + 1][VD]) {
-  FOR(i, N + 1) FOR_EACH(k) {
-    vec s[STAGES];
-    FOR(a, STAGES) s[a] = (vec){0};
-    FOR(j, N + 1) {
-      const vec of = t->Q[j][i][k];
-      FOR(a, STAGES) s[a] += x[j][a] * of;
-    }
-    FOR(a, STAGES) out[a][i][k] = s[a];
+/* a place in a step: the polynomials there, what the terms of speeds add to the way back from there, and how fast what
+   the series make changes */
+typedef struct {
+  double p[TERMS], back[TERMS], slope[TERMS];
+#if !GAIN_MATRIX
+  double demand_by[N1][TERMS]; /* what the terms of its own speed add to a joint's demand */
+#endif
+  vec speeds[V], demand[V];
+} Place;
+
+static void place_of(const Data *d, const Series *s, double h, double theta, Place *at) {
+  powers(theta, at->p);
+  slopes(theta, at->slope);
+  FOR(i, V) {
+    at->speeds[i] = changes(s->speeds, i, at->slope);
+    at->demand[i] = changes(s->demand, i, at->slope);
   }
+  /* stage j goes back by the speeds w_j + gamma w_(j+1), but the first by that at the begin and gamma w_1 */
+  FOR(j, TERMS) {
+    at->back[j] = j ? -h * GAMMA_OF_STEPS * at->p[j] : 0.0;
+    if (j < STAGES) at->back[j] -= h * at->p[j + 1];
+  }
+#if !GAIN_MATRIX
+  FOR(i, N) FOR(j, TERMS) {
+    double by = j ? -((const double *)d->kd)[i] * at->p[j] : 0.0;
+    if (STIFFNESS) by += ((const double *)d->kp)[i] * at->back[j];
+    at->demand_by[i][j] = by;
+  }
+#endif
+}
+
+/* `known`; of how many stages there is any. dQ is symmetric */
+static int known_of(Linear *l, int k) {
+  const FrozenTangent *t = l->frozen;
+  const double h = l->resolvent->h;
+  const int stages = k < VECTORS_OF_Q ? STAGES : k < VECTORS_OF_V ? 2 : 0;
+  const vec(*Q)[COLUMNS_OF_V] = t->Q[k < VECTORS_OF_Q ? k : 0], *drift = t->drift[k];
+  if (!stages) return 0;
+  for (int i = 0; i <= N; i += 2) {
+    vec s[2][STAGES];
+    FOR(b, 2) FOR(a, STAGES) s[b][a] = either(a < 2, h * drift[i + b], (vec){0});
+    if (k < VECTORS_OF_Q)
+      FOR(j, N + 1) FOR(a, STAGES) FOR(b, 2) s[b][a] += l->x[j][a] * Q[i + b][j];
+    FOR(b, 2) FOR(a, STAGES) l->known[a][i + b] = s[b][a];
+  }
+  return stages;
 }
 
 /* what comes with a state, in the piece of law and target that it is in */
-static void rates_forward(const FrozenTangent *t, int kind, const Contact *c, StateTangent *x) {
-  FOR_EACH(k) {
-    x->target_speed[k] = (vec){0};
-    FOR(i, NZ) x->target_speed[k] += c->at[i] * x->target[i][k];
-    x->rate[k] = x->speeds[N][k] + t->hand_speed[kind][k] - x->target_speed[k];
-    x->force[k] = c->k * x->penetration[k] + c->d * x->rate[k];
-  }
+static void rates_forward(const FrozenTangent *t, int k, const Contact *c, StateTangent *x) {
+  x->target_speed = (vec){0};
+  FOR(i, NZ) x->target_speed += c->at[i] * x->target[i];
+  x->rate = x->speeds[N] + t->hand_speed[k] - x->target_speed;
+  x->force = c->k * x->penetration + c->d * x->rate;
 }
 
-/* out += factor times gains (one number a joint, or a matrix) times x */
-INLINE void add_gain(const vec *gain, int matrix, double factor, const vec (*x)[VD], vec (*out)[VD]) {
+/* out += factor times a matrix of gains times x */
+INLINE void add_gain(const vec *gain, double factor, const vec *x, vec *out) {
   const double *g = (const double *)gain;
-  FOR(i, N) {
-    if (!matrix) FOR_EACH(k) out[i][k] += factor * g[i] * x[i][k];
-    else FOR(j, N) FOR_EACH(k) out[i][k] += factor * g[j * V * LANES + i] * x[j][k];
-  }
+  FOR(i, N) FOR(j, N) out[i] += factor * g[j * V * LANES + i] * x[j];
 }
-/* out += factor times the springs of what is not saturated times x */
-INLINE void add_springs(const Linear *l, double factor, const vec (*x)[VD], vec (*out)[VD]) {
-#if STIFFNESS && GAIN_MATRIX
-  vec whole[N1][VD];
-  memset(whole, 0, sizeof whole);
-  add_gain((const vec *)l->d->kp, KP_MATRIX, factor, x, whole);
-  FOR(i, N) FOR_EACH(k) out[i][k] += l->free[i] * whole[i][k];
-#elif STIFFNESS
-  add_gain(l->resolvent->kp, 0, factor, x, out);
+/* out += factor times gains, one number a joint, times x */
+INLINE void add_gains(const vec *gain, double factor, const vec *x, vec *out) {
+  FOR(i, N) out[i] += factor * ((const double *)gain)[i] * x[i];
+}
+#define ADD_KD(factor, x, out) (KD_MATRIX ? add_gain : add_gains)((const vec *)l->d->kd, factor, x, out)
+#define ADD_KP(factor, x, out) (KP_MATRIX ? add_gain : add_gains)((const vec *)l->d->kp, factor, x, out)
+
+/* out = torque + factor times what dampers and springs, of joints that are not saturated, make of speeds and deviations */
+INLINE void with_servo(const Linear *l, const vec *torque, double factor, const vec *speeds, const vec *deviation,
+                       vec *out) {
+#if GAIN_MATRIX
+  vec held[N1];
+  memset(held, 0, sizeof held);
+#if STIFFNESS
+  ADD_KP(factor, deviation, held);
+#endif
+  FOR(i, N) out[i] = torque[i] + l->free[i] * held[i];
+  if (speeds) add_gain((const vec *)l->resolvent->D, -factor, speeds, out);
+#else
+  const double *D = (const double *)l->resolvent->D, *kp = (const double *)l->resolvent->kp;
+  FOR(i, N) {
+    vec sum = torque[i];
+    if (STIFFNESS) sum += factor * kp[i] * deviation[i];
+    if (speeds) sum -= factor * D[i] * speeds[i];
+    out[i] = sum;
+  }
 #endif
 }
 
 /* tangents of n, term by term */
-typedef vec InputsTangent[BENDS ? TERMS : 1][INPUTS][VD];
+typedef vec InputsTangent[BENDS ? TERMS : 1][INPUTS];
 
-/* S b, with dJ's part on the right-hand side: dQ of both terms that this stage is made of, the drift's over `time` */
-INLINE void solve_forward(const Linear *l, int kind, int stage, double time, const RightTangent *b,
-                          const InputsTangent n, LeftTangent *x) {
+/* S b, with `known` on the right-hand side */
+INLINE void solve_forward(const Linear *l, int stage, int known, const RightTangent *b, const InputsTangent n,
+                          LeftTangent *x) {
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
   const double *X = (const double *)r->X[N];
-  vec rho[N1][VD], inputs[INPUTS][VD];
+  vec rho[N1], inputs[INPUTS];
 #if BENDS
-  FOR(a, INPUTS) FOR_EACH(k)
-    inputs[a][k] = either(stage, n[stage][a][k] + GAMMA_OF_STEPS * n[stage + 1][a][k], n[1][a][k]);
+  FOR(a, INPUTS) inputs[a] = either(stage, n[stage][a] + GAMMA_OF_STEPS * n[stage + 1][a], n[1][a]);
 #else
   memset(inputs, 0, sizeof inputs);
 #endif
-  FOR(i, ROWS_OF_V) FOR_EACH(k) {
-    vec a = {0};
-    if (kind == BY_Q && i <= N) {
-      a = l->dQ[stage ? stage - 1 : 0][i][k];
-      if (stage) a += GAMMA_OF_STEPS * l->dQ[stage][i][k];
-    }
-#if BIAS || JDOT
-    if (time != 0.0 && i <= N) a += l->frozen->drift[kind][i][k] * time;
-#endif
-    x->speeds[i][k] = a;
-    if (i < N) rho[i][k] = b->torque[i][k];
-  }
-  add_gain((const vec *)r->D, GAIN_MATRIX, -r->g, (const vec(*)[VD])x->speeds, rho);
-  add_springs(l, r->g, (const vec(*)[VD])b->deviation, rho);
-  add_product(r->X, N, rho[0], VD, x->speeds[0]);
+  const vec *of = known ? l->known[stage] : 0;
+  with_servo(l, b->torque, r->g, of, b->deviation, rho);
+  add_product(r->X, N, rho, of, x->speeds);
   const double slope = c->k * r->g + c->d;
-  FOR_EACH(k) {
-    vec rate = x->speeds[N][k] - X[N] * b->impulse[k], held[NZ1];
-    FOR(i, NZ) {
-      held[i] = (vec){0};
-      FOR(j, NZ) held[i] += c->inverse[i][j] * b->target[j][k];
-      if (TARGET_BENDS) FOR(j, NZ) held[i] += c->inverse[i][j] * r->g * inputs[1 + j][k];
-      rate -= c->at[i] * held[i];
-    }
-    if (TARGET_BENDS) rate -= inputs[INPUTS - 1][k];
-    x->force[k] = (c->k * b->penetration[k] + slope * rate + inputs[0][k]) / (1.0 + slope * r->g * c->mobility);
-    x->impulse[k] = b->impulse[k] + r->g * x->force[k];
-    x->rate[k] = rate - r->g * c->mobility * x->force[k];
-    x->penetration[k] = b->penetration[k] + r->g * x->rate[k];
-    FOR(i, NZ) x->target[i][k] = held[i] + r->g * c->moved[i] * x->force[k];
+  vec rate = x->speeds[N] - X[N] * b->impulse, held[NZ1];
+  FOR(i, NZ) {
+    held[i] = (vec){0};
+    FOR(j, NZ) held[i] += c->inverse[i][j] * b->target[j];
+    if (TARGET_BENDS) FOR(j, NZ) held[i] += c->inverse[i][j] * r->g * inputs[1 + j];
+    rate -= c->at[i] * held[i];
   }
-  FOR(i, N + 1) FOR_EACH(k) x->speeds[i][k] -= X[i] * x->impulse[k];
+  if (TARGET_BENDS) rate -= inputs[INPUTS - 1];
+  x->force = (c->k * b->penetration + slope * rate + inputs[0]) / (1.0 + slope * r->g * c->mobility);
+  const vec impulse = x->impulse = b->impulse + r->g * x->force;
+  x->rate = rate - r->g * c->mobility * x->force;
+  x->penetration = b->penetration + r->g * x->rate;
+  FOR(i, NZ) x->target[i] = held[i] + r->g * c->moved[i] * x->force;
+  FOR(i, N + 1) x->speeds[i] -= X[i] * impulse;
 }
 
 /* the tangents of all terms, from that of the state at the begin */
-static void terms_forward(const Linear *l, int kind, const StateTangent *dy, const InputsTangent n, SeriesTangent *s) {
-  const Data *d = l->d;
+static void terms_forward(const Linear *l, int k, int stages, const StateTangent *dy, const InputsTangent n,
+                          SeriesTangent *s) {
   const Resolvent *r = l->resolvent;
   const Contact *c = &r->contact;
   const double h = r->h, by_gamma = 1.0 / GAMMA_OF_STEPS;
   RightTangent b;
   LeftTangent x;
-  memcpy(s->speeds[0], dy->speeds, sizeof dy->speeds);
-  memcpy(s->demand[0], dy->demand, sizeof dy->demand);
-  FOR(i, N) FOR_EACH(k) {
-    b.torque[i][k] = h * (l->free[i] * dy->demand[i][k] - l->slide[i] * dy->speeds[i][k]);
-    b.deviation[i][k] = -h * dy->speeds[i][k];
+  FOR(i, N + 1) s->speeds[i][0] = dy->speeds[i];
+  FOR(i, N) {
+    b.torque[i] = h * (l->free[i] * dy->demand[i] - l->slide[i] * dy->speeds[i]);
+    b.deviation[i] = -h * dy->speeds[i];
   }
-  if (FRICTION && kind == BY_V) FOR(i, N) *lane(b.torque[i], NV - N + i) -= h * l->slide[i];
-  FOR_EACH(k) {
-    s->impulse[0][k] = dy->impulse[k];
-    s->penetration[0][k] = dy->penetration[k];
-    s->rate[0][k] = dy->rate[k];
-    s->force[0][k] = dy->force[k];
-    b.impulse[k] = h * dy->force[k];
-    b.penetration[k] = h * dy->rate[k];
-    FOR(i, NZ) {
-      s->target[0][i][k] = dy->target[i][k];
-      vec rate = c->G[i] * dy->force[k];
-      FOR(j, NZ) rate += c->Z[i][j] * dy->target[j][k];
-      b.target[i][k] = h * rate;
-    }
+  if (FRICTION) FOR(i, N) add_to_direction(&b.torque[i], k, FIRST_OF(BY_V) + NV - N + i, -h * l->slide[i]);
+  s->impulse[0] = dy->impulse;
+  s->penetration[0] = dy->penetration;
+  s->rate[0] = dy->rate;
+  s->force[0] = dy->force;
+  b.impulse = h * dy->force;
+  b.penetration = h * dy->rate;
+  FOR(i, NZ) {
+    s->target[i][0] = dy->target[i];
+    vec rate = c->G[i] * dy->force;
+    FOR(j, NZ) rate += c->Z[i][j] * dy->target[j];
+    b.target[i] = h * rate;
   }
   FOR(j, STAGES) {
-    solve_forward(l, kind, j, j < 2 ? h : 0.0, &b, n, &x);
-    vec net[N1][VD];
-    memset(net, 0, sizeof net);
-    add_gain((const vec *)r->D, GAIN_MATRIX, -1.0, (const vec(*)[VD])x.speeds, net);
-    add_springs(l, 1.0, (const vec(*)[VD])b.deviation, net);
-    memset(s->demand[j + 1], 0, sizeof s->demand[j + 1]);
-    FOR_EACH(k) s->speeds[j + 1][N][k] = either(j, (x.speeds[N][k] - s->speeds[j][N][k]) * by_gamma, x.speeds[N][k]);
-    FOR(i, N) FOR_EACH(k) {
-      vec v = x.speeds[i][k];
-      if (j) {
-        b.torque[i][k] = h * net[i][k];
-        b.deviation[i][k] = -h * v;
-        v = (v - s->speeds[j][i][k]) * by_gamma;
-      } else {
-        b.torque[i][k] += r->g * net[i][k];
-        b.deviation[i][k] -= r->g * v;
-      }
-      s->speeds[j + 1][i][k] = v;
+    solve_forward(l, j, j < stages, &b, n, &x);
+    /* the first stage adds to its right-hand side what others take in its place */
+    const double by = j ? h : r->g, before = j != 0, of = j ? by_gamma : 1.0;
+    if (j) memset(b.torque, 0, sizeof b.torque);
+    with_servo(l, b.torque, by, x.speeds, b.deviation, b.torque);
+    FOR(i, N + 1) {
+      const vec v = x.speeds[i];
+      s->speeds[i][j + 1] = (v - before * s->speeds[i][j]) * of;
+      if (i < N) b.deviation[i] = either(j, (vec){0}, b.deviation[i]) - by * v;
     }
-    add_gain((const vec *)d->kd, KD_MATRIX, -1.0, (const vec(*)[VD])s->speeds[j + 1], s->demand[j + 1]);
-#if STIFFNESS
-    add_gain((const vec *)d->kp, KP_MATRIX, 1.0, (const vec(*)[VD])b.deviation, s->demand[j + 1]);
-#endif
-    FOR_EACH(k) {
-      b.impulse[k] = s->impulse[j + 1][k] = either(j, h * x.force[k], x.impulse[k]);
-      b.penetration[k] = s->penetration[j + 1][k] = either(j, h * x.rate[k], x.penetration[k]);
-      FOR(i, NZ) {
-        const vec z = either(j, (x.target[i][k] - s->target[j][i][k]) * by_gamma, x.target[i][k]);
-        b.target[i][k] = s->target[j + 1][i][k] = z;
-      }
-      s->rate[j + 1][k] = either(j, (x.rate[k] - s->rate[j][k]) * by_gamma, x.rate[k]);
-      s->force[j + 1][k] = either(j, (x.force[k] - s->force[j][k]) * by_gamma, x.force[k]);
-    }
+    b.impulse = s->impulse[j + 1] = either(j, h * x.force, x.impulse);
+    b.penetration = s->penetration[j + 1] = either(j, h * x.rate, x.penetration);
+    FOR(i, NZ) b.target[i] = s->target[i][j + 1] = (x.target[i] - before * s->target[i][j]) * of;
+    s->rate[j + 1] = (x.rate - before * s->rate[j]) * of;
+    s->force[j + 1] = (x.force - before * s->force[j]) * of;
   }
 }
 
 #if BENDS
 /* of n, from tangents of the series at n as it is */
 static void bend_forward(const Bend *b, const SeriesTangent *s, InputsTangent n) {
-  double at[NV][UNKNOWNS];
+  double at[LANES][UNKNOWNS];
   FOR(i, NODES) {
-    vec seen[SEEN][VD];
-    FOR_EACH(k) FOR(o, SEEN) {
-      seen[o][k] = (vec){0};
+    vec seen[SEEN];
+    FOR(o, SEEN) {
+      seen[o] = (vec){0};
       FOR(j, TERMS) {
-        const vec w = o == 0 ? s->penetration[j][k] : o == 1 ? s->rate[j][k] : s->target[j][(o - 2) % NZ1][k];
-        seen[o][k] += AT_NODES[i][j] * w;
+        const vec w = o == 0 ? s->penetration[j] : o == 1 ? s->rate[j] : s->target[(o - 2) % NZ1][j];
+        seen[o] += AT_NODES[i][j] * w;
       }
     }
-    FOR(seed, NV) FOR(a, INPUTS) {
+    FOR(lane, LANES) FOR(a, INPUTS) {
       double x = 0.0;
-      FOR(o, SEEN) x += b->by[i][a][o] * ((const double *)seen[o])[seed];
-      at[seed][a * NODES + i] = x;
+      FOR(o, SEEN) x += b->by[i][a][o] * seen[o][lane];
+      at[lane][a * NODES + i] = x;
     }
   }
   memset(n, 0, sizeof(InputsTangent));
-  FOR(seed, NV) {
-    solve_bend(b, at[seed]);
+  FOR(lane, LANES) {
+    solve_bend(b, at[lane]);
     FOR(j, TERMS) FOR(a, INPUTS) FOR(i, NODES)
-      *lane(n[j][a], seed) += FROM_NODES[j][i] * at[seed][a * NODES + i];
+      n[j][a][lane] += FROM_NODES[j][i] * at[lane][a * NODES + i];
   }
 }
 #endif
 
-static void series_forward(const Linear *l, int kind, const StateTangent *dy, SeriesTangent *s) {
+static void series_forward(Linear *l, int k, const StateTangent *dy, SeriesTangent *s) {
   InputsTangent n;
   memset(n, 0, sizeof n);
-  terms_forward(l, kind, dy, (const vec(*)[INPUTS][VD])n, s);
+  const int stages = known_of(l, k);
+  terms_forward(l, k, stages, dy, (const vec(*)[INPUTS])n, s);
 #if BENDS
   bend_forward(l->bend, s, n);
-  terms_forward(l, kind, dy, (const vec(*)[INPUTS][VD])n, s);
+  terms_forward(l, k, stages, dy, (const vec(*)[INPUTS])n, s);
 #endif
 }
 
@@ -244,37 +264,73 @@ static void contact_within(const Linear *l, const State *then, const Instant *no
 #endif
 }
 
-INLINE vec along(const vec *w, long stride, const double *p) {
+INLINE vec along(const Terms w, const double *p) {
   vec s = w[0];
-  for (int j = 1; j < TERMS; j++) s += p[j] * w[j * stride];
+  for (int j = 1; j < TERMS; j++) s += p[j] * w[j];
   return s;
 }
-#define ALONG(w, ...) along(&(w)[0] __VA_ARGS__, (&(w)[1] __VA_ARGS__) - (&(w)[0] __VA_ARGS__), p)
+
+/* demands of the joints at places, from those at the begin; all places move by `moved` */
+static void demands_forward(const Linear *l, int count, const Place *const *places, vec moved,
+                            const SeriesTangent *t, const vec *begin, StateTangent *x) {
+#if GAIN_MATRIX
+  FOR(a, count) {
+    const Place *at = places[a];
+    vec speeds[N1], deviation[N1], *demand = x[a].demand;
+    FOR(i, N) {
+      speeds[i] = along(t->speeds[i], at->p) - t->speeds[i][0];
+      deviation[i] = (vec){0};
+      FOR(j, TERMS) deviation[i] += at->back[j] * t->speeds[i][j];
+      demand[i] = begin[i] + ((const double *)at->demand)[i] * moved;
+    }
+    ADD_KD(-1.0, speeds, demand);
+#if STIFFNESS
+    ADD_KP(1.0, deviation, demand);
+#endif
+  }
+#else
+  FOR(i, N) {
+    const vec b = begin[i];
+    vec w[TERMS];
+    FOR(j, TERMS) w[j] = t->speeds[i][j];
+    FOR(a, count) {
+      vec s = b + ((const double *)places[a]->demand)[i] * moved;
+      FOR(j, TERMS) s += places[a]->demand_by[i][j] * w[j];
+      x[a].demand[i] = s;
+    }
+  }
+#endif
+}
 
 /* how the event's place moves */
-static void event_forward(const Linear *l, int kind, const Event *e, const SeriesTangent *t, vec *moved) {
+static vec event_forward(const Linear *l, int k, const Event *e, const SeriesTangent *t, const StateTangent *dy) {
   const Series *s = l->series;
   const int i = e->number;
   double p[TERMS], slope[TERMS], along_step = 0.0, by_force = 0.0;
   powers(e->at, p);
   slopes(e->at, slope);
-  FOR_EACH(k) moved[k] = (vec){0};
+  vec moved = {0};
   if (e->kind == OF_RATE) {
     along_step = change(s->rate, slope);
-    FOR_EACH(k) moved[k] = ALONG(t->rate, [k]);
+    moved = along(t->rate, p);
   } else if (e->kind == OF_DEMAND) {
     for (int j = 1; j < TERMS; j++) along_step += slope[j] * ((const double *)s->demand[j])[i];
-    FOR_EACH(k) moved[k] = ALONG(t->demand, [i][k]);
+    StateTangent there;
+    Place place;
+    const Place *places[] = {&place};
+    place_of(l->d, s, l->resolvent->h, e->at, &place);
+    demands_forward(l, 1, places, moved, t, dy->demand, &there);
+    moved = there.demand[i];
   } else if (e->kind == OF_SLIDING) {
     for (int j = 1; j < TERMS; j++) along_step += slope[j] * ((const double *)s->speeds[j])[i];
-    FOR_EACH(k) moved[k] = ALONG(t->speeds, [i][k]);
-    if (kind == BY_V) *lane(moved, NV - N + i) += 1.0;
+    moved = along(t->speeds[i], p);
+    add_to_direction(&moved, k, FIRST_OF(BY_V) + NV - N + i, 1.0);
   } else if (e->kind == OF_FORCE) {
 #if LAW_BENDS
     double at[3];
     separation_at(l->d, s, e->at, at);
     along_step = at[1] * change(s->penetration, slope) + at[2] * change(s->rate, slope);
-    FOR_EACH(k) moved[k] = at[1] * ALONG(t->penetration, [k]) + at[2] * ALONG(t->rate, [k]);
+    moved = at[1] * along(t->penetration, p) + at[2] * along(t->rate, p);
 #else
     by_force = 1.0;
 #endif
@@ -287,48 +343,44 @@ static void event_forward(const Linear *l, int kind, const Event *e, const Serie
     FOR(z, NZ) {
       const double by = x.by_z[i + SWITCHES * z];
       along_step += by * change(s->target[z], slope);
-      FOR_EACH(k) moved[k] += by * ALONG(t->target, [z][k]);
+      moved += by * along(t->target[z], p);
     }
   }
 #endif
   if (by_force != 0.0) {
     along_step += by_force * change(s->force, slope);
-    FOR_EACH(k) moved[k] += by_force * ALONG(t->force, [k]);
+    moved += by_force * along(t->force, p);
   }
-  FOR_EACH(k) moved[k] = either(along_step != 0.0, -moved[k] / along_step, (vec){0});
+  return either(along_step != 0.0, -moved / along_step, (vec){0});
 }
 
-/* the state at a part of the step that moves by `moved`, with speeds from row `first` on; time and peak stay */
-static void state_forward(const Linear *l, double part, const vec *moved, const SeriesTangent *t, int first,
-                          StateTangent *x) {
-  const Series *s = l->series;
-  double p[TERMS], slope[TERMS];
-  powers(part, p);
-  slopes(part, slope);
-  for (int i = first; i <= N; i++) {
-    double by = 0.0;
-    for (int j = 1; j < TERMS; j++) by += slope[j] * ((const double *)s->speeds[j])[i];
-    FOR_EACH(k) x->speeds[i][k] = ALONG(t->speeds, [i][k]) + by * moved[k];
+/* states at places of the step that all move by `moved`, with speeds from row `first` on; impulse, time and peak stay */
+INLINE void state_forward(const Linear *l, int count, const Place *const *places, vec moved, const SeriesTangent *t,
+                          int first, const vec *demand, StateTangent *x) {
+#define ALONG(row, by) { \
+    vec w_[TERMS]; \
+    memcpy(w_, t->row, sizeof w_); \
+    FOR(a, count) { \
+      const Place *at = places[a]; \
+      vec s_ = w_[0] + (by) * moved; \
+      for (int j = 1; j < TERMS; j++) s_ += at->p[j] * w_[j]; \
+      x[a].row = s_; \
+    } \
   }
-  FOR_EACH(k) {
-    x->penetration[k] = ALONG(t->penetration, [k]) + change(s->penetration, slope) * moved[k];
-    x->impulse[k] = ALONG(t->impulse, [k]) + change(s->impulse, slope) * moved[k];
-    FOR(i, NZ) x->target[i][k] = ALONG(t->target, [i][k]) + change(s->target[i], slope) * moved[k];
-  }
-  FOR(i, N) {
-    double by = 0.0;
-    for (int j = 1; j < TERMS; j++) by += slope[j] * ((const double *)s->demand[j])[i];
-    FOR_EACH(k) x->demand[i][k] = ALONG(t->demand, [i][k]) + by * moved[k];
-  }
+  for (int i = first; i <= N; i++) ALONG(speeds[i], ((const double *)at->speeds)[i])
+  ALONG(penetration, change(l->series->penetration, at->slope))
+  FOR(i, NZ) ALONG(target[i], change(l->series->target[i], at->slope))
+#undef ALONG
+  demands_forward(l, count, places, moved, t, demand, x);
 }
 
 #if PEAK
-static void peak_forward(const Linear *l, double theta, const vec *moved, const SeriesTangent *t, StateTangent *dy) {
+static void peak_forward(const Linear *l, double theta, vec moved, const SeriesTangent *t, StateTangent *dy) {
   double p[TERMS], slope[TERMS], place;
   if (!(l->begin->peak < largest(l->series->force, theta, l->begin->peak, &place))) return;
   powers(place, p);
   slopes(place, slope);
   const double at_end = place == theta ? change(l->series->force, slope) : 0.0;
-  FOR_EACH(k) dy->peak[k] = ALONG(t->force, [k]) + at_end * moved[k];
+  dy->peak = along(t->force, p) + at_end * moved;
 }
 #endif

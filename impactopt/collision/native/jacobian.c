@@ -4,48 +4,56 @@
 typedef struct {
   Work collision;
   FreezeForward freeze;
+  RecordTangent record;
   ForwardRoom run;
 } Whole;
 #define ROOM Whole
 
-static void scalars_forward(const Course *c, const Data *d, int kind, const StateTangent *dy, double **by) {
+/* of a vector of directions */
+static void scalars_forward(const Course *c, const Data *d, int k, const StateTangent *dy, const RecordTangent *record) {
+#define PUT_NUMBER(name, x) put(x, 1, 0, record->to[OUT_##name] + k * LANES)
 #ifdef OUT_impulse
-  if (by[OUT_impulse]) put(&dy->impulse, SEEDS(kind), 1, 1, 0, by[OUT_impulse]);
+  PUT_NUMBER(impulse, &dy->impulse);
 #endif
 #ifdef OUT_peak_force
-  if (by[OUT_peak_force]) put(&dy->peak, SEEDS(kind), 1, 1, 0, by[OUT_peak_force]);
+  PUT_NUMBER(peak_force, &dy->peak);
 #endif
 #ifdef OUT_duration
-  if (by[OUT_duration]) put(&dy->time, SEEDS(kind), 1, 1, 0, by[OUT_duration]);
+  PUT_NUMBER(duration, &dy->time);
 #endif
 #ifdef OUT_separated
-  if (by[OUT_separated]) memset(by[OUT_separated], 0, SEEDS(kind) * sizeof(double));
+  const vec none = {0};
+  PUT_NUMBER(separated, &none);
 #endif
 #ifdef OUT_energy
   double slope[NZ1] = {0}, one = 1.0;
   const double *in[] = {c->final.target, d->target, &one};
   double *out[] = {slope};
   target_energy_back(in, out, 0, 0, 0);
-  vec sum[1][VD];
-  FOR_EACH(k) {
-    sum[0][k] = (vec){0};
-    FOR(i, NZ) sum[0][k] += slope[i] * dy->target[i][k];
-  }
-  if (by[OUT_energy]) put(sum, SEEDS(kind), 1, 1, 0, by[OUT_energy]);
+  vec sum = {0};
+  FOR(i, NZ) sum += slope[i] * dy->target[i];
+  PUT_NUMBER(energy, &sum);
 #endif
 }
 
 static void evaluate(const double **arg, double **res, Whole *w) {
   Course c;
   Work *own = &w->collision;
+  RecordTangent *record = &w->record;
   const Data *d = &own->data;
-  double *values[N_VALUES], *by[KINDS][N_VALUES];
-  int wanted[KINDS] = {0};
+  double *values[N_VALUES];
+  int wanted[ALL_VECTORS] = {0};
+  memset(record, 0, sizeof *record);
   FOR(i, N_VALUES) {
+    const long entries = ROWS[i] ? ROWS[i] * N_COLUMNS[0] : 1;
     values[i] = res[(KINDS + 1) * i];
     FOR(kind, KINDS) {
-      by[kind][i] = res[(KINDS + 1) * i + 1 + kind];
-      wanted[kind] |= by[kind][i] != 0;
+      double *by = res[(KINDS + 1) * i + 1 + kind];
+      if (by) FOR(seed, SEEDS(kind)) {
+        const int direction = FIRST_OF(kind) + seed;
+        record->to[i][direction] = by + seed * entries;
+        wanted[direction / LANES] = 1;
+      }
     }
   }
   collide(arg, values, own, &c);
@@ -53,13 +61,11 @@ static void evaluate(const double **arg, double **res, Whole *w) {
 
   const double *q = filled(arg[ARG_q], own->q, NQ), *v = filled(arg[ARG_v], own->v, NV);
   const double *normal = filled(arg[ARG_normal], own->normal, 3);
-  RecordTangent record;
-  FOR(kind, KINDS) record.by[kind] = by[kind];
-  freeze_forward(q, v, normal, call(target_yield, d->target, 0, 0), &own->frozen, &w->freeze);
-  run_forward(d, &w->freeze.frozen, (const vec(*)[V])w->freeze.P, &own->tape, HISTORIES ? &record : 0,
-              wanted, &w->run);
-  FOR(kind, KINDS) if (wanted[kind]) scalars_forward(&c, d, kind, &w->run.states[kind], by[kind]);
+  freeze_forward(q, v, normal, call(target_yield, d->target, 0, 0), &own->frozen, wanted,
+                 &w->freeze);
+  run_forward(d, &w->freeze.frozen, &own->tape, HISTORIES ? record : 0, wanted, &w->run);
+  FOR(k, ALL_VECTORS) if (wanted[k]) scalars_forward(&c, d, k, &w->run.states[k], record);
   /* no number in, none out */
-  if (c.final.impulse != c.final.impulse) FOR(kind, KINDS) FOR(i, N_VALUES)
-    FOR(k, (ROWS[i] ? ROWS[i] * N_COLUMNS[0] : 1) * SEEDS(kind)) if (by[kind][i]) by[kind][i][k] = NAN;
+  if (c.final.impulse != c.final.impulse) FOR(i, N_VALUES) FOR(direction, ALL_VECTORS * LANES)
+    FOR(k, ROWS[i] ? ROWS[i] * N_COLUMNS[0] : 1) if (record->to[i][direction]) record->to[i][direction][k] = NAN;
 }

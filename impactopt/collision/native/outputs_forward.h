@@ -1,7 +1,8 @@
 /* Tangents of the histories, a column an instant; see outputs.h. */
 
+/* where each output's derivatives by each direction go, column by column; null where nobody asks */
 typedef struct {
-  double **by[KINDS]; /* where each output's derivatives go: a column a direction, with the output column by column */
+  double *to[N_VALUES][ALL_VECTORS * LANES];
 } RecordTangent;
 
 #if FRICTION || defined(OUT_joint_velocity)
@@ -10,45 +11,73 @@ typedef struct {
 #define SPEEDS_OF_COLUMNS 0
 #endif
 
-/* of a state, and what one sees of it; in columns, of speeds only those that are asked for, and the hand's */
+/* rows of each wrench that columns need: of a ZMP alone its force down and two moments */
+#if defined(OUT_zmp) && !defined(OUT_ground_wrench) && !HELD_ASKED
+#define ROWS_ASKED(i) for (int i = 2; i < 5; i++)
+#else
+#define ROWS_ASKED(i) FOR(i, SIX)
+#endif
+
+/* an instant, and what tangents there are made with */
 typedef struct {
-  vec speeds[ROWS_OF_V][VD], demand[N1][VD], target[NZ1][VD];
-  vec impulse[VD], penetration[VD], time[VD], peak[VD], rate[VD], force[VD], target_speed[VD];
-} StateTangent;
+  int number;
+  Place place;
+  Instant at;
+  Contact contact;
+  double force, ground[SIX];
+} Column;
 
-INLINE void put(const vec (*x)[VD], int seeds, int rows, int columns, int column, double *to) {
-  FOR(seed, seeds) FOR(i, rows) to[(long)seed * rows * columns + (long)rows * column + i] = ((const double *)x[i])[seed];
+static void column_of(const Data *d, double penetration, Column *c) {
+  c->force = call(contact_force, &penetration, &c->at.rate, d->law);
+#ifdef OUT_zmp
+  vec wrench[VC];
+  wrench_of(d->frozen, (const double *)c->at.net, c->force, 1.0, wrench);
+  ground_wrench_of(d->frozen, (const double *)wrench, c->ground);
+#endif
 }
-#define PUT(name, rows, x) \
-  if (by[OUT_##name]) put((const vec(*)[VD])(x), SEEDS(kind), rows, N_COLUMNS[0], column, by[OUT_##name])
 
-static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F, const vec (*P)[V], int kind,
-                          const Instant *at, double force, const StateTangent *x, const RecordTangent *record,
-                          int column) {
-  double **by = record->by[kind];
+/* rows of a vector of directions, to a place in the output of each */
+typedef vec anywhere __attribute__((aligned(8)));
+INLINE void put(const vec *x, int rows, long place, double *const *to) {
+  if (rows < LANES) {
+    FOR(l, LANES) if (to[l]) FOR(i, rows) to[l][place + i] = x[i][l];
+    return;
+  }
+  /* the last square has some rows of the one before */
+  for (int begin = 0; begin < rows; begin += LANES) {
+    const int i = begin + LANES <= rows ? begin : rows - LANES;
+    vec square[LANES];
+    FOR(a, LANES) square[a] = x[i + a];
+    transpose(square);
+    FOR(l, LANES) if (to[l]) *(anywhere *)(to[l] + place + i) = square[l];
+  }
+}
+#define PUT(name, rows, x) put(x, rows, (long)(rows) * c->number, record->to[OUT_##name] + k * LANES)
+
+static void write_tangent(const Data *d, const FrozenTangent *t, int k, const Column *c, const StateTangent *x,
+                          const RecordTangent *record) {
 #ifdef OUT_time
-  PUT(time, 1, x->time);
+  PUT(time, 1, &x->time);
 #endif
 #ifdef OUT_penetration
-  PUT(penetration, 1, x->penetration);
+  PUT(penetration, 1, &x->penetration);
 #endif
 #ifdef OUT_hand_speed
-  vec speed[1][VD];
-  FOR_EACH(k) speed[0][k] = x->rate[k] + x->target_speed[k];
-  PUT(hand_speed, 1, speed);
+  const vec speed = x->rate + x->target_speed;
+  PUT(hand_speed, 1, &speed);
 #endif
 #ifdef OUT_target_speed
-  PUT(target_speed, 1, x->target_speed);
+  PUT(target_speed, 1, &x->target_speed);
 #endif
 #ifdef OUT_force
-  PUT(force, 1, x->force);
+  PUT(force, 1, &x->force);
 #endif
 #ifdef OUT_joint_velocity
-  vec velocity[N1][VD];
+  vec velocity[N1];
   memcpy(velocity, x->speeds, sizeof velocity);
-  if (kind == BY_V) FOR(i, N) *lane(velocity[i], NV - N + i) += 1.0;
+  FOR(i, N) add_to_direction(&velocity[i], k, FIRST_OF(BY_V) + NV - N + i, 1.0);
 #if REFERENCE
-  FOR(i, N) FOR_EACH(k) velocity[i][k] += ((const double *)d->bend)[i] * x->time[k];
+  FOR(i, N) velocity[i] += ((const double *)d->bend)[i] * x->time;
 #endif
   PUT(joint_velocity, N, velocity);
 #endif
@@ -57,10 +86,10 @@ static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F
 #endif
 #if defined(OUT_torque) || HELD_HISTORY
   /* with the hand's force, negative, in the last row: what wrenches are of */
-  vec net[N + 1][VD];
+  vec net[N + 1];
   FOR(i, N) {
-    const int held = ((const double *)at->torque)[i] == ((const double *)at->demand)[i];
-    FOR_EACH(k) net[i][k] = either(held, x->demand[i][k], (vec){0});
+    const double held = ((const double *)c->at.torque)[i] == ((const double *)c->at.demand)[i];
+    net[i] = held * x->demand[i];
   }
 #endif
 #ifdef OUT_torque
@@ -69,69 +98,60 @@ static void write_tangent(const Data *d, const FrozenTangent *t, const Frozen *F
 #if HELD_HISTORY
 #if FRICTION
   FOR(i, N) {
-    const double rate = ((const double *)d->joint_velocity)[i] + ((const double *)at->u)[i];
+    const double rate = ((const double *)d->joint_velocity)[i] + ((const double *)c->at.u)[i];
     double slope = ((const double *)d->viscous)[i];
     if (fabs(rate) <= TRANSITION) slope += ((const double *)d->coulomb)[i] / TRANSITION;
-    FOR_EACH(k) net[i][k] -= slope * x->speeds[i][k];
-    if (kind == BY_V) *lane(net[i], NV - N + i) -= slope;
+    net[i] -= slope * x->speeds[i];
+    add_to_direction(&net[i], k, FIRST_OF(BY_V) + NV - N + i, -slope);
   }
 #endif
-  FOR_EACH(k) net[N][k] = -x->force[k];
-  vec held[C1][VD];
-  FOR(c, C) {
-    FOR_EACH(k) held[c][k] = t->L_0[kind][c][k];
-    FOR(j, N + 1) FOR_EACH(k) held[c][k] -= ((const double *)P[c])[j] * net[j][k];
-    if (kind == BY_Q) FOR(j, N + 1) {
-      const double of = j < N ? ((const double *)at->net)[j] : -force;
-      FOR_EACH(k) held[c][k] -= of * t->P[c][j][k];
+  net[N] = -x->force;
+  vec wrenches[WRENCHES_ASKED][SIX];
+  FOR(g, WRENCHES_ASKED) {
+    vec sum[SIX];
+    memcpy(sum, t->wrench_begin[k][g], sizeof sum);
+    FOR(j, N + 1) ROWS_ASKED(i) sum[i] -= t->by[g][j][i] * net[j];
+    if (k < VECTORS_OF_Q) {
+      const vec(*by)[SIX] = t->wrench_by[k][g];
+      FOR(j, N) ROWS_ASKED(i) sum[i] -= ((const double *)c->at.net)[j] * by[j][i];
+      ROWS_ASKED(i) sum[i] += c->force * by[N][i];
     }
+    memcpy(wrenches[g], sum, sizeof sum);
   }
 #ifdef OUT_sole_wrench
-  PUT(sole_wrench, 6 * SOLES, held);
+  PUT(sole_wrench, SIX * SOLES, wrenches[0]);
 #endif
 #ifdef OUT_hand_wrench
-  PUT(hand_wrench, C - 6 * SOLES, held + 6 * SOLES);
-#endif
-#if defined(OUT_ground_wrench) || defined(OUT_zmp)
-  vec wrench[VC], total[6][VD];
-  wrench_of(F, (const double *)at->net, force, 1.0, wrench);
-  memcpy(total, t->unmodelled[kind], sizeof total);
-  FOR(s, SOLES) {
-    const double *f = (const double *)wrench + 6 * s, *p = F->soles + 3 * s;
-    const vec(*df)[VD] = (const vec(*)[VD])held + 6 * s, (*dp)[VD] = t->soles + 3 * s;
-    FOR_EACH(k) {
-      FOR(i, 6) total[i][k] += df[i][k];
-      FOR(i, 3) {
-        const int a = (i + 1) % 3, b = (i + 2) % 3;
-        total[3 + i][k] += p[a] * df[b][k] - p[b] * df[a][k];
-        if (kind == BY_Q) total[3 + i][k] += dp[a][k] * f[b] - dp[b][k] * f[a];
-      }
-    }
-  }
+  PUT(hand_wrench, C - SIX * SOLES, wrenches[SOLES]);
 #endif
 #ifdef OUT_ground_wrench
-  PUT(ground_wrench, 6, total);
+  PUT(ground_wrench, SIX, wrenches[WRENCHES_ASKED - 1]);
 #endif
 #ifdef OUT_zmp
-  double sum[6];
-  ground_wrench_of(F, (const double *)wrench, sum);
-  vec place[2][VD];
-  FOR_EACH(k) {
-    place[0][k] = (-total[4][k] + sum[4] / sum[2] * total[2][k]) / sum[2];
-    place[1][k] = (total[3][k] - sum[3] / sum[2] * total[2][k]) / sum[2];
-  }
+  const double *sum = c->ground;
+  const vec *total = wrenches[WRENCHES_ASKED - 1];
+  const vec place[2] = {(-total[4] + sum[4] / sum[2] * total[2]) / sum[2], (total[3] - sum[3] / sum[2] * total[2]) / sum[2]};
   PUT(zmp, 2, place);
 #endif
 #endif
 }
 
-/* the columns after `column` repeat it */
+/* the memory of the columns that come next, of a vector of directions: it is much, and far away */
+static void fetch(const RecordTangent *record, int k, int column, int count) {
+  FOR(i, N_VALUES) if (ROWS[i]) FOR(l, LANES) {
+    const char *to = (const char *)record->to[i][k * LANES + l];
+    const long begin = (long)ROWS[i] * column * sizeof(double), end = begin + (long)ROWS[i] * count * sizeof(double);
+    if (to) for (long place = begin; place < end; place += 64) __builtin_prefetch(to + place, 1);
+  }
+}
+
+/* the columns after `column` repeat it: as many again each time as there are */
 static void repeat_tangent(const RecordTangent *record, int column) {
-  FOR(kind, KINDS) FOR(i, N_VALUES) {
-    const long rows = ROWS[i], size = rows * N_COLUMNS[0];
-    double *to = record->by[kind][i];
-    if (!rows || !to) continue;
-    FOR(seed, SEEDS(kind)) for (int k = column + 1; k < N_COLUMNS[0]; k++)
-      memcpy(to + seed * size + rows * k, to + seed * size + rows * column, rows * sizeof(double));
+  FOR(i, N_VALUES) FOR(direction, ALL_VECTORS * LANES) {
+    const long rows = ROWS[i], wanted = rows * (N_COLUMNS[0] - column);
+    if (!rows || !record->to[i][direction]) continue;
+    double *to = record->to[i][direction] + rows * column;
+    for (long made = rows; made < wanted; made *= 2)
+      memcpy(to + made, to, (made < wanted - made ? made : wanted - made) * sizeof(double));
   }
 }

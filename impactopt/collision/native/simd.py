@@ -47,8 +47,8 @@ def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
     """(ca.Function <name>_parts, C of <name>_forward) of an SX function with dense outputs.
 
     <name>_parts (the function's inputs) -> the numbers that its derivatives need, <NAME>_PARTS of them.
-    <name>_forward (parts, seeds, out, count) : seeds[i] has `count` vectors of seed directions for each entry
-    of the i-th input that moves; out[i], unless it is null, gets as many for each entry of the i-th output.
+    <name>_forward (parts, seeds, out) : seeds[i] has a vector of seed directions for each entry of the i-th
+    input that moves; out[i] gets one for each entry of the i-th output.
 
     Parameters
     ----------
@@ -68,11 +68,9 @@ def simd_forward(function: Any, seeds: Mapping[int, Any]) -> tuple[Any, str]:
     code = [
         f"#define {name.upper()}_PARTS {max(len(numbers), 1)}",
         f"static void {name}_forward(",
-        "  const double *c, const vec *const *seeds, vec *const *out, int count) {",
-        "  for (int k = 0; k < count; k++) {",
-        f"    vec {', '.join(registers or ['a'])};",
-        *[f"    {line};" for line in lines],
-        "  }",
+        "  const double *c, const vec *const *seeds, vec *const *out) {",
+        f"  vec {', '.join(registers or ['a'])};",
+        *[f"  {line};" for line in lines],
         "}\n",
     ]
     return ca.Function(f"{name}_parts", inputs, [ca.vertcat(ca.SX(0, 1), *numbers)]), "\n".join(code)
@@ -105,10 +103,10 @@ def _split(whole: Any, n_given: int) -> tuple[list[Any], list[str]]:
         kind, read, write = whole.instruction_id(k), whole.instruction_input(k), whole.instruction_output(k)
         if kind == ca.OP_OUTPUT:
             value = operand(read[0]) if read[0] in held else f"(vec){{0}} + {operand(read[0])}"
-            lines.append(f"if (out[{write[0]}]) out[{write[0]}][{write[1]} * count + k] = {value}")
+            lines.append(f"out[{write[0]}][{write[1]}] = {value}")
         elif kind == ca.OP_INPUT and read[0] >= n_given:
             held[write[0]] = f"a{write[0]}"
-            lines.append(f"a{write[0]} = seeds[{read[0] - n_given}][{read[1]} * count + k]")
+            lines.append(f"a{write[0]} = seeds[{read[0] - n_given}][{read[1]}]")
         elif kind not in (ca.OP_INPUT, ca.OP_CONST) and any(register in held for register in read):
             lines.append(f"a{write[0]} = " + _LINEAR[kind].format(*map(operand, read)))
             held[write[0]] = f"a{write[0]}"

@@ -207,7 +207,7 @@ def _code(
         files_used += ["results.h"] if collision.n_freezes else ["back.h", *_BACK[method], "freeze_back.h"]
         files_used += ["gradient.c"]
     elif jacobian:
-        parts_of_way = ("freeze", "outputs", "implicit", "course")
+        parts_of_way = ("freeze", "implicit", "outputs", "course")
         forward = ["forward.h", *(f"{name}_forward.h" for name in parts_of_way)]
         files_used += ["results.h", *forward, "jacobian.c"]
     else:

@@ -54,6 +54,7 @@ class StructuredProgram:
         linear_rows = stack(rows.affine)
         self._row_out = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
         self._nonlinear = np.flatnonzero(self._row_out >= 0)
+        self._of_nonlinear = self._row_out[self._nonlinear]
         self.m = len(self._row_out)
         self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
         self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
@@ -119,7 +120,7 @@ class StructuredProgram:
     @cached_property
     def _jacobian(self) -> JacobianMap:
         row_of_out = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
-        row_of_out[self._row_out[self._nonlinear]] = self._nonlinear
+        row_of_out[self._of_nonlinear] = self._nonlinear
         return JacobianMap(self.blocks, self._lift, row_of_out, self._rows_matrix)
 
     @cached_property
@@ -155,7 +156,7 @@ class StructuredProgram:
         t = time.perf_counter()
         g = self._rows_matrix @ x + self._rows_const
         if self.blocks:
-            g[self._nonlinear] += self.all_outputs(x)[self._row_out[self._nonlinear]]
+            g[self._nonlinear] += self.all_outputs(x)[self._of_nonlinear]
         self.seconds += time.perf_counter() - t
         return g
 
@@ -171,7 +172,7 @@ class StructuredProgram:
     def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
         t = time.perf_counter()
         found, lam = self._hessian, np.zeros(int(self._out_offset[-1]))
-        lam[self._row_out[self._nonlinear]] = multipliers[self._nonlinear]
+        lam[self._of_nonlinear] = multipliers[self._nonlinear]
         for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
             b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out))
         out = found.matrix(sigma)

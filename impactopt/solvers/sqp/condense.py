@@ -148,6 +148,9 @@ class Condenser:
         ]
         for columns, _ in self.left:
             self.pattern[np.ix_(columns, columns)] = True
+        none = np.zeros(0, dtype=np.intp)
+        at = (np.concatenate([none, *[one[k] for one in self.left]]) for k in (0, 1))
+        self._of_left = np.repeat(np.arange(len(self.left)), of_left.sum(axis=1)), *at
         place = np.full(n, -1)
         place[self.free] = np.arange(self.free.size)
         inside = (place[i] >= 0) & (place[j] >= 0)
@@ -202,8 +205,8 @@ class Condenser:
     def A(self) -> Vector:
         """Of the equalities left, by the free variables (l, f)."""
         out = np.zeros((len(self.left), self.free.size))
-        for row, (columns, at) in zip(out, self.left, strict=True):
-            row[columns] = self.J[at]
+        rows, columns, at = self._of_left
+        out[rows, columns] = self.J[at]
         return out
 
     @property

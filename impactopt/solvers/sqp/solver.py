@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from impactopt.errors import check_array
 from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Vector, check_program
@@ -15,6 +14,7 @@ from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.reduced import ReducedRun
 from impactopt.solvers.sqp.run import Run, Task
 from impactopt.solvers.sqp.sl1qp import Sl1QPRun
+from impactopt.solvers.threads import threads
 
 
 def solve_sqp(
@@ -61,8 +61,7 @@ def solve_sqp(
     determined = getattr(program, "determined", ())
     reduced = ReducedRun(task, determined) if determined and not interior else None
     run: Run = reduced or (InteriorRun if interior else Sl1QPRun)(task)
-    # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
-    with threadpool_limits(limits=1 if interior or determined else None, user_api="blas"):
+    with threads().limit(limits=1 if interior or determined else None, user_api="blas"):
         try:
             status = run.iterate()
         except KeyboardInterrupt:

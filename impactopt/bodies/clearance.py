@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.fit import Planes
 from impactopt.bodies.pieces import Piece
-from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, transform
+from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
 from impactopt.bodies.world import WorldBody
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
@@ -79,6 +79,11 @@ class Places:
 
     def __len__(self) -> int:
         return len(self.travel)
+
+    @cached_property
+    def transforms(self) -> dict[tuple[int, int], Any]:
+        """Of instants and bodies, for exact distances: those that have been asked for."""
+        return {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -264,13 +269,15 @@ class Bodies:
     # ------------------------------------------------------------------ exactly
     def exact(self, at: Places, k: int, pair: Pair) -> float:
         """Distance [m] at instant k of two joints, or of a joint and a body of the world, -1 - its index."""
-        return self.closest(at, k, pair).distance
+        a, b = pair
+        here, there = self._transform(at, k, a), self._transform(at, k, b)
+        return min(distance(one.shape, here, two.shape, there) for one, two in self._pieces(pair))
 
     def closest(self, at: Places, k: int, pair: Pair) -> Closest:
         """Where the two of a pair are nearest to each other at instant k, or deepest in each other."""
         a, b = pair
         here, there = self._transform(at, k, a), self._transform(at, k, b)
-        pieces = self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
+        pieces = self._pieces(pair)
         best: Any = None
         nearest: Any = None
         for one, two in pieces:
@@ -286,9 +293,16 @@ class Bodies:
             tuple(one for one, two in pieces if two is nearest),
         )
 
+    def _pieces(self, pair: Pair) -> Sequence[tuple[Any, Any]]:
+        """Of the two of a pair, those that may meet."""
+        a, b = pair
+        return self.pairs[pair] if b >= 0 else [(one, self.world[-1 - b]) for one in self.links.of_joint[a]]
+
     def _transform(self, at: Places, k: int, body: int) -> Any:
-        rotation, translation = self.placement(at, k, body)
-        return transform(rotation, translation)
+        known = at.transforms.get((k, body))
+        if known is None:
+            known = at.transforms[k, body] = transform(*self.placement(at, k, body))
+        return known
 
     def placement(self, at: Places, k: int, body: int) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) [m] of a joint, or of a body of the world, -1 - its index."""

@@ -114,12 +114,14 @@ class Budget:
         start: Array | SolverResult,
         barrier: float | None = None,
         most: int | None = None,
+        leave: Callable[[Array], bool] | None = None,
     ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
 
         start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
         barrier : the first of "sqp" from a result, where that is not as near as it looks.
         most : iterations of "sqp", if the options do not say how many.
+        leave : of "sqp", whether variables (n,) near the optimum are enough.
         """
         left, y, z = self.left, None, None
         if isinstance(start, SolverResult):
@@ -142,6 +144,7 @@ class Budget:
             callback=self.callback,
             multipliers=y,
             bound_multipliers=z,
+            leave=leave,
         )
 
 

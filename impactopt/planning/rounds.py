@@ -86,6 +86,7 @@ class Refining:
     ) -> None:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
+        self._near: tuple[Transcription, Array, Violated | None] | None = None
         self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
         self._refined = 0  # rounds with a finer mesh
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
@@ -109,10 +110,27 @@ class Refining:
             t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
         if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
             start = start.x  # of a program with other rows
-        result = self.budget.run(t.program, start)
+        # bodies deep in each other ask for another program, long before this one is solved to its end
+        leave = None if isinstance(start, SolverResult) else partial(self._is_deep, t)
+        result = self.budget.run(t.program, start, leave=leave)
         if self.margins is None:
             result = self._looked_at(t, result, start.x if isinstance(start, SolverResult) else start)
         return t, result
+
+    def _violated(self, t: Transcription, x: Array) -> Violated | None:
+        """What a program lacks at its variables; the last that was asked for is known."""
+        if self.margins is None:
+            return None
+        if self._near is None or self._near[0] is not t or self._near[1] is not x:
+            self._near = t, x, rows_to_add(t, x, self.margins)
+        return self._near[2]
+
+    def _is_deep(self, t: Transcription, x: Array) -> bool:
+        """Whether bodies are deep in each other."""
+        with contextlib.suppress(InputError):
+            violated = self._violated(t, x)
+            return violated is not None and bool(violated.deep)
+        return False
 
     def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
         """A result without a verdict with that of another solver, from the same start."""
@@ -210,7 +228,7 @@ class Refining:
         error: ContactError | None = None
         with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
             if self.margins is not None:
-                violated = rows_to_add(t, old.x, self.margins)
+                violated = self._violated(t, old.x)
                 if violated is None or violated.depth <= 0:
                     self._apart = t, old
         if violated is not None and violated.deep and again < _DEEP_ROUNDS:

@@ -78,12 +78,13 @@ def rows_to_add(t: Transcription, x: Array, margins: Margins, *, share: float = 
         motion = plan.motion(STEP, missed=missed)
         at = Places.of(t.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
         near = bodies.near(at, margins.most + bodies.slack).least()
-        for k, joint, other, gap in zip(near.at, near.joint, near.other, near.gap, strict=True):
-            pair = bodies.known(int(joint), int(other))
+        columns = (a.tolist() for a in (near.at, near.joint, near.other, near.gap))
+        for k, joint, other, gap in zip(*columns, strict=True):
+            pair = bodies.known(joint, other)
             least = (1 - share) * margins.of(pair) + DEEPEST
             if not margins.term(pair).enabled or gap - bodies.slack > least:
                 continue
-            found = _Between(bodies.exact(at, int(k), pair), float(motion.time[k]), missed)
+            found = _Between(bodies.exact(at, k, pair), float(motion.time[k]), missed)
             if found.apart < least:
                 deepest = max(deepest, -found.apart)
                 key = tuple(_beside(spots, found.time, missed)), pair

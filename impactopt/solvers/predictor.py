@@ -11,15 +11,14 @@ programs", CDC 2019.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
-from threadpoolctl import ThreadpoolController
 
 from impactopt.solvers.program import Matrix, NonlinearProgram, Vector, max_violation
 from impactopt.solvers.sqp.newton import acquire
+from impactopt.solvers.threads import threads
 
 __all__ = ["Prediction", "Predictor"]
 
@@ -30,12 +29,6 @@ _PROXIMAL = 1e-2  # curvature more of every variable, so that what hardly matter
 _STEPS, _SETS = 5, 20  # QPs, and active sets of each
 _SHORT, _JAMMED = 0.1, 5  # so many line searches that are so short: it gets nowhere
 _ENOUGH = 1e-4  # of rows: no more QPs
-
-
-@cache
-def _threads() -> ThreadpoolController:
-    """Its making takes as long as a QP."""
-    return ThreadpoolController()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +93,7 @@ class Predictor:
         found: Prediction | None = None
         x, y, z, sides = self.x, self.y, self.z, self._sides
         g = program.constraints(x)
-        with _threads().limit(limits=1, user_api="blas"):
+        with threads().limit(limits=1, user_api="blas"):
             for k in range(_STEPS):
                 if not np.isfinite(g).all():
                     break

@@ -273,6 +273,7 @@ def add_apart_rows(
     everywhere = stack([part for _, slots in spots for part in slots])
     coordinates, constants = everywhere.matrix(b.layout.n), everywhere.const
     chains: dict[tuple[int, int], tuple[Chain, Any]] = {}
+    names: dict[tuple[int, int], str] = {}
     groups: dict[str, _Group] = {}
     for row, held in rows.items():
         body = bodies.world[-1 - row.other] if row.other < 0 else None
@@ -280,13 +281,17 @@ def add_apart_rows(
             chain = _chain(b.robot, row.joint, max(row.other, 0))
             pattern = chain.pattern(b.coordinates, None if body is None else body.rotation)
             chains[row.joint, row.other] = chain, pattern
+            names[row.joint, row.other] = " and ".join(bodies.names((row.joint, row.other)))
         chain, pattern = chains[row.joint, row.other]
         before = None
         if body is not None:
             shift = held.travel * bodies.normal * body.moves
             before = pin.SE3(body.rotation, body.place + shift).inverse()
         planes = (links.planes[row.other] if body is None else body.planes).with_facing(held.facing)
-        group = groups.setdefault(f"apart{chain.length}", _Group(chain.length + 3))
+        name = f"apart{chain.length}"
+        if name not in groups:
+            groups[name] = _Group(chain.length + 3)
+        group = groups[name]
         group.rows.append(row)
         group.patterns.append(pattern)
         group.spots.append(spot_of[row.place])
@@ -304,7 +309,7 @@ def add_apart_rows(
             Row(
                 (SelfCollision if row.other >= 0 else KeepOut).name,
                 spots[spot][0],
-                " and ".join(bodies.names((row.joint, row.other))),
+                names[row.joint, row.other],
                 TOO_NEAR,
             )
             for row, spot in zip(group.rows, group.spots, strict=True)

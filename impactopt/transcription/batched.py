@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from impactopt.transcription.rows import Index
 
 # of functions that take one instance a call: those in lanes are done before a thread has started
 THREADS = 2
+_LONGEST = 64  # calls at once
 
 
 class BatchedFunction:
@@ -26,16 +28,18 @@ class BatchedFunction:
         self._function = function
         self.columns = columns = function.size2_in(0)
         calls = -(-count // columns)
-        threads = ("thread", THREADS) if columns == 1 else ()
-        self._mapped = function.map(calls, *threads) if calls > 1 else function
-        self._buffer, self._run = self._mapped.buffer()
         # instances beyond `count` fill the last call up: they are the last one, again
         self.inputs = [np.zeros((calls * columns, function.size1_in(i))) for i in range(function.n_in())]
         self.count, self._shape = count, (calls * columns, function.nnz_out(0) // columns)
         self.take_parameters(parameters)
-        for i, a in enumerate(self.inputs):
-            if a.size:
-                self._buffer.set_arg(i, a.data)
+        self._parts = []  # of all instances, with the buffer of each
+        for first, last in _parts(calls, calls if columns == 1 else _LONGEST):
+            buffer, run = _repeated(function, last - first).buffer()
+            self._parts.append((slice(first * columns, last * columns), buffer, run))
+        for part, buffer, _ in self._parts:
+            for i, a in enumerate(self.inputs):
+                if a.size:
+                    buffer.set_arg(i, a[part].data)
         self.write_to(np.zeros(self.size))
 
     def take_parameters(self, parameters: Array) -> None:
@@ -55,8 +59,8 @@ class BatchedFunction:
         """From now on calls write to these (size,)."""
         self._all = numbers.reshape(self._shape)
         self.output = self._all[: self.count]
-        if numbers.size:
-            self._buffer.set_res(0, self._all.data)
+        for part, buffer, _ in self._parts if numbers.size else ():
+            buffer.set_res(0, self._all[part].data)
 
     def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
         """Rows are instances: z (count, n_z) -> (count, nnz of the output).
@@ -67,14 +71,32 @@ class BatchedFunction:
         self.inputs[0][self.count :] = z[-1:]
         if multipliers is not None:
             self.inputs[2][: self.count] = multipliers
-        self._run()
+        for _, _, run in self._parts:
+            run()
         return self.output
 
     @property
     def pattern(self) -> tuple[Index, Index]:
         """Rows and columns of an instance's nonzeros, in CasADi's (column-major) order."""
-        rows, columns = pattern(self._mapped.sparsity_out(0))
+        rows, columns = pattern(self._function.sparsity_out(0))
         return rows[: self.output.shape[1]], columns[: self.output.shape[1]]
+
+
+def _parts(calls: int, longest: int) -> Iterator[tuple[int, int]]:
+    """First and last of as few calls at once as there are powers of two, up to ``longest``."""
+    first = 0
+    while first < calls:
+        size = min(calls - first, longest)
+        size = size if size in (calls, longest) else 1 << (size.bit_length() - 1)
+        yield first, first + size
+        first += size
+
+
+@functools.lru_cache(maxsize=1024)
+def _repeated(function: Any, calls: int) -> Any:
+    """So many calls at once: for a hundred, CasADi takes longer to make this than to run it ten times."""
+    threads = ("thread", THREADS) if function.size2_in(0) == 1 else ()
+    return function.map(calls, *threads) if calls > 1 else function
 
 
 def pattern(sparsity: Any) -> tuple[Index, Index]:

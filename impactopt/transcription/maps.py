@@ -7,6 +7,7 @@ mostly variables of the program side by side.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,8 +43,8 @@ class JacobianMap:
         entry, place, length, factor = _joined(parts)
         at, values = _placed(linear)
         places = union(np.concatenate([place, at]), np.concatenate([length, np.ones_like(at)]))
-        self._rows, self._starts = _csc(places, self._shape)
         self._linear = np.bincount(np.searchsorted(places, at), values, places.size)
+        self._made = sp.csc_array((self._linear, *_csc(places, self._shape)), shape=self._shape)
         shape = places.size, self._entries.size
         self._sums = Runs.make(entry, np.searchsorted(places, place), length, factor, shape)
 
@@ -51,7 +52,7 @@ class JacobianMap:
         """For what the blocks' Jacobians were last."""
         values = self._linear.copy()
         self._sums.add_to(values, self._entries)
-        return sp.csc_array((values, self._rows, self._starts), shape=self._shape)
+        return _with(self._made, values)
 
 
 class HessianMap:
@@ -84,7 +85,7 @@ class HessianMap:
         at, values = _placed(quadratic)
         one, other = (_pattern(p, self._shape) for p in (union(place, length), union(at)))
         whole = sp.csc_array(one + one.T + other)
-        self._rows, self._starts = whole.indices, whole.indptr
+        self._made = whole
         places = np.repeat(np.arange(n), np.diff(whole.indptr)) * n + whole.indices
         numbers = sp.csc_array((np.arange(places.size), whole.indices, whole.indptr), self._shape)
         self._across = numbers.T.tocsc().data.astype(np.int32)
@@ -97,7 +98,7 @@ class HessianMap:
         values: Array = np.multiply(sigma, self._half)
         self._sums.add_to(values, self._entries)
         values = with_transposed(values, self._across)
-        return sp.csc_array((values, self._rows, self._starts), shape=self._shape)
+        return _with(self._made, values)
 
 
 def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
@@ -107,6 +108,13 @@ def _shared(functions: Sequence[BatchedFunction]) -> tuple[Array, Index]:
     for f, start in zip(functions, starts, strict=False):
         f.write_to(entries[start : start + f.size])
     return entries, starts
+
+
+def _with(matrix: sp.csc_array, values: Array) -> sp.csc_array:
+    """The same pattern with other values: SciPy's own way looks at the whole pattern again."""
+    out = copy.copy(matrix)
+    out.data = values
+    return out
 
 
 def _terms(lift: sp.csr_array, z: Index) -> tuple[Index, Index, Array]:

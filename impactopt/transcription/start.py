@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,6 +21,7 @@ from impactopt.transcription.finer_contact import carry_contact, same_places
 from impactopt.transcription.guess import effective_mass, speed_that_leaves
 from impactopt.transcription.layout import Array, Group
 from impactopt.transcription.mesh import with_middles
+from impactopt.transcription.rows import Row
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import Transcription
 
@@ -193,9 +193,7 @@ def carried_over(t: ContactProgram, old: ContactProgram, x: Array, y: Array, z: 
         state = t.contact_state[0].evaluate(new), t.u0.read(new)[0], t.contact_legs.evaluate(new)
         for first in t.hit.first:
             first.guess(new, *state)
-    of_rows = dict(zip(_keys(old), y, strict=True))
-    rows = np.array([of_rows.get(key, 0.0) for key in _keys(t)])
-    return _finished(t, new), rows, bounds
+    return _finished(t, new), _of_same_rows(t.program.origins, old.program.origins, y), bounds
 
 
 def _carry_by_label(group: Group, known: Group, *vectors: tuple[Array, Array]) -> None:
@@ -214,13 +212,25 @@ def _model(t: ContactProgram) -> tuple[str, int]:
     return t.problem.collision, t.problem.freezes
 
 
-def _keys(t: ContactProgram) -> Iterator[tuple[str, str, str, int]]:
+def _of_same_rows(rows: Sequence[Row], known: Sequence[Row], numbers: Array) -> Array:
+    """The numbers of known rows for these: those of the same name, as often as there are any; else 0.
+
+    Most rows in front are the very same: programs differ by what comes after them.
+    """
+    differ = (k for k, (one, other) in enumerate(zip(rows, known, strict=False)) if one is not other)
+    same = next(differ, min(len(rows), len(known)))
+    of_names = dict(zip(_keys(known[same:]), numbers[same:].tolist(), strict=True))
+    return np.concatenate([numbers[:same], [of_names.get(key, 0.0) for key in _keys(rows[same:])]])
+
+
+def _keys(rows: Sequence[Row]) -> Iterator[tuple[tuple[str, str, str], int]]:
     """What a row is, and how many of that name come before it."""
-    seen: Counter[tuple[str, str, str]] = Counter()
-    for row in t.program.origins:
+    seen: dict[tuple[str, str, str], int] = {}
+    for row in rows:
         name = row.term, row.place.name, row.component
-        yield *name, seen[name]
-        seen[name] += 1
+        before = seen.get(name, 0)
+        seen[name] = before + 1
+        yield name, before
 
 
 def _finished(t: ContactProgram, x: Array) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -53,16 +54,13 @@ class StructuredProgram:
         linear_rows = stack(rows.affine)
         self._row_out = np.concatenate([np.zeros(0, dtype=np.intp), *rows.outputs])
         self._nonlinear = np.flatnonzero(self._row_out >= 0)
+        self._of_nonlinear = self._row_out[self._nonlinear]
         self.m = len(self._row_out)
         self._rows_matrix, self._rows_const = linear_rows.matrix(n), linear_rows.const
         self.g_lower = np.concatenate([np.zeros(0), *rows.lower])
         self.g_upper = np.concatenate([np.zeros(0), *rows.upper])
         self._at: tuple[Array, list[Array]] | None = None  # where functions were last asked for
         self._take_objective(objective, quadratic, linear)
-        row_of_out = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
-        row_of_out[self._row_out[self._nonlinear]] = self._nonlinear
-        self._jacobian = JacobianMap(self.blocks, self._lift, row_of_out, self._rows_matrix)
-        self._hessian = HessianMap(self.blocks, self._lift, self._Q)
         self.seconds = 0.0
 
     def take_numbers(
@@ -119,6 +117,16 @@ class StructuredProgram:
         ]
 
     # ------------------------------------------------------------------ evaluation
+    @cached_property
+    def _jacobian(self) -> JacobianMap:
+        row_of_out = np.full(int(self._out_offset[-1]), -1, dtype=np.intp)
+        row_of_out[self._of_nonlinear] = self._nonlinear
+        return JacobianMap(self.blocks, self._lift, row_of_out, self._rows_matrix)
+
+    @cached_property
+    def _hessian(self) -> HessianMap:
+        return HessianMap(self.blocks, self._lift, self._Q)
+
     def _lifted(self, x: Array) -> list[Array]:
         if self._at is not None and np.array_equal(self._at[0], x):
             return self._at[1]
@@ -148,25 +156,26 @@ class StructuredProgram:
         t = time.perf_counter()
         g = self._rows_matrix @ x + self._rows_const
         if self.blocks:
-            g[self._nonlinear] += self.all_outputs(x)[self._row_out[self._nonlinear]]
+            g[self._nonlinear] += self.all_outputs(x)[self._of_nonlinear]
         self.seconds += time.perf_counter() - t
         return g
 
     def jacobian(self, x: Array) -> sp.csc_array:
         t = time.perf_counter()
+        found = self._jacobian  # blocks write where it reads
         for b, z in zip(self.blocks, self._lifted(x), strict=True):
             b.jacobian(z)
-        out = self._jacobian.matrix()
+        out = found.matrix()
         self.seconds += time.perf_counter() - t
         return out
 
     def hessian(self, x: Array, sigma: float, multipliers: Array) -> sp.csc_array:
         t = time.perf_counter()
-        lam = np.zeros(int(self._out_offset[-1]))
-        lam[self._row_out[self._nonlinear]] = multipliers[self._nonlinear]
+        found, lam = self._hessian, np.zeros(int(self._out_offset[-1]))
+        lam[self._of_nonlinear] = multipliers[self._nonlinear]
         for b, z, o in zip(self.blocks, self._lifted(x), self._out_offset, strict=False):
             b.hessian(z, lam[o : o + b.count * b.n_out].reshape(b.count, b.n_out))
-        out = self._hessian.matrix(sigma)
+        out = found.matrix(sigma)
         self.seconds += time.perf_counter() - t
         return out
 

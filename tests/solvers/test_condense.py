@@ -14,7 +14,7 @@ from impactopt.solvers.sqp.cholesky import BlockCholesky
 from impactopt.solvers.sqp.compiled import kernels
 from impactopt.solvers.sqp.condense import Condenser, find_eliminations
 from impactopt.solvers.sqp.kernels import Kernels
-from impactopt.solvers.sqp.newton import NewtonSystem
+from impactopt.solvers.sqp.newton import NewtonSystem, acquire, release
 from impactopt.solvers.sqp.patterns import Elimination
 from impactopt.transcription.start import first_iterate
 
@@ -104,6 +104,38 @@ def test_a_variable_that_is_held_does_not_move(algebra):
     step, _ = newton.solve(rng.normal(size=J.shape[1]), rng.normal(size=c.m))
     assert step[c.free[1]] == 0.0
     assert np.abs(step).min(initial=1.0, where=np.arange(step.size) != c.free[1]) > 0.0
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_a_structure_serves_programs_with_other_inequalities(ties):
+    """Where these couple what is coupled anyway; it gets another one where they tie two systems together."""
+    J, H, eliminations, rng = chained(7)
+    m, n = J.shape
+    new = np.zeros((2, n))
+    new[0, [n - 3, n - 1]] = new[1, [0, 2 if ties else n - 2]] = rng.normal(size=2)
+    dense = J.toarray()
+    more = sp.csc_array(np.vstack([new[:1], dense, new[1:]]))
+    determined = [Determined((0,), variables) for variables in eliminations[0].variables]
+    systems, bounded = [], np.zeros(n, dtype=bool)
+    for matrix, before in ((J, 0), (more, 1)):
+        equal = np.zeros(matrix.shape[0], dtype=bool)
+        equal[before + eliminations[0].rows.ravel()] = equal[before + m - 5] = True
+        given = {"determined": determined, "equal": equal, "bounded": bounded, "moves": ~bounded}
+        systems.append(acquire(matrix, H, **given))
+        release(systems[-1])
+    assert (systems[0] is systems[1]) is not ties
+    newton, c = systems[1], systems[1].condenser
+    weights, gradient, residual = 0.1 + rng.random(c.rows.size), rng.normal(size=n), rng.normal(size=m + 2)
+    assert newton.factor(more, H, np.zeros(c.free.size), lambda _: weights.copy(), hard=True)
+    step, y = newton.solve(gradient, residual)
+    softness = np.zeros(m + 2)
+    softness[c.rows] = 1.0 / weights
+    softness[equal] = 0.0
+    dense = more.toarray()
+    system = np.block([[H.toarray() + newton.shift * np.eye(n), dense.T], [dense, -np.diag(softness)]])
+    exact = np.linalg.solve(system, -np.concatenate([gradient, residual]))
+    np.testing.assert_allclose(step, exact[:n], atol=1e-8 * (1 + np.abs(exact).max()))
+    np.testing.assert_allclose(y, exact[n:], atol=1e-8 * (1 + np.abs(exact).max()))
 
 
 @pytest.mark.parametrize("tie", ["row", "equality", "hessian", "own row"])

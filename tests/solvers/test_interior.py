@@ -53,6 +53,21 @@ def test_bent_steps_lead_to_the_same_optimum(seed):
     np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-4)
 
 
+def test_a_run_may_be_left_near_its_optimum():
+    """Where whoever started it says so: it is asked with points ever nearer to the optimum."""
+    wanted = np.array([-1.0, 0.5, 2.0, 5.0])
+    asked = []
+    whole = solve_sqp(projection(wanted), np.ones(4), leave=lambda x: bool(asked.append(x)))
+    assert whole.status is Status.SOLVED
+    off = [float(np.abs(x - np.maximum(wanted, 0.0)).max()) for x in asked]
+    assert len(asked) > 1 and off == sorted(off, reverse=True)
+    left = solve_sqp(projection(wanted), np.ones(4), leave=lambda _: True)
+    assert left.status is Status.ACCEPTABLE
+    assert left.iterations < whole.iterations
+    np.testing.assert_array_equal(left.x, asked[0])
+    np.testing.assert_allclose(left.x, np.maximum(wanted, 0.0), atol=0.05)
+
+
 def test_rows_far_off_are_not_bent():
     """Where a row is off by more than one, a step is as straight as ever."""
     wanted = np.array([-1.0, *np.full(19, 5.0)])

@@ -106,7 +106,7 @@ class BarrierProblem:
         self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu)
         x = x.copy()
         x[c.free] = self.x.values
-        self.point = point = p.point(x)
+        self.point = point = point if np.array_equal(x, point.x) else p.point(x)
         multipliers = np.concatenate([y, z[c.bounded]])
         self.y = multipliers[c.rows]
         self.gone_y = multipliers[c.eliminated]

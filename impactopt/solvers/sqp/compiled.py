@@ -83,6 +83,9 @@ class CompiledKernels(Kernels):
             found = self._made[id(thing)] = thing, make(thing)
         return found[1]
 
+    def forget(self, thing: Any) -> None:
+        self._made.pop(id(thing), None)
+
     @staticmethod
     def _all(stages: Sequence[EliminationStep]) -> tuple[Any, ...]:
         made, keep = [], []
@@ -110,20 +113,25 @@ class CompiledKernels(Kernels):
 
     @staticmethod
     def _groups(products: Sequence[Products]) -> tuple[Any, ...]:
-        empty = [np.zeros(0, np.int32)]
+        none = [np.zeros(0, np.int32)]
         columns = [p.values.shape[1] for p in products]
         before = np.cumsum([0, *[p.to.size for p in products]])
-        rows = [start + _rows_of_triangle(m) for start, m in zip(before, columns, strict=False)]
+        rows = [
+            start + p.to.shape[1] * np.arange(len(p.to))[:, None] + _rows_of_triangle(m)
+            for start, p, m in zip(before, products, columns, strict=False)
+        ]
         parts = (
-            np.array([p.rows.size for p in products], dtype=np.int32),
-            np.array(columns, dtype=np.int32),
-            np.concatenate(empty + [p.rows for p in products]),
-            np.concatenate(empty + [p.values.ravel() for p in products]),
-            _runs(np.concatenate(empty + [p.to for p in products]), np.concatenate(empty + rows)),
+            np.concatenate(none + [p.counts for p in products]).astype(np.int32),
+            np.repeat(columns, [len(p.to) for p in products]).astype(np.int32),
+            np.concatenate(none + [p.rows for p in products]),
+            np.concatenate(none + [p.values.ravel() for p in products]),
+            _runs(
+                np.concatenate(none + [p.to.ravel() for p in products]),
+                np.concatenate(none + [r.ravel() for r in rows]),
+            ),
         )
-        return parts, np.zeros(
-            max([(p.rows.size + 1) * (p.values.shape[1] + 1) for p in products], default=1)
-        )
+        most = [(int(p.counts.max(initial=0)) + 1) * (p.values.shape[1] + 1) for p in products]
+        return ctypes.c_int64(parts[0].size), parts, np.zeros(max(most, default=1))
 
     # ------------------------------------------------------------------ the operations
     def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
@@ -131,8 +139,7 @@ class CompiledKernels(Kernels):
         self._c.newton_copy(*arrays, ctypes.c_int64(source.size))
 
     def add_products(self, products: Sequence[Products], values: Vector, weights: Vector, W: Vector) -> None:
-        parts, work = self._of(products, self._groups)
-        groups = ctypes.c_int64(len(products))
+        groups, parts, work = self._of(products, self._groups)
         self._c.newton_products(groups, *map(address, [*parts, values, weights, W, work]))
 
     def eliminate(self, stages: Sequence[EliminationStep], J: Vector) -> None:

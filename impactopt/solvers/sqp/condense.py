@@ -18,10 +18,10 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from impactopt.solvers.program import Determined, Matrix, Vector
-from impactopt.solvers.sqp.kernels import Index, Kernels
+from impactopt.solvers.sqp.kernels import Index, Kernels, Places, Products
 from impactopt.solvers.sqp.patterns import (
+    Alike,
     Elimination,
-    alike,
     by_pattern,
     entries,
     fill,
@@ -72,6 +72,11 @@ def _determines(pattern: bytes, size: int) -> bool:
     return bool((maximum_bipartite_matching(system) >= 0).all())
 
 
+def _columns(matrix: Matrix) -> Index:
+    """Of each entry of a csc its column."""
+    return np.repeat(np.arange(matrix.shape[1]), np.diff(matrix.indptr))
+
+
 class Condenser:
     """Eliminates, for matrices whose patterns do not change.
 
@@ -104,48 +109,38 @@ class Condenser:
         bounded (n,): variables with a finite bound.
         """
         m, n = jacobian.shape
-        self._kernels = kernels
+        self._kernels, self.n = kernels, n
+        number = np.full(m, -1)  # of an equality among them
+        number[equal] = np.arange(int(equal.sum()))
         gone = np.concatenate([np.zeros(0, np.intp), *[e.variables.ravel() for e in eliminations]])
         taken = np.concatenate([np.zeros(0, np.intp), *[e.rows.ravel() for e in eliminations]])
-        self.eliminated = np.sort(taken)
+        self._taken = np.sort(number[taken])
+        self._left = np.setdiff1d(np.arange(int(equal.sum())), self._taken)
         self.bounded = np.sort(gone[bounded[gone]])
-        self.m, self.n = m + self.bounded.size, n
-        left, free = np.ones(self.m, dtype=bool), np.ones(n, dtype=bool)
-        left[self.eliminated] = free[gone] = False
-        self.rows, self.free = np.flatnonzero(left), np.flatnonzero(free)
-        self._equations = np.flatnonzero(equal)
-        self.equal = np.searchsorted(self.rows, self._equations[left[self._equations]])
+        self.free = np.setdiff1d(np.arange(n), gone)
 
-        number = np.full(m, -1)  # of an equality among them
-        number[self._equations] = np.arange(self._equations.size)
-        J, H = jacobian.tocoo(), hessian.tocoo()
-        mine = np.flatnonzero(number[J.row] >= 0)
-        own_rows, own_columns = number[J.row[mine]], J.col[mine]
-        touches = np.zeros((self._equations.size, n), dtype=bool)
+        own = number[jacobian.indices]
+        own_rows, own_columns = own[own >= 0], _columns(jacobian)[own >= 0]
+        touches = np.zeros((int(equal.sum()), n), dtype=bool)
         touches[own_rows, own_columns] = True
-        groups = alike(by_pattern(jacobian, np.setdiff1d(self.rows[self.rows < m], self._equations)))
+        groups = by_pattern(jacobian, np.flatnonzero(~equal))
         couples = np.eye(n, dtype=bool)
-        couples[H.row, H.col] = True
-        for columns, _ in groups:
-            couples[columns[:, :, None], columns[:, None, :]] = True
+        couples[hessian.indices, _columns(hessian)] = True
+        for group in groups:
+            couples[group.columns[:, :, None], group.columns[:, None, :]] = True
         systems = fill(touches, couples, [Elimination(number[q], e) for q, e in eliminations])
 
-        p, c = entries(touches)
-        rows, none = numbered(p, c, touches.shape)
+        rows, count = numbered(*entries(touches), touches.shape)
         i, j = entries(couples)
-        i, j = i[i >= j], j[i >= j]
-        pairs, nothing = numbered(i, j, couples.shape)
-        pairs[j, i] = pairs[i, j]
-        self.J, self.W = np.zeros(none + 1), np.zeros(nothing + 1)
-        self._own_jacobian = mine.astype(np.int32), rows[own_rows, own_columns]
-        lower = H.row >= H.col
-        self._own_hessian = np.flatnonzero(lower).astype(np.int32), pairs[H.row[lower], H.col[lower]]
+        i, j = self._entries = i[i >= j], j[i >= j]
+        pairs, coupled = numbered(i, j, couples.shape)
+        self.J, self.W = np.zeros(count + 1), np.zeros(coupled + 1)
+        self._to = rows[own_rows, own_columns]
         self._diagonal = np.diagonal(pairs).copy()
-        at = np.flatnonzero(H.row == H.col)
-        self._curved = at, H.row[at]
-        self._products = [made for columns, same in groups for made in products(pairs, columns, same)]
+        self._products: list[Products] = []
+        self._take(jacobian, hessian, equal, pairs, groups)
+        pairs[j, i] = pairs[i, j]
         self._stages = [stage(same, rows, pairs) for found in systems for same in shapes(found)]
-        self._left = number[self.rows[self.equal]]
         self.pattern = couples[np.ix_(self.free, self.free)]
         of_left = touches[np.ix_(self._left, self.free)]
         self.left = [
@@ -153,10 +148,42 @@ class Condenser:
         ]
         for columns, _ in self.left:
             self.pattern[np.ix_(columns, columns)] = True
+        none = np.zeros(0, dtype=np.intp)
+        at = (np.concatenate([none, *[one[k] for one in self.left]]) for k in (0, 1))
+        self._of_left = np.repeat(np.arange(len(self.left)), of_left.sum(axis=1)), *at
         place = np.full(n, -1)
         place[self.free] = np.arange(self.free.size)
         inside = (place[i] >= 0) & (place[j] >= 0)
-        self.at_free = np.flatnonzero(inside).astype(np.int32), place[i[inside]], place[j[inside]]
+        self.at_free = (np.flatnonzero(inside) + 1).astype(np.int32), place[i[inside]], place[j[inside]]
+
+    def take(self, jacobian: Matrix, hessian: Matrix, equal: Mask) -> bool:
+        """Be that of matrices with other patterns but the same equalities; False: these rows or this Hessian
+        couple variables that nothing has coupled yet, and all stays as it was.
+        """
+        pairs, _ = numbered(*self._entries, (self.n, self.n))
+        return self._take(jacobian, hessian, equal, pairs, by_pattern(jacobian, np.flatnonzero(~equal)))
+
+    def _take(
+        self, jacobian: Matrix, hessian: Matrix, equal: Mask, pairs: Places, groups: Sequence[Alike]
+    ) -> bool:
+        """pairs : places of the entries of W's lower triangle, as of `numbered`."""
+        found = products(pairs, groups)
+        row, column = hessian.indices, _columns(hessian)
+        lower = np.flatnonzero(row >= column)
+        to = pairs[row[lower], column[lower]]
+        if not (to.all() and all(p.to.all() for p in found)):
+            return False
+        self._kernels.forget(self._products)
+        self._products, self._own_hessian = found, (lower.astype(np.int32), to)
+        at = np.flatnonzero(row == column)
+        self._curved = at, row[at]
+        self._own_jacobian = np.flatnonzero(equal[jacobian.indices]).astype(np.int32), self._to
+        self._equations = np.flatnonzero(equal)
+        self.eliminated = self._equations[self._taken]
+        self.m = equal.size + self.bounded.size
+        self.rows = np.setdiff1d(np.arange(self.m), self.eliminated)
+        self.equal = np.searchsorted(self.rows, self._equations[self._left])
+        return True
 
     # ------------------------------------------------------------------ numbers
     def load(self, jacobian: Matrix, hessian: Matrix) -> None:
@@ -178,8 +205,8 @@ class Condenser:
     def A(self) -> Vector:
         """Of the equalities left, by the free variables (l, f)."""
         out = np.zeros((len(self.left), self.free.size))
-        for row, (columns, at) in zip(out, self.left, strict=True):
-            row[columns] = self.J[at]
+        rows, columns, at = self._of_left
+        out[rows, columns] = self.J[at]
         return out
 
     @property

@@ -26,6 +26,7 @@ from impactopt.solvers.sqp.run import Run, Task
 from impactopt.solvers.sqp.search import LineSearch
 
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
+_NEAR = 5e-4  # barriers below this are near the end
 _RESTARTS = 2  # where nothing is progress any more
 
 
@@ -36,6 +37,7 @@ class InteriorRun(Run):
         super().__init__(task)
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
         self._search, self._phase = LineSearch(), ElasticPhase(self.options)
+        self._leave = task.leave
 
     def iterate(self) -> Status:
         self.point = self.program.point(self.point.x)
@@ -121,6 +123,9 @@ class InteriorRun(Run):
                 return Status.TIME_LIMIT
             if problem.lower_barrier(residual):
                 self._search.forget()
+                near = problem.mu < _NEAR and problem.elastic is None
+                if near and self._leave is not None and self._leave(self.point.x):
+                    return Status.ACCEPTABLE
             found = self._advance(residual)
             if isinstance(found, Status):
                 return found

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ Stack = npt.NDArray[np.float64]
 class EliminationStep:
     """Systems (k) of one shape, r rows each: where their numbers stand, and what eliminating them found.
 
-    Places of what is not there point to one number behind the others, which is zero.
+    Places of what is not there point to the number in front of all others, which is zero.
 
     Attributes
     ----------
@@ -72,11 +73,17 @@ class EliminationStep:
         return self.u[:, : self.X.shape[1]]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Products:
-    """Rows (g,) that touch the same columns: places of their values (g, p), and of the products of two: a
-    row's lower triangle (p (p + 1) / 2,)."""
+    """Groups (g,) of rows that touch the same p columns.
 
+    Attributes
+    ----------
+    counts (g,) : of each group its rows.  rows (k,), values (k, p) : rows, one group after the other, and
+        places of their values.  to (g, p (p + 1) / 2) : places of products of two, a row's lower triangle.
+    """
+
+    counts: Index
     rows: Places
     values: Places
     to: Places
@@ -109,6 +116,9 @@ class Panels:
 class Kernels:
     """In NumPy."""
 
+    def forget(self, thing: Any) -> None:
+        """No operation will be asked for with this list of steps or products any more."""
+
     def copy(self, values: Vector, source: Places, to: Vector, places: Places) -> None:
         """to[places] = values[source]"""
         to[places] = values[source]
@@ -118,7 +128,7 @@ class Kernels:
         for p in products:
             part = values[p.values]
             i, j = np.tril_indices(part.shape[1])
-            W[p.to] += ((part.T * weights[p.rows]) @ part)[i, j]
+            _add(W, np.repeat(p.to, p.counts, axis=0), weights[p.rows][:, None] * part[:, i] * part[:, j])
 
     def eliminate(self, stages: Sequence[EliminationStep], J: Vector) -> None:
         """X = B^-1 N, and the other equalities' values with the step -X d_c in place of d_e.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,6 @@ class NewtonSystem:
     def __init__(self, condenser: Condenser, held: Index, kernels: Kernels):
         """held: numbers of the free variables that do not move."""
         self.condenser, self.held = condenser, held
-        self._equal = condenser.rows[condenser.equal]  # numbers of the equalities left
         self._matrix = BlockCholesky(condenser.pattern, kernels)
         self._from, i, j = condenser.at_free
         places = self._matrix.places
@@ -51,12 +51,14 @@ class NewtonSystem:
         for row, (columns, at) in enumerate(condenser.left):
             i, j = np.tril_indices(columns.size)
             to = places(columns[i], columns[j]).astype(np.int32)
-            self._products.append(Products(np.full(1, row, dtype=np.int32), at[None], to))
+            number, once = np.full(1, row, dtype=np.int32), np.ones(1, dtype=np.intp)
+            self._products.append(Products(counts=once, rows=number, values=at[None], to=to[None]))
         self.begin(b"")
 
     def begin(self, key: bytes) -> None:
         """Forget the shifts of another program; key: of the structure."""
         self.key = key
+        self._equal = self.condenser.rows[self.condenser.equal]  # numbers of the equalities left
         self._last = self.shift = 0.0
 
     def factor(
@@ -207,20 +209,19 @@ def acquire(
     moves: Mask,
 ) -> NewtonSystem:
     """The system for these patterns, for one who gives it back: its structure takes as long as 10 iterations
-    and serves all programs that differ in their numbers.
+    and serves all programs that differ in their numbers, or in inequalities that couple nothing new.
 
     determined : what rows determine; equal (m,): which rows are equalities; bounded, moves (n,): which
     variables have a finite bound, and which are not fixed.
     """
-    arrays = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
-    arrays += [variables for _, variables in determined]
-    arrays += [equal, bounded, moves]
-    digest = hashlib.sha256(repr([rank for rank, _ in determined]).encode())
-    for array in arrays:
-        digest.update(f"{array.dtype} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    key = digest.digest()
-    system = _structures.pop(key, None)
+    mine = equal[jacobian.indices]
+    starts = np.append(0, np.cumsum(mine))[jacobian.indptr]
+    of_equalities = np.cumsum(equal)[jacobian.indices[mine]], starts
+    known = [variables for _, variables in determined]
+    structure = _digest([rank for rank, _ in determined], *of_equalities, *known, bounded, moves)
+    patterns = [a for matrix in (jacobian, hessian) for a in (matrix.indptr, matrix.indices)]
+    key = structure + _digest(None, *patterns, equal)
+    system = _structures.pop(key, None) or _alike(structure, jacobian, hessian, equal)
     if system is None:
         algebra = fastest()
         eliminations = find_eliminations(jacobian, equal, determined)
@@ -229,6 +230,22 @@ def acquire(
         system = NewtonSystem(condenser, held, algebra)
     system.begin(key)
     return system
+
+
+def _alike(structure: bytes, jacobian: Matrix, hessian: Matrix, equal: Mask) -> NewtonSystem | None:
+    """One with the same equalities, made to be that of these patterns: other inequalities change little."""
+    for key, system in reversed(_structures.items()):
+        if key.startswith(structure) and system.condenser.take(jacobian, hessian, equal):
+            return _structures.pop(key)
+    return None
+
+
+def _digest(words: Any, *arrays: Index | Mask) -> bytes:
+    digest = hashlib.sha256(repr(words).encode())
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.digest()
 
 
 def release(system: NewtonSystem) -> None:

@@ -43,23 +43,24 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
     The systems of each list of those that come out can be eliminated at once, list after list.
     """
     row_left, column_left = np.ones(touches.shape[0], dtype=bool), np.ones(touches.shape[1], dtype=bool)
+    touched_by = np.ascontiguousarray(touches.T)  # the same, as columns are looked at as often as rows
     out = []
     for elimination in eliminations:
         waiting = list(zip(*elimination, strict=True))
         while waiting:
-            systems, waiting = _apart(waiting, touches, couples, row_left)
+            systems, waiting = _apart(waiting, touched_by, couples, row_left)
             for q, e in systems:
                 row_left[q] = column_left[e] = False
             found = []
             for q, e in systems:
-                t = np.flatnonzero(touches[:, e].any(axis=1) & row_left)
+                t = np.flatnonzero(touched_by[e].any(axis=0) & row_left)
                 c = np.flatnonzero(touches[q].any(axis=0) & column_left)
                 more = couples[e].any(axis=0) & column_left
                 more[c] = False
                 u = np.concatenate([c, np.flatnonzero(more)])
-                touches[np.ix_(t, c)] = touches[np.ix_(t, e)] = True
-                touches[np.ix_(q, e)] = couples[np.ix_(e, e)] = True
-                couples[np.ix_(c, u)] = couples[np.ix_(u, c)] = True
+                for rows, columns in ((t, c), (t, e), (q, e)):
+                    touches[rows[:, None], columns] = touched_by[columns[:, None], rows] = True
+                couples[e[:, None], e] = couples[c[:, None], u] = couples[u[:, None], c] = True
                 found.append(Touched(q, e, t, c, u))
             out.append(found)
     return out
@@ -68,12 +69,12 @@ def fill(touches: Any, couples: Any, eliminations: Sequence[Elimination]) -> lis
 _Systems = list[tuple[Index, Index]]  # rows and variables of each
 
 
-def _apart(systems: _Systems, touches: Any, couples: Any, row_left: Any) -> tuple[_Systems, _Systems]:
+def _apart(systems: _Systems, touched_by: Any, couples: Any, row_left: Any) -> tuple[_Systems, _Systems]:
     """Those of these systems that nothing ties to one before them, and the others."""
-    rows, variables = np.zeros(touches.shape[0], dtype=bool), np.zeros(touches.shape[1], dtype=bool)
+    rows, variables = np.zeros(touched_by.shape[1], dtype=bool), np.zeros(touched_by.shape[0], dtype=bool)
     now, later = _Systems(), _Systems()
     for q, e in systems:
-        touched = touches[:, e].any(axis=1) & row_left
+        touched = touched_by[e].any(axis=0) & row_left
         if (rows & touched).any() or couples[e][:, variables].any():
             later.append((q, e))
             continue
@@ -83,23 +84,39 @@ def _apart(systems: _Systems, touches: Any, couples: Any, row_left: Any) -> tupl
     return now, later
 
 
-_Rows = tuple[Index, Index, Places]
+class Alike(NamedTuple):
+    """Groups of rows, each of which touches the same columns, as many as those of the other groups.
+
+    columns (g, p) : of each group; counts (g,) : its rows; rows (k,) : of one group after the other; values
+    (k, p) : where their numbers stand in the data.
+    """
+
+    columns: Index
+    counts: Index
+    rows: Index
+    values: Places
 
 
-def by_pattern(jacobian: Matrix, rows: Index) -> list[_Rows]:
-    """Columns, rows that touch just them, and where their values (rows, columns) stand in the data, csc."""
+def by_pattern(jacobian: Matrix, rows: Index) -> list[Alike]:
+    """All of these rows that touch any column; the data are those of a csc."""
     numbered = sp.csc_array((np.arange(jacobian.nnz), jacobian.indices, jacobian.indptr), jacobian.shape)
     by_rows = numbered.tocsr()
     by_rows.sort_indices()
     start, columns, at = by_rows.indptr, by_rows.indices, by_rows.data.astype(np.int32)
-    found: dict[bytes, list[int]] = {}
-    for i in rows:
-        found.setdefault(columns[start[i] : start[i + 1]].tobytes(), []).append(i)
-    found.pop(b"", None)
+    touched, ends = columns.tobytes(), (columns.itemsize * start).tolist()
+    groups: dict[bytes, int] = {}
+    group = np.array([groups.setdefault(touched[ends[i] : ends[i + 1]], len(groups)) for i in rows.tolist()])
+    if not group.size:
+        return []
+    first, counts = np.unique(group, return_index=True, return_counts=True)[1:]
+    sizes = (start[1:] - start[:-1])[rows[first]]
+    order = np.argsort(group, kind="stable")
+    size_of = sizes[group[order]]
     out = []
-    for key, numbers in found.items():
-        own, same = np.frombuffer(key, dtype=columns.dtype).astype(np.intp), np.array(numbers)
-        out.append((own, same, at[start[same][:, None] + np.arange(own.size)]))
+    for p in dict.fromkeys(sizes[sizes > 0].tolist()):
+        chosen, same, every = np.flatnonzero(sizes == p), rows[order[size_of == p]], np.arange(p)
+        own = columns[start[rows[first[chosen]]][:, None] + every].astype(np.intp)
+        out.append(Alike(own, counts[chosen], same, at[start[same][:, None] + every]))
     return out
 
 
@@ -109,29 +126,23 @@ def entries(matrix: Any) -> tuple[Index, Index]:
 
 
 def numbered(i: Index, j: Index, shape: tuple[int, ...]) -> tuple[Places, int]:
-    """Places of the entries (i, j), counted from 0, in a matrix; the others have the number of all."""
-    out = np.full(shape, i.size, dtype=np.int32)
-    out[i, j] = np.arange(i.size)
+    """Places of the entries (i, j) in a matrix, counted from 1; the others have 0. And how many there are."""
+    out = np.zeros(shape, dtype=np.int32)
+    out[i, j] = np.arange(1, i.size + 1)
     return out, i.size
 
 
 _lower = functools.cache(np.tril_indices)
 
 
-def alike(groups: Sequence[_Rows]) -> list[tuple[Index, list[_Rows]]]:
-    """All columns (group, column) of those groups that have as many as each other, and these groups."""
-    sizes: dict[int, list[_Rows]] = {}
-    for group in groups:
-        sizes.setdefault(group[0].size, []).append(group)
-    return [(np.array([columns for columns, _, _ in same]), same) for same in sizes.values()]
-
-
-def products(pairs: Places, columns: Index, groups: list[_Rows]) -> list[Products]:
-    i, j = _lower(columns.shape[1])
-    return [
-        Products(rows=rows.astype(np.int32), values=values, to=to)
-        for (_, rows, values), to in zip(groups, pairs[columns[:, i], columns[:, j]], strict=True)
-    ]
+def products(pairs: Places, groups: Sequence[Alike]) -> list[Products]:
+    """Where products of each row's numbers belong; pairs : places of the entries of W, as of `numbered`."""
+    out = []
+    for columns, counts, rows, values in groups:
+        i, j = _lower(columns.shape[1])
+        to = pairs[columns[:, i], columns[:, j]]
+        out.append(Products(counts=counts, rows=rows.astype(np.int32), values=values, to=to))
+    return out
 
 
 def shapes(systems: list[Touched]) -> list[list[Touched]]:

@@ -46,7 +46,8 @@ class Point:
     @cached_property
     def jacobian(self) -> Matrix:
         """dg/dx, csc_array (m, n)."""
-        return sp.csc_array(self.program.jacobian(self.x))
+        found = self.program.jacobian(self.x)
+        return found if isinstance(found, sp.csc_array) else sp.csc_array(found)
 
     @cached_property
     def row_norms(self) -> Vector:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from impactopt.solvers.program import Callback, NonlinearProgram, Status, Vector
@@ -13,7 +14,10 @@ from impactopt.solvers.sqp.report import Report
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
-    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds."""
+    """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
+
+    leave : as of `solve_sqp`.
+    """
 
     program: NonlinearProgram
     options: SQPOptions
@@ -21,6 +25,7 @@ class Task:
     x: Vector
     y: Vector
     z: Vector
+    leave: Callable[[Vector], bool] | None
 
 
 class Run(ABC):

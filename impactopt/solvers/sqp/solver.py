@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from impactopt.errors import check_array
-from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, check_program
+from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Vector, check_program
 from impactopt.solvers.sqp.interior import InteriorRun
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.reduced import ReducedRun
 from impactopt.solvers.sqp.run import Run, Task
 from impactopt.solvers.sqp.sl1qp import Sl1QPRun
+from impactopt.solvers.threads import threads
 
 
 def solve_sqp(
@@ -23,6 +25,7 @@ def solve_sqp(
     callback: Callback | None = None,
     multipliers: npt.ArrayLike | None = None,
     bound_multipliers: npt.ArrayLike | None = None,
+    leave: Callable[[Vector], bool] | None = None,
 ) -> SolverResult:
     """Solve a nonlinear program by sequential quadratic programming.
 
@@ -33,6 +36,8 @@ def solve_sqp(
     options : see `SQPOptions`.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
     multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
+    leave : asked with the iterate (n,), each time that the interior-point method lets its barrier fall near
+        the end: whether it is as good as the optimum for what it is for. Then the status is `ACCEPTABLE`.
 
     Returns
     -------
@@ -51,13 +56,12 @@ def solve_sqp(
     )
     x0 = np.clip(x0, program.x_lower, program.x_upper)
     options = options or SQPOptions()
-    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z)
+    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z, leave=leave)
     interior = options.qp_solver == "interior"
     determined = getattr(program, "determined", ())
     reduced = ReducedRun(task, determined) if determined and not interior else None
     run: Run = reduced or (InteriorRun if interior else Sl1QPRun)(task)
-    # its matrices are small: a second thread of the BLAS only waits, and takes the processor meanwhile
-    with threadpool_limits(limits=1 if interior or determined else None, user_api="blas"):
+    with threads().limit(limits=1 if interior or determined else None, user_api="blas"):
         try:
             status = run.iterate()
         except KeyboardInterrupt:

@@ -1,7 +1,7 @@
 /* The small dense algebra of condensed Newton systems; kernels.py says what each function is for.
 
    Matrices lie by columns, as BLAS and LAPACK want them: an array (k, a, b) of NumPy's is k matrices of b rows
-   and a columns. Places of what is not there point to one number behind the others, which is zero. */
+   and a columns. Places of what is not there point to the number in front of all others, which is zero. */
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>

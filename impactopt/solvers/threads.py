@@ -1,0 +1,13 @@
+"""The threads of BLAS, which small matrices do not need: a second one only waits, and takes the processor."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from threadpoolctl import ThreadpoolController
+
+
+@cache
+def threads() -> ThreadpoolController:
+    """Of the libraries that are loaded: to look for them takes as long as a QP."""
+    return ThreadpoolController()

@@ -49,6 +49,11 @@ class Point:
         return sp.csc_array(self.program.jacobian(self.x))
 
     @cached_property
+    def rows(self) -> Matrix:
+        """dg/dx by rows, csr_array (m, n)."""
+        return self.jacobian.tocsr()
+
+    @cached_property
     def row_norms(self) -> Vector:
         """Euclidean norms of the rows of the Jacobian (m,); 1 for zero rows."""
         norms = np.sqrt(np.asarray(self.jacobian.multiply(self.jacobian).sum(axis=1)).ravel())

@@ -51,7 +51,10 @@ AGAIN = 3  # from the start, with all rows that are known by then
 BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.03, 1e-2, 1e-3
 # where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
 ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
-ROUGHLY_LEARNED = {"kkt_tolerance": 0.1, "violation_tolerance": 1e-3}  # of quasi-Newton steps, which end slowly
+ROUGHLY_LEARNED = {
+    "kkt_tolerance": 0.1,
+    "violation_tolerance": 1e-3,
+}  # of quasi-Newton steps, which end slowly
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
 METHODS = {"collocation": StrikeTranscription, "shooting": ShootingStrike}

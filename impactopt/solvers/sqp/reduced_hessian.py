@@ -21,6 +21,7 @@ _FLOOR = 1e-5  # least eigenvalue
 _ACTIVE = (0.0, 10.0, 1e2, 1e3, 1e4)
 _LEARNED = 1e-3  # least eigenvalue of what BFGS has learned
 _FIRST = 1e-2  # curvature that BFGS begins with
+_STEEPEST = 1e4  # that it learns
 _SHIFT = 1e-4  # least of a sparse Hessian that is not convex
 _STEEP = 0.1  # curvature where only the violation counts
 Active = Callable[[], Matrix]
@@ -122,8 +123,8 @@ class BFGSModel:
         return ReducedModel(B, point.gradient, reduction.T, of_start)
 
     def _update(self, point: Point, y: Vector) -> None:
-        """With multipliers that are the same at both points: of rows, and of equalities that determine nothing,
-        whose curvature steps have to follow. What the others determine is in the gradients."""
+        """With multipliers that are the same at both points: of rows, and of equalities that determine
+        nothing, which steps have to follow as they bend. What the others determine is in the gradients."""
         assert self._last is not None
         before, basis = self._last
         reduction = self._reduction
@@ -138,6 +139,8 @@ class BFGSModel:
             return
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
+        if float(r @ r) > _STEEPEST * float(step @ r):
+            return  # a kink between the two points, and no curvature
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
 
 

@@ -52,6 +52,10 @@ AGAIN = 3  # from the start, with all rows that are known by then
 BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.03, 1e-2, 1e-3
 # where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
 ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
+ROUGHLY_LEARNED = {
+    "kkt_tolerance": 0.1,
+    "violation_tolerance": 1e-3,
+}  # of quasi-Newton steps, which end slowly
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
 METHODS = {"collocation": StrikeTranscription, "shooting": ShootingStrike}
@@ -275,12 +279,13 @@ def _round_by_round(
     """A program with its first rows between bodies, and then with those that its solutions lack, which
     ``known`` gets too.
 
-    The interior-point method goes a part of the way only, as long as there will be more rows.
+    The interior-point method and quasi-Newton steps go a part of the way only, as long as there will be more
+    rows.
     """
-    interior = _interior(budget)
-    first = (_roughly(budget) if interior else budget).run(t.program, start, BARRIER_DEEP)
+    partly = _interior(budget) or _learns(budget)
+    first = (_roughly(budget) if partly else budget).run(t.program, start, BARRIER_DEEP)
     t, result = _settled(budget, t, first)
-    exact = None if interior else (t, result)  # the last one that is solved to its end; others lead there
+    exact = None if partly else (t, result)  # the last one that is solved to its end; others lead there
     for again in reversed(range(ROUNDS)):
         rough = exact is None or result is not exact[1]
         if not result.status.usable or (budget.left == 0 and not rough):
@@ -292,10 +297,10 @@ def _round_by_round(
         deep = bool(more) and _depth(spots, margins, more) > 0
         known |= more
         finer = t.with_apart({**t.apart_rows, **more}) if more else t
-        roughly = interior and deep and again > 0
+        roughly = partly and deep and again > 0
         solving = _roughly(budget) if roughly else budget
         new = solving.run(finer.program, carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
-        if interior and new.status in _STUCK and budget.left != 0:  # from there, but without multipliers
+        if partly and new.status in _STUCK and budget.left != 0:  # from there, but without multipliers
             roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
         steps, t, result = new.iterations, finer, one_after_the_other(result, new)
         if new.status is Status.INTERRUPTED:
@@ -312,6 +317,11 @@ def _round_by_round(
 def _interior(budget: Budget) -> bool:
     """Whether the solver is the interior-point method."""
     return budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
+
+
+def _learns(budget: Budget) -> bool:
+    """Whether steps are quasi-Newton's, as by shooting."""
+    return (budget.options or {}).get("hessian") == "bfgs"
 
 
 def _clean_strike(
@@ -348,8 +358,8 @@ def _bounded_strike(
 
 def _roughly(budget: Budget) -> Budget:
     """The same, content with what is nearly solved."""
-    given = budget.options or {}
-    return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in ROUGHLY.items()}})
+    given, rough = budget.options or {}, ROUGHLY_LEARNED if _learns(budget) else ROUGHLY
+    return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in rough.items()}})
 
 
 def _depth(spots: Spots, margins: Margins, rows: Iterable[ApartRow]) -> float:

@@ -28,7 +28,7 @@ from impactopt.transcription.rows import Index
 STEPS = 12  # of the horizon
 INSTANTS = STEPS + 1  # at which rows hold: from the first touch on, whose force may be the largest
 FORCE = 100.0  # [N] unit of the peak force among the outputs
-_BEND = 1.0  # [rad/s^2] of differences by the reference's bend, in which the collision is all but linear
+_BEND = 1e-3  # [rad/s^2] of differences by the reference's bend, in which the collision is all but linear
 _HORIZONS = (2e-3, 5e-3, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.4)  # [s]: few, as one is compiled in
 
 
@@ -221,38 +221,45 @@ class Shooting:
         inputs = self._inputs(z, state)
         found = {k: v.copy() for k, v in self._value(**inputs).items()}
         self._jacobian(**inputs)
-        by_bend = self._by_bend(inputs["reference"])
+        by_bend = self._by_bend(inputs["reference"], found)
         ways = np.zeros((nv + nv + nl, self.n_in))  # of q in the basis of v, of v, of the bend
         ways[: c.base, : c.base] = state.slopes[: c.base, ny : ny + c.base]
         ways[c.base + c.independent, np.arange(c.base, ny)] = 1.0
         ways[c.base + c.dependent, 2 * ny + np.arange(nl)] = 1.0
         ways[nv:, : 2 * ny + nl] = state.slopes
+        limit, at = self.robot.torque_limit, self.parts
 
-        def by_z(name: str) -> Array:
-            parts = (
-                self._jacobian.matrix(f"{name}_by_q"),
-                self._jacobian.matrix(f"{name}_by_v"),
-                by_bend[name],
-            )
-            made = np.hstack(parts) @ ways
-            made[:, 2 * ny + nl :] += self._jacobian.matrix(f"{name}_by_feedforward") * limit
-            return np.asarray(made)
+        def by_inputs(name: str) -> Array:
+            """(size, nv + nv + nl + n)"""
+            parts = [self._jacobian.matrix(f"{name}_by_{by}") for by in ("q", "v", "feedforward")]
+            parts[2] = parts[2] * limit
+            return np.hstack([*parts[:2], by_bend[name], parts[2]])
 
-        limit = self.robot.torque_limit
-        out, at = np.zeros((self.n_out, self.n_in)), self.parts
-        out[at["impulse"]], out[at["duration"]] = by_z("impulse"), by_z("duration") / self.horizon
-        out[at["energy"]], out[at["peak"]] = by_z("energy"), by_z("peak_force") / FORCE
-        out[at["torque"]] = by_z("demand") / np.tile(limit, INSTANTS)[:, None]
-        if len(self._cone):
-            wrench = by_z("sole_wrench").reshape(INSTANTS, nl, self.n_in)
-            out[at["cone"]] = (self._cone @ wrench).reshape(-1, self.n_in)
-        speeds, times = by_z("joint_velocity").reshape(INSTANTS, self.n, self.n_in), by_z("time")
+        # what needs few of its rows is taken together before it meets the ways
+        speeds = by_inputs("joint_velocity").reshape(INSTANTS, self.n, -1)
         known = found["joint_velocity"].reshape(INSTANTS, -1)
         way = np.tensordot(_weights(found["time"]), speeds, (0, 0))
-        way += (0.5 * (known[1:] + known[:-1])).T @ np.diff(times, axis=0)
+        way += (0.5 * (known[1:] + known[:-1])).T @ np.diff(by_inputs("time"), axis=0)
+        of_joints = [speeds[-1], way]
+        own = {
+            "impulse": by_inputs("impulse"),
+            "duration": by_inputs("duration") / self.horizon,
+            "energy": by_inputs("energy"),
+            "peak": by_inputs("peak_force") / FORCE,
+            "torque": by_inputs("demand") / np.tile(limit, INSTANTS)[:, None],
+        }
+        if len(self._cone):
+            wrench = by_inputs("sole_wrench").reshape(INSTANTS, nl, -1)
+            own["cone"] = (self._cone @ wrench).reshape(at["cone"].size, -1)
+        every = np.vstack([*own.values(), *of_joints])
+        made = every[:, : len(ways)] @ ways
+        made[:, 2 * ny + nl :] += every[:, len(ways) :]
+        out = np.zeros((self.n_out, self.n_in))
+        out[np.concatenate([at[name] for name in own])] = made[: -2 * self.n]
+        last, way = made[-2 * self.n : -self.n], made[-self.n :]
         _, rates, moved = self._outputs(z, state, found)
-        for name, of_joints, turned in (("rate", speeds[-1], rates), ("y", way, moved)):
-            out[at[name]] = self._of_joints(of_joints - self._as_map_turns(y, legs, turned), state)
+        for name, joints, turned in (("rate", last, rates), ("y", way, moved)):
+            out[at[name]] = self._of_joints(joints - self._as_map_turns(y, legs, turned), state)
         out[at["y"][:, None], np.arange(ny)] += np.eye(ny)
         out[at["legs"]] = way[c.dependent]
         out[at["legs"][:, None], 2 * ny + np.arange(nl)] += np.eye(nl)
@@ -268,16 +275,15 @@ class Shooting:
             out[first, : slopes.shape[1]] = slopes
         return out
 
-    def _by_bend(self, reference: Array) -> dict[str, Array]:
-        """Central differences by the bend of each leg joint: (size, nl) of each output."""
+    def _by_bend(self, reference: Array, found: dict[str, Array]) -> dict[str, Array]:
+        """Differences by the bend of each leg joint: (size, nl) of each output, which are ``found`` there."""
         out = {name: np.zeros((self._value.found[name].size, self.nl)) for name in self._carried}
         for j, joint in enumerate(self.coordinates.dependent):
-            for sign in (1.0, -1.0):
-                bent = reference.copy()
-                bent[joint] += sign * _BEND
-                found = self._value(reference=bent)
-                for name, columns in out.items():
-                    columns[:, j] += sign * found[name] / (2 * _BEND)
+            bent = reference.copy()
+            bent[joint] += _BEND
+            other = self._value(reference=bent)
+            for name, columns in out.items():
+                columns[:, j] = (other[name] - found[name]) / _BEND
         return out
 
 

@@ -92,6 +92,48 @@ def test_a_hessian_that_is_not_convex_is_lifted_and_stays_sparse(monkeypatch: py
     assert_optimal(bent, result)
 
 
+def test_quasi_newton_steps_learn_how_the_equalities_bend() -> None:
+    """The objective is straight, so that all there is to learn is the circle's curvature."""
+    circle = Chain(
+        4,
+        lambda a, b, c, d: a + d,
+        lambda a, b, c, d: [(0, b - a, 0), (0, c - b, 0), (0, a**2 + d**2 - 1, 0)],
+        lower=-3,
+        upper=3,
+    )
+    timed, multiplier = TimedProgram(circle), 50.0
+    angles = (0.40, 0.41)
+    points = [timed.point(np.array([np.cos(x), np.cos(x), np.cos(x), np.sin(x)])) for x in angles]
+    reduction = Reduction(timed, points[0].jacobian, Chain.determined, dense=True)
+    rule, y = make_model(timed, WAYS["bfgs"], reduction), np.array([0.0, 0.0, multiplier])
+    for point in points:
+        reduction.load(point)
+        model = rule.at(point, y, lambda: np.zeros((0, 1)), True)
+    assert model.B.shape == (1, 1)
+    assert model.B[0, 0] == pytest.approx(2 * multiplier, rel=1e-3)
+
+
+def test_a_kink_is_no_curvature_to_learn() -> None:
+    """Where slopes jump between two points that are all but one, quasi-Newton steps keep what they know."""
+    bent = Chain(
+        4,
+        lambda a, b, c, d: c + 0.5 * (a**2 + d**2) + ca.if_else(a > 0.3, 5 * (a - 0.3), 0),
+        lambda a, b, c, d: [(0, b - ca.sin(a), 0), (0, c - b**2 - a, 0)],
+        lower=-3,
+        upper=3,
+    )
+    timed = TimedProgram(bent)
+    points = [
+        timed.point(np.array([a, np.sin(a), np.sin(a) ** 2 + a, 0.5])) for a in (0.3 - 1e-6, 0.3 + 1e-6)
+    ]
+    reduction = Reduction(timed, points[0].jacobian, Chain.determined, dense=True)
+    rule, learned = make_model(timed, WAYS["bfgs"], reduction), []
+    for point in points:
+        reduction.load(point)
+        learned.append(rule.at(point, np.zeros(bent.m), lambda: np.zeros((0, 2)), True).B)
+    np.testing.assert_allclose(learned[1], learned[0], atol=1e-6)
+
+
 def test_iterates_follow_the_curve_of_what_rows_determine() -> None:
     curve = lambda a: 0.3 * a**2  # noqa: E731
 
@@ -161,7 +203,9 @@ def _step(beyond: float, radius: float, monkeypatch: pytest.MonkeyPatch) -> Solv
     reduction = Reduction(program, point.jacobian, Chain.determined)
     reduction.load(point)
     qp = ReducedQP(program, reduction, make_qp_solver("osqp"))
-    model = make_model(program, WAYS["osqp"], reduction).at(point, np.zeros(4), qp.active(point), True)
+    model = make_model(program, WAYS["osqp"], reduction).at(
+        point, np.zeros(4), lambda: qp.active(point), True
+    )
     found = qp.solve(point, model, point.g, radius=radius, price=100.0, time_limit=None)
     assert found is not None
     return found

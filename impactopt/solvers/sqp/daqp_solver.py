@@ -6,12 +6,13 @@ import daqp
 import numpy as np
 
 from impactopt.solvers.program import Vector
-from impactopt.solvers.sqp.answers import finished, no_answer, refusal
+from impactopt.solvers.sqp.answers import answer, finished, no_answer, refusal, split
 from impactopt.solvers.sqp.qp import QPSolution, QPStatus, QuadraticProgram
 
 _SOLVED, _INFEASIBLE, _CONTRADICTION = 1, -1, -6  # exit flags; the last: of equalities
 _EQUALITY = 5  # "sense" of a row: active, and never to leave
 _NONE = 1e30  # DAQP's infinity
+_EXACT = 1e-3  # of the tolerance: an error that needs no refinement
 
 
 class DaqpSolver:
@@ -64,4 +65,9 @@ class DaqpSolver:
             return no_answer(qp, QPStatus.FAILED, iterations)
         unit = np.zeros(m + n)
         unit[first] = info["lam"]
-        return finished(qp, np.array(x), unit, self.tolerance, iterations)
+        x = np.array(x)
+        if (
+            qp.error(x, *split(qp, unit)) <= _EXACT * self.tolerance
+        ):  # its multipliers of other rows are zeros
+            return answer(qp, x, unit, QPStatus.SOLVED, iterations)
+        return finished(qp, x, unit, self.tolerance, iterations)

@@ -50,6 +50,11 @@ class Point:
         return found if isinstance(found, sp.csc_array) else sp.csc_array(found)
 
     @cached_property
+    def rows(self) -> Matrix:
+        """dg/dx by rows, csr_array (m, n)."""
+        return self.jacobian.tocsr()
+
+    @cached_property
     def row_norms(self) -> Vector:
         """Euclidean norms of the rows of the Jacobian (m,); 1 for zero rows."""
         norms = np.sqrt(np.asarray(self.jacobian.multiply(self.jacobian).sum(axis=1)).ravel())

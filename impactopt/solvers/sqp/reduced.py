@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -151,7 +152,8 @@ class ReducedRun(Run):
         while True:
             if self._out_of_time():
                 return Status.TIME_LIMIT
-            model = self._model.at(self.point, self.y, self._qp.active(self.point), self._start is None)
+            held = partial(self._qp.active, self.point)
+            model = self._model.at(self.point, self.y, held, self._start is None)
             solved = self._solve(model, self.point.g)
             if solved is None:
                 self._radius *= _SHORTER
@@ -184,7 +186,7 @@ class ReducedRun(Run):
         length = 1.0
         for attempt in range(_HALVINGS):
             trial = self._back(self.program.point(self._inside(self.point.x + length * solved.d)))
-            verdict = self._judge(trial, length, solved, model)
+            verdict = self._judge(trial, length, solved)
             if verdict is not None:
                 relief = self.point.violation - trial.violation
                 hoped = self.point.violation - solved.linear_violation
@@ -194,7 +196,7 @@ class ReducedRun(Run):
                 again = self._solve(model, bent)
                 if again is not None:
                     other = self._back(self.program.point(self._inside(self.point.x + again.d)))
-                    verdict = self._judge(other, 1.0, solved, model)
+                    verdict = self._judge(other, 1.0, solved)
                     if verdict is not None:
                         return Taken(other, 1.0, verdict, again, ", corrected")
             length *= 0.5
@@ -215,10 +217,13 @@ class ReducedRun(Run):
                 break
         return trial
 
-    def _judge(self, trial: Point, length: float, solved: Solved, model: ReducedModel) -> bool | None:
+    def _judge(self, trial: Point, length: float, solved: Solved) -> bool | None:
         """Whether a point is taken, and then whether for the objective's sake; None: it is not."""
-        if not trial.differentiable:
-            return None
+        verdict = self._verdict(trial, length, solved) if trial.finite else None
+        return verdict if verdict is not None and trial.differentiable else None
+
+    def _verdict(self, trial: Point, length: float, solved: Solved) -> bool | None:
+        """The same of a point where rows are finite, whatever their slopes, which take longer."""
         h, f, before = trial.violation, trial.objective, self.point
         if self._start is not None:
             relief = before.violation - solved.linear_violation
@@ -247,8 +252,8 @@ class ReducedRun(Run):
             kept = [p for p in self._filter if p.violation < pair.violation or p.objective < pair.objective]
             self._filter = [*kept, pair]
         self.point = taken.point
-        if self._start is None:
-            self._take_multipliers(taken.solved)
+        if self._start is None:  # those of the equalities follow when its slopes are there
+            self.y, self.z = taken.solved.y.copy(), taken.solved.z.copy()
         else:
             self.y, self.z = np.zeros_like(self.y), np.zeros_like(self.z)
             beats = all(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,8 +21,10 @@ _FLOOR = 1e-5  # least eigenvalue
 _ACTIVE = (0.0, 10.0, 1e2, 1e3, 1e4)
 _LEARNED = 1e-3  # least eigenvalue of what BFGS has learned
 _FIRST = 1e-2  # curvature that BFGS begins with
+_STEEPEST = 1e4  # that it learns
 _SHIFT = 1e-4  # least of a sparse Hessian that is not convex
 _STEEP = 0.1  # curvature where only the violation counts
+Active = Callable[[], Matrix]
 
 
 @dataclass(frozen=True)
@@ -46,9 +49,9 @@ class ReducedModel:
 class ModelRule(Protocol):
     """Makes the model at a point."""
 
-    def at(self, point: Point, y: Vector, active: Matrix, objective: bool) -> ReducedModel:
-        """Of the Lagrangian with multipliers y (m,); active (a, r): unit rows that hold; objective: whether
-        it counts, or the violation alone."""
+    def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
+        """Of the Lagrangian with multipliers y (m,); active: gives the unit rows (a, r) that hold; objective:
+        whether it counts, or the violation alone."""
         ...
 
     def forget(self) -> None:
@@ -63,7 +66,7 @@ class ExactModel:
         self._program, self._reduction = program, reduction
         self._shift = 0.0
 
-    def at(self, point: Point, y: Vector, active: Matrix, objective: bool) -> ReducedModel:
+    def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
         T = self._reduction.T
         if not objective:
             return _steep(point, T)
@@ -72,8 +75,8 @@ class ExactModel:
         of_start = T.T @ H
         B = of_start @ T
         if self._reduction.sparse:
-            return ReducedModel(self._lifted(0.5 * (B + B.T), active), point.gradient, T, of_start)
-        return ReducedModel(_convex(0.5 * (B + B.T), active), point.gradient, T, of_start)
+            return ReducedModel(self._lifted(0.5 * (B + B.T), active()), point.gradient, T, of_start)
+        return ReducedModel(_convex(0.5 * (B + B.T), active()), point.gradient, T, of_start)
 
     def forget(self) -> None:
         self._shift = 0.0
@@ -103,7 +106,7 @@ class BFGSModel:
         self._B = _FIRST * np.eye(self._reduction.free.size)
         self._last: tuple[Point, np.ndarray] | None = None
 
-    def at(self, point: Point, y: Vector, active: Matrix, objective: bool) -> ReducedModel:
+    def at(self, point: Point, y: Vector, active: Active, objective: bool) -> ReducedModel:
         reduction = self._reduction
         if not objective:
             return _steep(point, reduction.T)
@@ -120,12 +123,13 @@ class BFGSModel:
         return ReducedModel(B, point.gradient, reduction.T, of_start)
 
     def _update(self, point: Point, y: Vector) -> None:
-        """With rows' multipliers that are the same at both points; equalities have none here."""
+        """With multipliers that are the same at both points: of rows, and of equalities that determine
+        nothing, which steps have to follow as they bend. What the others determine is in the gradients."""
         assert self._last is not None
         before, basis = self._last
         reduction = self._reduction
         only = np.zeros_like(y)
-        only[reduction.rows] = y[reduction.rows]
+        only[reduction.rows], only[reduction.left] = y[reduction.rows], y[reduction.left]
         step = (point.x - before.x)[reduction.free]
         change = reduction.gradient(point.gradient + point.jacobian.T @ only)
         change = change - basis.T @ (before.gradient + before.jacobian.T @ only)
@@ -135,6 +139,8 @@ class BFGSModel:
             return
         theta = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
         r = theta * change + (1.0 - theta) * Bs
+        if float(r @ r) > _STEEPEST * float(step @ r):
+            return  # a kink between the two points, and no curvature
         self._B = self._B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(step @ r)
 
 

@@ -86,10 +86,12 @@ class ReducedQP:
         """Unit rows (k, r): those that are not eliminated, then of the bounds."""
         if self._at is not point:
             reduction = self._reduction
-            own, self._norms = reduction.rows_by_free(point.jacobian)
-            own, bounds = sp.diags_array(1.0 / self._norms) @ own, reduction.T[reduction.bounded]
-            self._at = point
-            self._every = sp.vstack([own, bounds], "csr") if reduction.sparse else np.vstack([own, bounds])
+            own, self._norms = reduction.rows_by_free(point)
+            bounds, self._at = reduction.T[reduction.bounded], point
+            if reduction.sparse:
+                self._every = sp.vstack([sp.diags_array(1.0 / self._norms) @ own, bounds], "csr")
+            else:
+                self._every = np.vstack([own / self._norms[:, None], bounds])
         return self._every
 
     def solve(

@@ -56,7 +56,7 @@ class Reduction:
         """jacobian : (m, n) csc, at any point.  dense : never sparse, however many variables are free."""
         equal = program.g_lower == program.g_upper
         self._equations, every = np.flatnonzero(equal), np.ones(int(equal.sum()), dtype=bool)
-        equations = self._of_equations(jacobian)
+        equations = self._of_equations(jacobian.tocsr())
         self._empty = sp.csc_array((program.n, program.n))
         self._key = _key(equations, determined)
         if self._key not in _structures:
@@ -90,8 +90,8 @@ class Reduction:
         ------
         LinAlgError : rows do not determine their variables there.
         """
-        equations = self._of_equations(point.jacobian)
-        self._of_left = point.jacobian.tocsr()[self.left]
+        equations = self._of_equations(point.rows)
+        self._of_left = point.rows[self.left]
         self._condenser.load(equations, self._empty)
         Z = np.zeros((self._n, self.free.size))
         Z[self.free, np.arange(self.free.size)] = 1.0
@@ -109,8 +109,8 @@ class Reduction:
         self._within = Q[:, rank:]
         self.T = Z @ self._within
 
-    def _of_equations(self, jacobian: Matrix) -> Matrix:
-        return jacobian.tocsr()[self._equations].tocsc()
+    def _of_equations(self, rows: Matrix) -> Matrix:
+        return rows[self._equations].tocsc()
 
     def normal(self, g: Vector) -> Vector:
         """The step (n,) that meets the linearized equalities, as well as they can be, whose values are g
@@ -143,12 +143,12 @@ class Reduction:
         """(n, f) what all variables do with each of the free ones."""
         return self._Z
 
-    def rows_by_free(self, jacobian: Matrix) -> tuple[Any, Vector]:
+    def rows_by_free(self, point: Point) -> tuple[Any, Vector]:
         """`rows` along the columns of `T` (k, r), and their norms (k,) by the free variables: what a row
         changes with these, those that they determine with them. Its gradient by all variables may be
         thousands of times as long. 1 for rows that nothing changes.
         """
-        own = jacobian.tocsr()[self.rows]
+        own = point.rows[self.rows]
         by_free = own @ self._Z
         norms, whole = _norms(by_free), _norms(own)
         norms = np.maximum(norms, _SHORT * whole)

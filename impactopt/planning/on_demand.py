@@ -16,7 +16,7 @@ from impactopt.contact.fields import snake_case
 from impactopt.errors import InputError
 from impactopt.planning.changes import changed
 from impactopt.planning.gears import gears_beyond
-from impactopt.planning.multistart import carried, one_after_the_other
+from impactopt.planning.multistart import carried, one_after_the_other, rank_of, with_effort_of
 from impactopt.planning.sliding import slides_beyond
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import ON_DEMAND_TERMS, GearLoad, Slide, Term
@@ -82,8 +82,11 @@ def kept_on_demand(
             x0 = start.x if isinstance(start, SolverResult) else start
             cold = program_for(origin.with_apart({}), bounded, report)
             none = np.zeros(origin.program.m), np.zeros(origin.layout.n)
-            again = solve(cold, carried_over(cold, origin, x0, *none)[0])
-            found, new = again[0], one_after_the_other(new, again[1])
+            again, last = solve(cold, carried_over(cold, origin, x0, *none)[0])
+            both = one_after_the_other(new, last)
+            # where neither is a solution, the one that is less off its rows says more
+            kept = last.status is not Status.INTERRUPTED and rank_of(new) < rank_of(last)
+            found, new = (found, with_effort_of(new, both)) if kept else (again, both)
         if not new.status.usable and new.status is not Status.INTERRUPTED:
             without = ", ".join(f"[terms.{name}]" for name in broken)
             new = replace(new, message=f"{new.message} Without {without} there is a plan, but {said}.")

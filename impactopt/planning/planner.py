@@ -18,6 +18,7 @@ from impactopt.planning.made_again import planned_by, program_of
 from impactopt.planning.models import carried_start, climbed
 from impactopt.planning.multistart import (
     EFFORT,
+    VIOLATED,
     Budget,
     Starts,
     attempt_of,
@@ -33,7 +34,7 @@ from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import Callback, SolverResult
+from impactopt.solvers.program import Callback, SolverResult, max_violation
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
@@ -45,6 +46,7 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
+_PUSH = 1e-6  # into its bounds, of a start that is a solution
 _MORE = 2  # starts, where all that were asked for end with bodies in each other
 
 
@@ -145,6 +147,8 @@ def _planned(
         given = carried_start(t, partial(program_of, start), start, apart)
     if not isinstance(given, str):
         check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
+    if isinstance(given, SolverResult):
+        budget = _near_by(budget, t, given)
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
@@ -164,6 +168,16 @@ def _planned(
         **planned_by(t, result),
         **fields,
     )
+
+
+def _near_by(budget: Budget, t: Transcription, start: SolverResult) -> Budget:
+    """One whose solver does not move a start that meets its rows off its bounds: it may be the optimum, and
+    what is moved may come to another one.
+    """
+    meets = max_violation(t.program, start.x, t.program.constraints(start.x)) <= VIOLATED
+    if budget.solver != "sqp" or not meets:
+        return budget
+    return replace(budget, options={"push": _PUSH, **(budget.options or {})})
 
 
 def _led(

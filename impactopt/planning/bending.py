@@ -29,8 +29,7 @@ __all__ = ["moved_solution"]
 Array = NDArray[np.float64]
 _FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
-# where the solver goes on from a first-order plan, and how far it moves it inside its bounds: it is as near
-_BARRIER, _PUSH = 1e-7, 1e-6
+_BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
 
 
 def moved_solution(
@@ -62,8 +61,7 @@ def moved_solution(
     old = solution.result
     # a first-order plan that is far off its rows is a worse start than the plan itself
     if near := first.status.usable:
-        near_by = replace(budget, options={"push": _PUSH, **(options or {})})
-        result = near_by.run(t.program, first, _BARRIER)
+        result = budget.near_by().run(t.program, first, _BARRIER)
     else:
         result = budget.run(t.program, old)
     stopped = result.status is Status.INTERRUPTED

@@ -23,7 +23,7 @@ __all__ = ["ChosenGains", "roomy", "settled", "with_chosen", "with_factors_of"]
 
 Array = NDArray[np.float64]
 Program = TypeVar("Program", Transcription, StrikeTranscription)
-_BARRIER, _PUSH = 1e-7, 1e-6  # of the settled program, and into its bounds: its start is a solution
+_BARRIER = 1e-7  # of the settled program, whose start is a solution
 _AT_BOUND = 1e-3  # of a factor's logarithm
 
 
@@ -138,8 +138,7 @@ def settled(
     new = program_for(t, problem, None)
     result = _in_torques_of(new, t.robot, carried(new, t, old))
     if old.status.usable and budget.left != 0:
-        near = {"push": _PUSH, **(budget.options or {})} if budget.solver == "sqp" else budget.options
-        polished = replace(budget, options=near).run(new.program, result, _BARRIER)
+        polished = budget.near_by().run(new.program, result, _BARRIER)
         if polished.status.usable:
             result = one_after_the_other(old, polished)
     return new, {

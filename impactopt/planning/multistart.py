@@ -26,6 +26,7 @@ SOLVERS = ("sqp", "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
+_PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
 
 
@@ -100,6 +101,14 @@ class Budget:
     def started(self) -> Budget:
         """The same with all its time, which begins now."""
         return replace(self, since=time.perf_counter())
+
+    def near_by(self) -> Budget:
+        """The same, whose solver hardly moves a start off its bounds: it is a solution, or next to one, and
+        what is moved may come to another.
+        """
+        return (
+            replace(self, options={"push": _PUSH, **(self.options or {})}) if self.solver == "sqp" else self
+        )
 
     @property
     def left(self) -> float | None:

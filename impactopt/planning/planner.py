@@ -46,7 +46,6 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 STARTS = ("reach", "strike")
-_PUSH = 1e-6  # into its bounds, of a start that is a solution
 _MORE = 2  # starts, where all that were asked for end with bodies in each other
 
 
@@ -147,8 +146,8 @@ def _planned(
         given = carried_start(t, partial(program_of, start), start, apart)
     if not isinstance(given, str):
         check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
-    if isinstance(given, SolverResult):
-        budget = _near_by(budget, t, given)
+    if isinstance(given, SolverResult) and _meets_rows(t, given):
+        budget = budget.near_by()  # the start may be the optimum
     if report is not None:
         report(f"program of {t.program.n} variables and {t.program.m} rows; {budget.solver} starts")
     margins = Margins(problem) if problem.keeps_apart else None
@@ -170,14 +169,8 @@ def _planned(
     )
 
 
-def _near_by(budget: Budget, t: Transcription, start: SolverResult) -> Budget:
-    """One whose solver does not move a start that meets its rows off its bounds: it may be the optimum, and
-    what is moved may come to another one.
-    """
-    meets = max_violation(t.program, start.x, t.program.constraints(start.x)) <= VIOLATED
-    if budget.solver != "sqp" or not meets:
-        return budget
-    return replace(budget, options={"push": _PUSH, **(budget.options or {})})
+def _meets_rows(t: Transcription, start: SolverResult) -> bool:
+    return max_violation(t.program, start.x, t.program.constraints(start.x)) <= VIOLATED
 
 
 def _led(

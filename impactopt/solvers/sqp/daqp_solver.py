@@ -66,8 +66,7 @@ class DaqpSolver:
         unit = np.zeros(m + n)
         unit[first] = info["lam"]
         x = np.array(x)
-        if (
-            qp.error(x, *split(qp, unit)) <= _EXACT * self.tolerance
-        ):  # its multipliers of other rows are zeros
+        # its multipliers of rows that do not hold are zeros
+        if qp.error(x, *split(qp, unit)) <= _EXACT * self.tolerance:
             return answer(qp, x, unit, QPStatus.SOLVED, iterations)
         return finished(qp, x, unit, self.tolerance, iterations)

@@ -57,7 +57,11 @@ def moved_solution(
     if not polish:
         return _solution(solution, t, first, (built - began, time.perf_counter() - built))
     margins = Margins(problem) if problem.keeps_apart else None
-    refining = Refining(budget, margins, solution.apart, None)
+    refining = Refining(budget, margins, solution.apart, None, mesh=refine)
+
+    def mended(t: Transcription, result: SolverResult, x0: Array) -> tuple[Transcription, SolverResult]:
+        return refining.judged(*refining.rounds(t, result, x0)[:2])
+
     old = solution.result
     # a first-order plan that is far off its rows is a worse start than the plan itself
     if near := first.status.usable:
@@ -67,16 +71,15 @@ def moved_solution(
     stopped = result.status is Status.INTERRUPTED
     if near and not (result.status.usable or stopped) and budget.left != 0:
         result = one_after_the_other(result, budget.run(t.program, old))
-    if refine:
-        t, result, _ = refining.rounds(t, result, old.x)
-    t, result = refining.judged(t, result)
+    t, result = mended(t, result, old.x)
 
     # new rows are farther off than what a tolerance for small moves makes up for
     given = {name: value for name, value in (options or {}).items() if not name.endswith("_tolerance")}
     exact = replace(budget, options=given)
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
-        return refining.judged(other, exact.run(other.program, start))
+        x0 = start.x if isinstance(start, SolverResult) else start
+        return mended(other, exact.run(other.program, start), x0)
 
     t, result = kept_on_demand(t, result, (t, old), solve, lambda *_: ())
     return _solution(solution, t, result, (built - began, time.perf_counter() - built))

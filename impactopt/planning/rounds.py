@@ -75,6 +75,8 @@ class Refining:
     has them. Where its solution brings other bodies into each other, leaves its limits between nodes, or has
     a contact that is too coarse, it gets more of them there and is solved again: from where it is; or, where
     limbs are through each other, from the start.
+
+    mesh : whether it may get finer; False: rows are added, and only while bodies are in each other.
     """
 
     def __init__(
@@ -83,8 +85,11 @@ class Refining:
         margins: Margins | None,
         rows: Mapping[ApartRow, Held],
         report: Callable[[str], None] | None,
+        *,
+        mesh: bool = True,
     ) -> None:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
+        self.mesh = mesh
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
         self._near: tuple[Transcription, Array, Violated | None] | None = None
         self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
@@ -180,12 +185,14 @@ class Refining:
         round.
         """
         found: list[tuple[Transcription, str, SolverResult]] = []
-        self._tried, self._refined, self._apart = frozenset(), 0, None
+        self._tried, self._apart = frozenset(), None
+        self._refined = 0 if self.mesh else _NODE_ROUNDS
         while result.status.usable and self.budget.left != 0:
             if self.margins is None and len(found) == _NODE_ROUNDS:
                 break
             following = self._next(t, result, x0, len(found))
-            if following is None or len(found) >= (_ROUNDS if self._is_apart(result) else _MOST):
+            most = _MOST if not self._is_apart(result) else _ROUNDS if self.mesh else 0
+            if following is None or len(found) >= most:
                 break
             if self.report is not None:
                 self.report(following.why)

@@ -207,7 +207,8 @@ class Solution(Solved):
         ``damping`` of the contact (the law's units), or ``margin`` of the centres of pressure [m].
 
         First come quadratic programs about this plan, which find rows that begin and cease to hold; then the
-        solver goes on from there, with this plan's mesh. ``polish=False``: the first alone. They are quick
+        solver goes on from there, with this plan's mesh, and with new rows where bodies come into each other
+        that have none. ``polish=False``: the first alone. They are quick
         and within a thousandth of the rows where status says "acceptable"; other plans of theirs are none.
         ``refine=True`` refines the mesh too, as `impactopt.solve` does. ``callback``, ``options`` and
         ``time_limit`` are those of `impactopt.solve`.

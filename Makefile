@@ -71,7 +71,7 @@ types: $(STAMP) ## check types with mypy
 format: $(STAMP) ## rewrite the sources in the project's style
 	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
-bench: $(STAMP) ## run every benchmark, some minutes; tables, JSON and pictures in results/bench
+bench: $(STAMP) ## run every benchmark, about an hour; tables, JSON and pictures in results/bench
 	@$(BIN)/impactopt bench all --out results/bench $(ARGS)
 
 attack: $(STAMP) ## attack it at length: files, URDFs, commands, calls, collisions (ARGS='--seed 7'); faults in results/attack

@@ -23,7 +23,10 @@ def identify(
     ],
     law: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="A contact law, as problem files call it; may be repeated; all."),
+        typer.Option(
+            metavar="NAME",
+            help="A contact law, as problem files call it; may be repeated. Left out: all of them.",
+        ),
     ] = None,
     target_mass: Annotated[
         float | None,
@@ -39,7 +42,12 @@ def identify(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Write [contact] of the law that fits best there."),
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Write the law that fits best there, as a section for a problem file.",
+        ),
     ] = None,
     as_json: AsJson = False,
     verbose: Verbose = False,

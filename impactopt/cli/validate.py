@@ -45,7 +45,7 @@ def validate(
     ] = None,
     controller: Annotated[
         Controller,
-        typer.Option(help="servo: of the joints; wbc: whole-body controller, as in the file's [controller]."),
+        typer.Option(help="servo: of the joints; wbc: whole-body controller, set as the problem file says."),
     ] = Controller.servo,
     settings: Settings = None,
     as_json: AsJson = False,

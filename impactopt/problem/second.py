@@ -22,9 +22,9 @@ Array = NDArray[np.float64]
 class SecondStriker:
     """Another hand that meets the target, at a point of its own.
 
-    Both touch at one instant, are fastest in at one instant, and leave at one instant; each has the contact
-    law to itself, and the target feels the sum. The target moves along the normal and does not turn: a door
-    on rails, a box that is guided, or one that the two forces leave straight.
+    Both hands touch at the same instant, are deepest in at the same instant, and leave at the same instant.
+    Each has the contact law to itself. The target feels the sum of both forces. It moves along the normal and
+    does not turn: a door on rails, a box that is guided, or one that the two forces leave straight.
 
     Attributes
     ----------

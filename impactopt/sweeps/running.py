@@ -184,7 +184,7 @@ def _read(source: Sweep | Mapping[str, Any] | str | os.PathLike[str]) -> Sweep:
 def _compile(chosen: Sweep, problem: ImpactProblem, work: Work, tell: Callable[[str], None]) -> None:
     """Build functions here, so that it is done once, and said; workers find them on disk."""
     if chosen.case_kind == "collision":
-        tell("building the collision (compiles for a minute the first time)")
+        tell("building the collision (compiles the first time)")
         evaluate(work, Unit(index=0, first=0, count=1, columns=chosen.design.columns(0, 1)))
     else:
         block_functions(problem, problem.coordinates, tell)

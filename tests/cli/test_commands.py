@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.fake_solution import strike_record
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import impactopt
@@ -231,6 +232,15 @@ def test_every_command_has_examples_that_name_its_options() -> None:
         assert "Examples:" in shown and examples, command
         for option in re.findall(r" (--[\w-]+)", " ".join(examples)):
             assert option in shown.split("Examples:")[0], (command, option)
+
+
+def test_no_help_has_brackets_which_are_taken_for_markup() -> None:
+    commands = [get_command(app)]
+    while commands:
+        command = commands.pop()
+        commands += getattr(command, "commands", {}).values()
+        texts = [command.help, *(getattr(parameter, "help", "") for parameter in command.params)]
+        assert not [text for text in texts if text and "[" in text], command.name
 
 
 def test_help_and_completion_load_nothing_heavy() -> None:

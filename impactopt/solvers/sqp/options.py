@@ -26,11 +26,13 @@ class SQPOptions:
     complementarity_tolerance : of "interior", largest product of a multiplier and the distance to its bound
         at a solution. The objective's error is at most this times the number of active bounds.
     acceptable_tolerance : tolerance in place of kkt_tolerance for the status ACCEPTABLE, if no step helps.
-    max_iterations, time_limit [s] : limits; the best iterate is returned.
-    radius, radius_max : with QP solvers, first and largest radius of the trust region |d|_inf <= radius.
-    price, price_max : first and largest price of violations: with QP solvers in the merit function
-        f + price * sum of violations, with "interior" in its elastic phase. It rises by itself. If the first
-        is too low, more iterations are needed; if the largest is too low, the end may be infeasible.
+    max_iterations : most iterations; then the best iterate is returned.
+    time_limit : [s]; then the best iterate is returned.
+    radius : with QP solvers, first radius of the trust region |d|_inf <= radius.
+    radius_max : with QP solvers, its largest radius.
+    price : first price of violations: with QP solvers in the merit function f + price * sum of violations,
+        with "interior" in its elastic phase. It rises by itself; if it is too low, it takes more iterations.
+    price_max : largest price of violations. If it is too low, the end may be infeasible.
     levenberg : with QP solvers, multiple of the identity that is always added to the Hessian. It rises by
         itself where the QP solver has difficulties.
     augmentation : with QP solvers, weight of the active rows (in multiples of the Hessian's norm) in making
@@ -38,14 +40,14 @@ class SQPOptions:
     curvature_floor : with QP solvers, least eigenvalue, in multiples of the Hessian's norm, after making it
         convex.
     dense_limit : with QP solvers, most variables for which matrices are treated as dense: the Hessian made
-        convex by its eigenvalues rather than by a shift, QPs solved by the dense active-set method.
+        convex by its eigenvalues rather than by a shift, QPs solved by the dense active-set method. Like
+        levenberg, augmentation and curvature_floor it is for programs that do not say which variables their
+        rows determine, such as textbook problems. Plans and strikes say so.
     second_order_correction : whether a refused step is corrected for the curvature of the rows.
-    barrier, barrier_warm : of "interior", first barrier parameter, of starts without and with multipliers.
-        The latter, if below 5e-3, falls at once where the start is near a solution.
+    barrier : of "interior", first barrier parameter of a start without multipliers.
+    barrier_warm : the same of a start with multipliers. Below 5e-3 it falls at once where the start is near a
+        solution.
     push : of "interior", how far the start is moved inside its bounds.
-
-    With QP solvers, levenberg, augmentation, curvature_floor and dense_limit are for programs that do not say
-    which variables their rows determine, such as textbook problems. Plans and strikes say so.
     """
 
     qp_solver: str = "interior"

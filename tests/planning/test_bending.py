@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from impactopt.files.problem_file import load_problem
 from impactopt.planning.bent_program import bent_of
 from impactopt.planning.changes import changed, parameter_of
 from impactopt.planning.made_again import program_on
+from impactopt.planning.multistart import Budget
 from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.objectives import Impulse
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.terms import GearLoad, HitRegion, Slide, TargetSpeed
-from impactopt.solvers.program import Status
+from impactopt.solvers.program import SolverResult, Status
 
 TIGHT: dict[str, Any] = {"kkt_tolerance": 1e-8, "complementarity_tolerance": 1e-8}
 
@@ -86,6 +88,28 @@ def test_a_bent_plan_is_that_of_the_changed_problem(arm: Solution, changes: dict
     assert abs(first.impulse / bent.impulse - 1) < 1e-3
     assert first.status is Status.ACCEPTABLE and first.result.max_violation <= 1e-3
     assert first.result.iterations <= 5 and "first order" in first.result.message
+
+
+@pytest.mark.parametrize("failing", [0, 1, 2])
+def test_where_one_start_leads_nowhere_the_next_does(
+    arm: Solution, failing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the first-order plan, from the plan with a high barrier, from the plan with a low one."""
+    own, done = Budget.run, list[SolverResult]()
+
+    def run(self: Budget, *given: Any) -> SolverResult:
+        found = own(self, *given)
+        done.append(found)
+        lost = replace(found, status=Status.ITERATION_LIMIT, max_violation=0.1)
+        return lost if len(done) <= failing else found
+
+    monkeypatch.setattr(Budget, "run", run)
+    mass = 1.02 * arm.problem.target.parameters["mass"]
+    bent = arm.moved(mass=mass, options=TIGHT)
+    assert bent.status is Status.SOLVED
+    assert len(done) == failing + 1
+    assert bent.result.iterations == sum(result.iterations for result in done)
+    assert bent.impulse == pytest.approx(arm.moved(mass=mass, options=TIGHT).impulse, rel=1e-5)
 
 
 def test_a_program_with_other_numbers_is_that_of_its_problem(arm: Solution) -> None:

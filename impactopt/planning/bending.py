@@ -31,7 +31,7 @@ _FIRST_ORDER = 1e-3  # of rows: a first-order plan that is off by more is none
 _ENOUGH, _CORRECTIONS = 1e-4, 4  # of rows: no more steps; and so many at most beside the first
 _BARRIER = 1e-7  # where the solver goes on from a first-order plan: it is as near
 # First barriers, and most iterations, from the plan itself. With the smaller one the solver keeps to bounds
-# that hold no more, and takes a third longer. In one of 50 shifts either leads nowhere, and the other does not.
+# that hold no more, and takes a third longer. In one of 50 shifts either of them leads nowhere.
 _FROM_PLAN = ((1e-3, 150), (1e-5, None))
 
 

@@ -12,6 +12,7 @@ from impactopt.problem.terms.contact_wrench_cone import ContactWrenchCone
 from impactopt.problem.terms.gaze import Gaze
 from impactopt.problem.terms.gear_load import GearLoad
 from impactopt.problem.terms.grip import Grip
+from impactopt.problem.terms.ground_force import GroundForce
 from impactopt.problem.terms.hand_orientation import HandOrientation
 from impactopt.problem.terms.hit_cone import HitCone
 from impactopt.problem.terms.hit_region import HitRegion
@@ -35,6 +36,7 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     VelocityLimit(),
     PositionLimit(),
     ContactWrenchCone(),
+    GroundForce(),
     Balance(),
     Incidence(),
     LegExtension(),
@@ -69,6 +71,7 @@ __all__ = [
     "Gaze",
     "GearLoad",
     "Grip",
+    "GroundForce",
     "HandOrientation",
     "HitCone",
     "HitRegion",

@@ -16,6 +16,7 @@ from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.keeping_apart import Margins, same_bodies
 from impactopt.planning.made_again import planned_by, program_of
 from impactopt.planning.models import carried_start, climbed
+from impactopt.planning.motion_price import within_price
 from impactopt.planning.multistart import (
     EFFORT,
     VIOLATED,
@@ -178,8 +179,17 @@ def _led(
 ) -> tuple[Transcription, SolverResult]:
     """What comes of a start, with the rows on demand that it needs.  to_its_end : round by round."""
     work = refining.solve if to_its_end else refining.first
-    found, result = work(t, start)
-    return _bounded(refining, found, result, (t, start), to_its_end)
+    found, result = _bounded(refining, *work(t, start), (t, start), to_its_end)
+
+    def again(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
+        own = refining.anew(other)
+        done = _bounded(
+            own, *(own.solve if to_its_end else own.first)(other, start), (other, start), to_its_end
+        )
+        refining.learn(own)
+        return done
+
+    return within_price(found, result, again, refining.report)
 
 
 def _bounded(
@@ -192,7 +202,7 @@ def _bounded(
     """As `kept_on_demand`."""
 
     def solve(other: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
-        own = Refining(refining.budget, refining.margins, other.apart_rows, refining.report)
+        own = refining.anew(other)
         done = own.solve(other, start) if to_its_end else own.first(other, start)
         refining.learn(own)
         return done

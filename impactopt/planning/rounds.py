@@ -103,6 +103,10 @@ class Refining:
             self._known = t, x, contact_error(t, x)
         return self._known[2]
 
+    def anew(self, t: Transcription) -> Refining:
+        """Another one, for a program that has constraints between bodies already."""
+        return Refining(self.budget, self.margins, t.apart_rows, self.report)
+
     def learn(self, other: Refining) -> None:
         """Take over what another has found of the last program that it had."""
         self.blocked, self._known = other.blocked, other._known

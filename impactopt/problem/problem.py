@@ -24,6 +24,7 @@ from impactopt.errors import (
     check_array,
     check_name,
     check_number,
+    did_you_mean,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
@@ -43,6 +44,7 @@ from impactopt.problem.checks import (
 )
 from impactopt.problem.described import described
 from impactopt.problem.hashing import problem_hash
+from impactopt.problem.motion_style import STYLES, MotionPrices, idle_joints
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES, Objective, check_objectives
 from impactopt.problem.phase import Phase
 from impactopt.problem.scenario import Scenario
@@ -107,6 +109,10 @@ class ImpactProblem:
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
         `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
+    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending away
+        from the start posture (`impactopt.problem.motion_style`); or "strongest", without.
+    motion_price : largest share of the objective that the prices of the style may take; they are reduced until
+        they take no more.  price_scale : factor on them, as a plan has reduced them.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
         return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
         they make the optimum unique, and bring the robot back to its start.
@@ -142,6 +148,9 @@ class ImpactProblem:
     obstacles: tuple[Obstacle, ...] = ()
     terms: tuple[Term, ...] = ()
     objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
+    style: str = "natural"
+    motion_price: float = 0.03
+    price_scale: float = 1.0
     smoothness: float = 1e-5
     wrench_price: float = 1e-3
     return_price: float = 0.1
@@ -191,7 +200,10 @@ class ImpactProblem:
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
 
     def _check_prices(self) -> None:
-        for name in ("smoothness", "wrench_price", "return_price"):
+        if self.style not in STYLES:
+            near = did_you_mean(str(self.style), STYLES)
+            raise InputError(f"unknown style {self.style!r}{near}: give {' or '.join(map(repr, STYLES))}")
+        for name in ("smoothness", "wrench_price", "return_price", "motion_price", "price_scale"):
             number = check_number(name, getattr(self, name))
             object.__setattr__(self, name, number)
             if not 0 <= number <= MOST:
@@ -240,6 +252,17 @@ class ImpactProblem:
         self.robot.check_limits(posture, name="the start posture")
         self.robot.check_stance(posture, self.stance.sole_names(self.robot))
         check_at_rest(self.robot, self.coordinates, self.stance.sole_names(self.robot), posture)
+
+    @property
+    def style_prices(self) -> MotionPrices:
+        """The prices of its style, as far as they are reduced."""
+        return STYLES[self.style].scaled(self.price_scale)
+
+    @cached_property
+    def idle_joints(self) -> NDArray[np.bool_]:
+        """Mask (n,) of the joints that move no striker, no sole on the ground and no hand that holds on."""
+        strikers = [self.robot.striker(name).model_frame for name in self.strikers]
+        return idle_joints(self.robot, [*strikers, *(leg.frame for leg in self.coordinates.legs)])
 
     @property
     def lasts(self) -> bool:

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from impactopt.errors import InputError
+from impactopt.problem.motion_style import MotionPrices
 from impactopt.problem.objectives import Objective
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, Group, Layout, stack
@@ -58,6 +60,15 @@ class Prices:
     linear: Array
     constant: float = 0.0
 
+    def __add__(self, other: Prices) -> Prices:
+        return Prices(
+            self.quadratic + other.quadratic, self.linear + other.linear, self.constant + other.constant
+        )
+
+    def evaluate(self, x: Array) -> float:
+        """Their sum [N s] for solver variables (n,)."""
+        return float(x @ (self.quadratic @ x) / 2 + self.linear @ x) + self.constant
+
 
 def assemble(
     layout: Layout, wanted: list[tuple[Objective, Quantity]], prices: Prices
@@ -85,26 +96,50 @@ def wrench_prices(b: Builder, groups: list[tuple[Group, int]]) -> Array:
 def motion_prices(
     b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase], wrenches: list[Group]
 ) -> Prices:
-    """Of the accelerations of motions, of sole wrenches, and of ending away from the start posture.
+    """Small prices of accelerations, of sole wrenches, and of ending away from the start posture.
 
     to_rest : those of the motions that end at rest.  wrenches : the means of these groups.
     """
-    p, n = b.problem, b.layout.n
-    linear, diagonal, constant = np.zeros(n), np.zeros(n), 0.0
-    accelerations: list[Affine] = []
+    p = b.problem
+    prices = MotionPrices(acceleration=p.smoothness, end=p.return_price)
+    of_wrenches = wrench_prices(b, [(group, group.count) for group in wrenches])
+    return _priced(b, prices, motions, to_rest) + Prices(sp.diags_array(of_wrenches), np.zeros(b.layout.n))
+
+
+def style_prices(b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase]) -> Prices:
+    """Prices of the problem's motion style."""
+    return _priced(b, b.problem.style_prices, motions, to_rest)
+
+
+def _priced(
+    b: Builder, prices: MotionPrices, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase]
+) -> Prices:
+    """Integrals by the nodes' shares of a phase; the duration is its typical one, so that all is quadratic."""
+    n, c = b.layout.n, b.coordinates
+    speeds = np.full(b.ny, prices.speed)
+    speeds[c.base :] += prices.idle_speed * b.problem.idle_joints[c.independent]
+    priced: list[Affine] = []
     for motion in motions:
-        typical = float(np.mean(motion.phase.duration))
+        T = float(np.mean(motion.phase.duration))
         for s, length in zip(motion.nodes, np.gradient(motion.nodes), strict=True):
-            weight = p.smoothness * typical * length
-            accelerations.append(motion.at(s)[2] * (np.sqrt(2 * weight) / typical**2))
-    weighted = stack(accelerations)
-    m = weighted.matrix(n)
-    linear += m.T @ weighted.const
-    constant += float(weighted.const @ weighted.const) / 2
-    diagonal += wrench_prices(b, [(group, group.count) for group in wrenches])
-    for motion in to_rest:  # price (y_end - y_start)^2: rest near the start posture
+            _, rate, bend = motion.at(s)
+            if prices.acceleration:
+                priced.append(bend * np.sqrt(2 * prices.acceleration * length / T**3))
+            if speeds.any():
+                priced.append(rate * np.sqrt(2 * speeds * length / T))
+        for s, end in pairwise(motion.breaks) if prices.jerk else ():  # of a cubic it is constant there
+            step = motion.at(float(end))[2] - motion.at(float(s))[2]
+            priced.append(step * np.sqrt(2 * prices.jerk / (T**5 * (end - s))))
+    m = sp.csr_array((0, n))
+    constants = np.zeros(0)
+    if priced:
+        weighted = stack(priced)
+        m, constants = weighted.matrix(n), weighted.const
+    linear, constant = m.T @ constants, float(constants @ constants) / 2
+    diagonal = np.zeros(n)
+    for motion in to_rest:  # price (y_end - y_start)^2
         end = motion.c.index(-1)
-        diagonal[end] += 2 * p.return_price
-        linear[end] -= 2 * p.return_price * b.y0
-        constant += p.return_price * float(b.y0 @ b.y0)
+        diagonal[end] += 2 * prices.end
+        linear[end] -= 2 * prices.end * b.y0
+        constant += prices.end * float(b.y0 @ b.y0)
     return Prices(m.T @ m + sp.diags_array(diagonal), linear, constant)

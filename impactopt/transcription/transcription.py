@@ -36,7 +36,7 @@ from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.nodes import add_nodes
-from impactopt.transcription.objective import Prices, motion_prices
+from impactopt.transcription.objective import Prices, motion_prices, style_prices
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.rows import Index, Place, along, degrees, percent, rates
 from impactopt.transcription.simd import in_lanes
@@ -289,7 +289,9 @@ class Transcription(ContactProgram):
     def _prices(self) -> Prices:
         coasting = [] if self.abort is None else [self.abort.coast_w]
         wrenches = [part.w for part in (self.swing, *self.follows, *self.hit.collisions)]
-        return motion_prices(self.builder, [self.swing, *self.follows], self.follows, [*wrenches, *coasting])
+        motions = [self.swing, *self.follows]
+        self._style = style_prices(self.builder, motions, self.follows)
+        return motion_prices(self.builder, motions, self.follows, [*wrenches, *coasting]) + self._style
 
     def _determined(self) -> list[Determined]:
         found = [*self.swing.determined(), *self.hit.determined()]
@@ -298,6 +300,11 @@ class Transcription(ContactProgram):
         return [*found, determined(Turn.RATE, self.u0.index(0))]
 
     # ------------------------------------------------------------------ solution
+    def style_share(self, x: Array) -> float:
+        """Share of the objectives that the prices of the motion style take, for solver variables (n,)."""
+        worth = sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
+        return self._style.evaluate(x) / abs(worth) if worth else np.inf
+
     def body_states(self, x: Array) -> list[BodyState]:
         plan, found = self.decode(x), self.swing_spots()
         out = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -124,22 +125,36 @@ def _lifted(
 def price_pieces(
     problem: ImpactProblem, robot: RobotMotion, ways: Sequence[Way], blows: Sequence[Blow]
 ) -> list[Piece]:
-    """Small prices of accelerations, of wrenches, and of ending away from the start."""
-    p, out = problem, list[Piece]()
+    """Prices of the motion style, and small ones of accelerations, wrenches and ending away from the start."""
+    p, style, out = problem, problem.style_prices, list[Piece]()
+    moving = np.full(robot.ny, style.speed)
+    moving[robot.base :] += style.idle_speed * p.idle_joints[robot.independent]
     for way in ways:
         typical = float(np.mean(way.phase.duration))
         for s, length in zip(way.nodes, np.gradient(way.nodes), strict=True):
             weight, at = p.smoothness * length / typical**3, way.at(float(s))
+            speeds = moving * length / typical
 
-            def bending(v: Variables, at: Any = at, weight: float = weight) -> Array:
-                return np.array([weight * np.sum(at(v)[2] ** 2)])
+            def bending(v: Variables, at: Any = at, weight: float = weight, speeds: Array = speeds) -> Array:
+                _, rate, bend = at(v)
+                return np.array([weight * np.sum(bend**2) + speeds @ rate**2])
 
             out.append(Piece(bending))
+        for s, end in pairwise(way.breaks) if style.jerk else ():
+            middle, weight = (s + end) / 2, style.jerk * (end - s) / typical**5
+
+            def jerking(
+                v: Variables, way: Way = way, middle: float = middle, weight: float = weight
+            ) -> Array:
+                third = way.curve(v)[2].derivative()(middle)
+                return np.array([weight * np.sum(third**2)])
+
+            out.append(Piece(jerking))
         if not way.swings:
 
             def away(v: Variables, way: Way = way) -> Array:
                 gap = way.control(v, way.phase.intervals + 2) - robot.y0
-                return np.array([p.return_price * np.sum(gap**2)])
+                return np.array([(p.return_price + style.end) * np.sum(gap**2)])
 
             out.append(Piece(away))
     if not robot.soles:

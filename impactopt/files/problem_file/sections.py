@@ -147,8 +147,14 @@ ControllerSection: Any = section_of(ControllerSettings)
 
 
 class ObjectiveSection(Section):
-    """Small prices that make the optimum unique, and bring the robot back to its start."""
+    """The motion's style, and small prices that make the optimum unique."""
 
+    style: Literal["natural", "strongest"] = optional(
+        '"natural": prices on jerk, on the travel of joints, above all of idle ones, and on ending away from '
+        'the start posture; "strongest": none'
+    )
+    motion_price: NotNegative = optional("largest share of the objective that the style's prices may take")
+    price_scale: NotNegative = optional("factor on the style's prices, as a plan has reduced them")
     smoothness: NotNegative = optional("price of accelerations [N s per (rad/s^2)^2 s]")
     wrench_price: NotNegative = optional("price of the soles' wrenches")
     return_price: NotNegative = optional("price of ending away from the start posture [N s per rad^2]")

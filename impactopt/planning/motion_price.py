@@ -1,0 +1,48 @@
+"""Reduction of the prices of a motion style to the share of the objective that a problem allows them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.planning.multistart import carried, one_after_the_other
+from impactopt.planning.on_demand import program_for
+from impactopt.solvers.program import SolverResult
+from impactopt.transcription.transcription import Transcription
+
+__all__ = ["within_price"]
+
+Array = NDArray[np.float64]
+_TRIES = 3  # reductions: with lower prices there is more to be priced, so one may not be enough
+_TOLERANCE = 0.02  # of the share: a plan that is within it is not solved again
+_BELOW = 0.9  # of the allowed share is aimed at
+
+
+def within_price(
+    t: Transcription,
+    result: SolverResult,
+    solve: Callable[[Transcription, SolverResult | Array], tuple[Transcription, SolverResult]],
+    report: Callable[[str], None] | None = None,
+) -> tuple[Transcription, SolverResult]:
+    """The program and its result, with the prices of the motion style reduced until they take no more of the
+    objective than `ImpactProblem.motion_price`; solved again from where it is.
+    """
+    for _ in range(_TRIES):
+        allowed = t.problem.motion_price
+        if not result.status.usable or not t.problem.price_scale:
+            break
+        share = t.style_share(result.x)
+        if share <= allowed * (1 + _TOLERANCE):
+            break
+        scale = t.problem.price_scale * (_BELOW * allowed / share if np.isfinite(share) else 0.0)
+        if report is not None:
+            report(f"the motion's style takes {100 * share:.1f} % of the objective: its prices are reduced")
+        cheaper = program_for(t, replace(t.problem, price_scale=scale), report)
+        found, new = solve(cheaper, carried(cheaper, t, result))
+        if not new.status.usable:
+            break
+        t, result = found, one_after_the_other(result, new)
+    return t, result

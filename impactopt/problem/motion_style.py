@@ -1,0 +1,56 @@
+"""Motion styles: prices on motion that keep a plan one that a laboratory would run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.robots.robot import Robot
+
+__all__ = ["STYLES", "MotionPrices", "idle_joints"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionPrices:
+    """Prices of a whole motion, each on the integral of a square over swing and follow-through.
+
+    acceleration [N s per (rad/s^2)^2 s], jerk [N s per (rad/s^3)^2 s] : of all independent coordinates.
+    speed, idle_speed [N s per (rad/s)^2 s] : of all of them, and of idle joints besides.
+    end [N s per rad^2] : of the squared distance between the posture at rest and that of the start.
+    """
+
+    acceleration: float = 0.0
+    jerk: float = 0.0
+    speed: float = 0.0
+    idle_speed: float = 0.0
+    end: float = 0.0
+
+    def scaled(self, factor: float) -> MotionPrices:
+        """All prices multiplied by a factor."""
+        return replace(self, **{name: factor * value for name, value in vars(self).items()})
+
+
+# Chosen on `punch`, `nailing` and `punch_g1` (docs/howto/style.md has the table): jerk takes out reversals and
+# peaks, idle speed the travel of limbs that bring nothing, speed the detours of all others.
+STYLES: dict[str, MotionPrices] = {
+    "natural": MotionPrices(jerk=5e-7, speed=5e-3, idle_speed=2e-2, end=2.0),
+    "strongest": MotionPrices(),
+}
+
+
+def idle_joints(robot: Robot, frames: Iterable[str]) -> NDArray[np.bool_]:
+    """Mask (n,) of the joints that move none of these frames: those of idle arms, and of the head."""
+    model = robot.model
+    carrying = {
+        int(j) for name in frames for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
+    }
+    first = model.nv - robot.n
+    idle = np.ones(robot.n, dtype=bool)
+    for j in carrying:
+        column = int(model.joints[j].idx_v) - first if j else -1
+        if column >= 0:
+            idle[column] = False
+    return idle

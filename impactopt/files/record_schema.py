@@ -154,7 +154,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         ),
         _NUMBER,
     ),
-    **dict.fromkeys(("freezes?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
+    **dict.fromkeys(("freezes?", "price_scale?", "model_error_pct?", "model_error_zmp_mm?"), _NUMBER),
     "collision_elements?": ([(int,)], type(None)),
     "scenarios?": ([(_SCENARIO,)],),
     "simulated?": (_SIMULATED,),
@@ -164,7 +164,7 @@ _OTHERS: Mapping[str, _Kinds] = {
     "rows_on_demand?": ([_TEXT],),
     "gains?": ([(_GAINS,)],),
     "set_aside?": ({"directory": _TEXT, "kept": _TEXT},),
-    **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "collision_model?"), _TEXT),
+    **dict.fromkeys(("note?", "caution?", "gear_caution?", "command?", "style?", "collision_model?"), _TEXT),
 }
 _DEEPEST = 20
 

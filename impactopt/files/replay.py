@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +138,7 @@ def _problem_file(
 
 
 def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> ImpactProblem:
-    """With the rows on demand that the record's plan needed, and the gains that it chose.
+    """With the rows on demand that the record's plan needed, the gains that it chose, and its style's prices.
 
     given : the file was, and is not the record's own text.
     """
@@ -146,6 +146,8 @@ def _built(record: Record, file: ProblemFile, result: Path, *, given: bool) -> I
         problem = file.build()
         told = record.summary.get("gains", ())
         problem = with_chosen(problem, [each["factor"] for each in told])
+        if (scale := record.summary.get("price_scale", 1.0)) != problem.price_scale:
+            problem = replace(problem, price_scale=scale)
         return with_rows(problem, record.summary.get("rows_on_demand", ()))
     except InputError as error:
         if given:

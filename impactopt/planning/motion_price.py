@@ -34,10 +34,11 @@ def within_price(
         allowed = t.problem.motion_price
         if not result.status.usable or not t.problem.price_scale:
             break
-        share = t.style_share(result.x)
+        share, style = t.price_shares(result.x)
         if share <= allowed * (1 + _TOLERANCE):
             break
-        scale = t.problem.price_scale * (_BELOW * allowed / share if np.isfinite(share) else 0.0)
+        left = max(_BELOW * allowed - (share - style), 0.0) if np.isfinite(share) else 0.0
+        scale = t.problem.price_scale * left / style if style > 0 else 0.0
         if report is not None:
             report(f"the motion's style takes {100 * share:.1f} % of the objective: its prices are reduced")
         cheaper = program_for(t, replace(t.problem, price_scale=scale), report)

@@ -117,6 +117,8 @@ class Solved:
             "collision_model": self.problem.collision,
             "freezes": self.problem.freezes,
             "rows_on_demand": list(rows_on_demand(self.problem)),
+            "style": self.problem.style,
+            "price_scale": self.problem.price_scale,
             "model_error_pct": None if self.model_error is None else self.model_error.impulse_pct,
             "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),

@@ -16,6 +16,7 @@ from impactopt.robots.robot import Robot
 
 __all__ = ["problem_hash"]
 
+_UNSHAPED = ("name", "price_scale")  # how far a plan has reduced its prices is the plan's
 DIGITS = 16  # 64 bits: two of a million problems share a hash once in 40 million times
 
 
@@ -25,7 +26,7 @@ def problem_hash(problem: Any) -> str:
     Names of the problem and the robot, the order of terms and objectives, postures that it does not start
     from, and whether a default was given or left out make no difference. Numbers count to the last digit.
     """
-    shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
+    shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name not in _UNSHAPED}
     second = shape.pop("second")
     if gains := shape.pop("gains"):
         each = zip(problem.gain_joints, gains, strict=True)

@@ -109,10 +109,10 @@ class ImpactProblem:
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
         `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
-    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending away
-        from the start posture (`impactopt.problem.motion_style`); or "strongest", without.
-    motion_price : largest share of the objective that the prices of the style may take; they are reduced until
-        they take no more.  price_scale : factor on them, as a plan has reduced them.
+    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending
+        away from the start posture (`impactopt.problem.motion_style`); or "strongest", without.
+    motion_price : largest share of the objective that prices on motion may take; those of the style are
+        reduced until they take no more.  price_scale : factor on these, as a plan has reduced them.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
         return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
         they make the optimum unique, and bring the robot back to its start.

@@ -300,10 +300,14 @@ class Transcription(ContactProgram):
         return [*found, determined(Turn.RATE, self.u0.index(0))]
 
     # ------------------------------------------------------------------ solution
-    def style_share(self, x: Array) -> float:
-        """Share of the objectives that the prices of the motion style take, for solver variables (n,)."""
+    def price_shares(self, x: Array) -> tuple[float, float]:
+        """Shares of the objectives that all prices on motion take, and those of its style alone, for solver
+        variables (n,).
+        """
         worth = sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
-        return self._style.evaluate(x) / abs(worth) if worth else np.inf
+        if not worth:
+            return np.inf, np.inf
+        return (self.program.objective(x) + worth) / abs(worth), self._style.evaluate(x) / abs(worth)
 
     def body_states(self, x: Array) -> list[BodyState]:
         plan, found = self.decode(x), self.swing_spots()

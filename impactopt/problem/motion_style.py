@@ -33,8 +33,8 @@ class MotionPrices:
         return replace(self, **{name: factor * value for name, value in vars(self).items()})
 
 
-# Chosen on `punch`, `nailing` and `punch_g1` (docs/howto/style.md has the table): jerk takes out reversals and
-# peaks, idle speed the travel of limbs that bring nothing, speed the detours of all others.
+# Chosen on `punch`, `nailing` and `punch_g1` (docs/howto/style.md has the table): jerk takes out reversals
+# and peaks, idle speed the travel of limbs that bring nothing, speed the detours of all others.
 STYLES: dict[str, MotionPrices] = {
     "natural": MotionPrices(jerk=5e-7, speed=5e-3, idle_speed=2e-2, end=2.0),
     "strongest": MotionPrices(),

@@ -114,7 +114,7 @@ def style_prices(b: Builder, motions: Sequence[MotionPhase], to_rest: Sequence[M
 def _priced(
     b: Builder, prices: MotionPrices, motions: Sequence[MotionPhase], to_rest: Sequence[MotionPhase]
 ) -> Prices:
-    """Integrals by the nodes' shares of a phase; the duration is its typical one, so that all is quadratic."""
+    """Integrals by the nodes' shares of a phase; its typical duration makes all of it quadratic."""
     n, c = b.layout.n, b.coordinates
     speeds = np.full(b.ny, prices.speed)
     speeds[c.base :] += prices.idle_speed * b.problem.idle_joints[c.independent]

@@ -125,7 +125,7 @@ def _lifted(
 def price_pieces(
     problem: ImpactProblem, robot: RobotMotion, ways: Sequence[Way], blows: Sequence[Blow]
 ) -> list[Piece]:
-    """Prices of the motion style, and small ones of accelerations, wrenches and ending away from the start."""
+    """Prices of the motion style, and small ones of accelerations, wrenches and ends away from the start."""
     p, style, out = problem, problem.style_prices, list[Piece]()
     moving = np.full(robot.ny, style.speed)
     moving[robot.base :] += style.idle_speed * p.idle_joints[robot.independent]

@@ -342,8 +342,10 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """Its own terms that are not switched off."""
-        return tuple(term for term in self.terms if term.active)
+        """Its own terms and the defaults that it does not give, but for those that are switched off."""
+        own = {kind_of(term, Term) for term in self.terms}
+        usual = tuple(term for term in DEFAULT_TERMS if type(term) not in own)
+        return tuple(term for term in (*self.terms, *usual) if term.active)
 
     @property
     def on_demand(self) -> tuple[Term, ...]:

@@ -9,6 +9,7 @@ where they are given. A new one is a file here, and its lines below.
 from impactopt.problem.terms.balance import Balance
 from impactopt.problem.terms.base import Term, check_known, kind_of
 from impactopt.problem.terms.contact_wrench_cone import ContactWrenchCone
+from impactopt.problem.terms.first_touch import FirstTouch
 from impactopt.problem.terms.gaze import Gaze
 from impactopt.problem.terms.gear_load import GearLoad
 from impactopt.problem.terms.grip import Grip
@@ -42,6 +43,7 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     LegExtension(),
     SelfCollision(),
     KeepOut(),
+    FirstTouch(),
 )
 ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide())
 # all that problem files know, in their order
@@ -68,6 +70,7 @@ __all__ = [
     "TERMS",
     "Balance",
     "ContactWrenchCone",
+    "FirstTouch",
     "Gaze",
     "GearLoad",
     "Grip",

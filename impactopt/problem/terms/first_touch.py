@@ -1,0 +1,115 @@
+"""First touch of the striking link: by its striking point, with its face to the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.bodies.striker_face import striker_face
+from impactopt.contact.fields import about
+from impactopt.problem.block import BlockExpression, BlockRecipe, make_block
+from impactopt.problem.terms.base import Term
+from impactopt.problem.violation import degrees, millimetres
+
+if TYPE_CHECKING:
+    from impactopt.kinematics.coordinates import StanceCoordinates
+
+Array = NDArray[np.float64]
+SINCE = 0.12  # [s] before contact: earlier than that the striking point alone keeps off the target's plane
+NAMES = ("first_touch", "second_first_touch")  # of the blocks, striker by striker
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstTouch(Term):
+    """The striking link touches the target with its striking point, not with another part before it.
+
+    Up to contact no corner of the link's hull is farther than `depth` beyond the target's plane, and at
+    contact the link's face, about the striking point, looks along the normal. Links without a body have no
+    such constraints.
+    """
+
+    name: ClassVar[str] = "first touch"
+    unit: ClassVar[str] = "m"
+    depth: float = field(
+        default=1.5e-3,
+        metadata=about("largest distance of the link's hull beyond the target's plane", unit="m", above=0),
+    )
+    angle: float = field(
+        default=0.6,
+        metadata=about("largest angle between the link's face and the normal", unit="rad", above=0),
+    )
+    enabled: bool = field(default=True, metadata=about("whether it holds"))
+
+    def __post_init__(self) -> None:
+        self.check_angle()
+        super().__post_init__()
+
+    def blocks(self, problem: Any, coordinates: StanceCoordinates) -> dict[str, BlockRecipe]:
+        return {
+            name: BlockRecipe(lambda striker=striker: ahead(coordinates, striker), (striker,))
+            for name, striker in zip(NAMES, problem.strikers, strict=False)
+            if striker_face(problem.robot, striker) is not None
+        }
+
+    def add_rows(self, program: Any) -> None:
+        p, spots = program.problem, late_spots(program)
+        for name, (striker, point) in zip(NAMES, p.contacts, strict=False):
+            face = striker_face(p.robot, striker)
+            if face is None:
+                continue
+            ways = np.vstack([face.corners, face.normal / np.sin(self.angle)])
+            moved = np.append(np.ones(len(face.corners)), 0.0)  # a direction has no place
+            each = [ways, moved[:, None]]
+
+            def numbers(b: Any, each: Any = each, count: int = len(spots)) -> Array:
+                rows = np.hstack([np.tile(b.problem.normal, (len(each[0]), 1)), *each])
+                return np.tile(rows, (count, 1))
+
+            slots = [[slots[0]] for _, slots in spots for _ in ways]
+            at = program.add_block(name, slots, numbers(program.builder))
+            program.builder.follow(
+                lambda b, name=name, numbers=numbers: b.block(name).take_parameters(numbers(b))
+            )
+            for k, (place, _) in enumerate(spots):
+                outputs = at + k * len(ways) + np.arange(len(ways))
+                program.rows.add(
+                    term=self.name,
+                    place=place,
+                    components=[f"{striker}, corner {i}" for i in range(len(face.corners))],
+                    outputs=outputs[:-1],
+                    upper=float(p.normal @ point) + self.depth,
+                    measure=millimetres("beyond the target's plane"),
+                    whole=striker,
+                )
+            program.rows.add(
+                term=self.name,
+                place=spots[-1][0],
+                components=[f"{striker}'s face"],
+                outputs=outputs[-1:],
+                lower=1 / np.tan(self.angle),
+                measure=degrees("too far off"),
+            )
+
+
+def late_spots(program: Any) -> list[Any]:
+    """Places of the last part of the swing, up to contact, with their slots; of a target that comes, contact."""
+    p = program.problem
+    since = max(0.0, 1 - SINCE / float(np.mean(p.swing.duration)))
+    return list(program.swing_spots(1.0 if p.target.speed_before() else since))
+
+
+def ahead(c: StanceCoordinates, striker: str) -> BlockExpression:
+    """Coordinate along the normal of a point of the striking link, or cosine of a direction of it.
+
+    z = y;  p = normal (3), point from the striking point on [m] or direction (3), 1 for a point and 0 for a
+    direction;  out = coordinate [m] or cosine.
+    """
+    y, normal, way, point = ca.SX.sym("y", c.ny), ca.SX.sym("n", 3), ca.SX.sym("d", 3), ca.SX.sym("point")
+    still = ca.SX.zeros(c.ny)
+    rotation, origin = c.rb_frame(f"striker:{striker}", c.upper_motion(y, still, still)[0])
+    out = ca.dot(normal, point * origin + ca.mtimes(rotation, way))
+    return make_block([y], [normal, way, point], {"along": out})

@@ -1,4 +1,4 @@
-"""Face of a striking link: the direction in which it strikes, and the part of its hull that may touch first."""
+"""Face of a striking link: its direction, and the corners of its hull that may touch first."""
 
 from __future__ import annotations
 

@@ -27,6 +27,7 @@ from impactopt.solvers.program import SolverResult, Status, Violation
 from impactopt.transcription.contact_error import ContactError
 from impactopt.transcription.mesh import Elements, Shares, contact_elements
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
+from impactopt.transcription.motion_measures import first_touch, motion_measures
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 from impactopt.transcription.planned_loads import motion_loads
 from impactopt.transcription.planned_strike import PlannedStrike
@@ -361,6 +362,8 @@ class Solution(Solved):
             **self.loads.summary(),
             **self.clearance(),
             "slide_mm": 1e3 * way,
+            **motion_measures(self.problem, self.trajectory),
+            **first_touch(plan),
             "versions": versions(),
         }
         known: dict[str, Any] = {

@@ -96,7 +96,7 @@ class FirstTouch(Term):
 
 
 def late_spots(program: Any) -> list[Any]:
-    """Places of the last part of the swing, up to contact, with their slots; of a target that comes, contact."""
+    """Places of the swing's end with their slots: the last 0.12 s, or contact alone if the target comes."""
     p = program.problem
     since = max(0.0, 1 - SINCE / float(np.mean(p.swing.duration)))
     return list(program.swing_spots(1.0 if p.target.speed_before() else since))

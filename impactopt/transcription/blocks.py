@@ -98,7 +98,7 @@ def node(c: StanceCoordinates) -> BlockExpression:
     tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(y, legs, w)
     out = {
         "closure": c.closure(y, legs),
-        "base": tau[: c.base] / base_scale(c, weight, lever),
+        "base": tau[: c.base, :] / base_scale(c, weight, lever),
         "torque": tau[c.base :] / limit,
         "leg_rate": leg_part(c, v) / rate_limit,
         "extension": c.leg_determinants(legs) / start,

@@ -234,6 +234,7 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
             )
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
+    yield from robot.source.notes if robot.source is not None else ()
     for key, what in (
         ("armature_kg_m2", "rotor inertias"),
         ("torque_limit_N_m", "torque limits"),

@@ -89,7 +89,8 @@ class Robot:
         object.__setattr__(self, "strikers", dict(self.strikers))
         found, limits = Mistakes(), (self.torque_limit, self.velocity_limit, self.lower, self.upper)
         found.attempt(lambda: check_inertias(self.model))
-        found.attempt(lambda: checks.check_limits(self.joint_names, *limits))
+        kind = "URDF" if self.urdf else "MJCF" if self.mjcf else ""
+        found.attempt(lambda: checks.check_limits(self.joint_names, *limits, kind))
         found.raise_if_any(f"robot {self.name!r}")
         object.__setattr__(self, "actuators", known(self.actuators or (Actuator(),) * self.n))
         checks.check_actuators(self.joint_names, self.actuators)

@@ -51,23 +51,33 @@ class Drafted:
         """Whether it is of an MJCF."""
         return self.robot.mjcf is not None
 
+    @property
+    def freed(self) -> bool:
+        """Whether it stands, and its MJCF has no free joint."""
+        return self.mjcf and self.robot.floating and not is_floating(read_mjcf(self.path).model)
+
     def made(self, **more: Any) -> Robot:
         """The robot anew, with more options."""
         make = Robot.from_mjcf if self.mjcf else Robot.from_urdf
         return make(self.path, inertias=REPAIRED, **{**self.options, **more})
 
 
-def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
+def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Drafted:
     """The robot of a file, on two legs if it has them, else bolted to the ground.
+
+    bolted : to the ground, even if it has legs.
 
     Raises
     ------
-    InputError : it cannot be read; it has legs that no plan can hold, with the reason; nothing can strike.
+    InputError : it cannot be read; it has legs that no plan can hold, with the reason; its root has no mass,
+        and legs bear it; nothing can strike.
     """
-    first = _read(path, mjcf, None if mjcf else True)
+    first = _floating(path, mjcf, bolted)
     locked = _locked(first)
-    floats = is_floating(first.model)
+    floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0
     found = _made(path, mjcf, floats, locked)
+    if is_floating(first.model) and not floats:
+        _check_bolted(first, found)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
     if legs:
         _check_legs(found.robot, legs)
@@ -83,6 +93,34 @@ def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
     if not arms:
         raise InputError(f"{path}: there is no limb beside the legs, so nothing to strike with")
     return replace(found, legs=legs, arms=arms)
+
+
+def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
+    """The robot with a free-flyer at its root, if it may have one.
+
+    Many an MJCF of a humanoid has no free joint, so that a scene can place it.
+    """
+    if bolted or not mjcf:
+        return _read(path, mjcf, not bolted)
+    read = read_mjcf(path)
+    if is_floating(read.model):
+        return read
+    try:
+        return read_mjcf(path, floating=True)
+    except InputError:  # several bodies on the ground
+        return read
+
+
+def _check_bolted(first: Description, found: Drafted) -> None:
+    """InputError if a robot stands on legs that has a free-flyer in `first`, and none in `found`, as its root
+    has no mass.
+    """
+    model = lock_joints(first.model, found.options["locked"])
+    if legs_of(model, {joint + 1: pieces for joint, pieces in found.pieces.items()}):
+        raise InputError(
+            f"{found.path}: the root link has no mass, and the robot stands on legs; give it an "
+            "<inertial>, or bolt it to the ground (--bolted)"
+        )
 
 
 def _read(path: Path, mjcf: bool, floating: bool | None) -> Description:

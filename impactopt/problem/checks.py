@@ -81,8 +81,8 @@ def check_stance(problem: Any) -> None:
     pull = np.array(robot.model.gravity.linear)
     if stance.sole_frames(robot) and not (pull[2] < 0 and not pull[:2].any()):
         raise InputError(
-            f"gravity is {pull.tolist()} m/s2, and soles that stand need one along -z: turn the model's gravity, "
-            "as <option gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
+            f"gravity is {pull.tolist()} m/s2, and soles that stand need one along -z: turn it, as <option "
+            "gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
         )
     if np.any(stance.compliance > 0):
         raise InputError(

@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from impactopt.errors import Mistakes
 from impactopt.robots.build import joint_names, lock_joints
-from impactopt.robots.inertias import REPAIRED, repair_inertias
+from impactopt.robots.inertias import REPAIRED, check_choice, repair_inertias
 from impactopt.robots.parts import Source, Striker
 
 __all__ = ["Description", "Tie", "between"]
@@ -93,6 +93,7 @@ class Description:
         given : name, locked and inertias, as of `Robot.from_urdf`, and what is recorded beside them.
         options : of `Robot.from_model`, that were given.
         """
+        check_choice(given["inertias"])
         model, kind = lock_joints(self.model, given["locked"]), self.kind.lower()
         repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
         every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}

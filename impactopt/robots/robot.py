@@ -19,7 +19,7 @@ from impactopt.robots import mjcf as _mjcf
 from impactopt.robots import urdf as _urdf
 from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.hinges import check_sole, with_hinges
-from impactopt.robots.inertias import GIVEN, REPAIRED, check_choice, check_inertias
+from impactopt.robots.inertias import GIVEN, REPAIRED, check_inertias
 from impactopt.robots.names import tell_apart
 from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
@@ -136,7 +136,6 @@ class Robot:
         ------
         InputError : no such file; Gazebo's springs and loops and <mimic>, unless their joints are locked.
         """
-        check_choice(inertias)
         read = _urdf.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
         model, every, source = read.made(path, given, options)
@@ -169,7 +168,6 @@ class Robot:
         ------
         InputError : no MuJoCo; no robot; ball joints; springs, tendons, loops and followers that move.
         """
-        check_choice(inertias)
         read = _mjcf.read_mjcf(path, floating=floating)
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
         model, every, source = read.made(path, given, options)

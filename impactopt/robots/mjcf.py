@@ -226,7 +226,7 @@ class _Reader(Compiled):
         mj, m = self.mj, self.mujoco
         return bool(
             mj.actuator_gaintype[a] == m.mjtGain.mjGAIN_FIXED
-            and mj.actuator_biastype[a] in (m.mjtBias.mjBIAS_NONE, m.mjtBias.mjBIAS_AFFINE)
+            and int(mj.actuator_biastype[a]) in (int(m.mjtBias.mjBIAS_NONE), int(m.mjtBias.mjBIAS_AFFINE))
             and mj.actuator_dyntype[a] == m.mjtDyn.mjDYN_NONE
             and not self.numbers("actuator_delay")[a : a + 1].any()
             and not self.numbers("actuator_dampingpoly")[a : a + 1].any()

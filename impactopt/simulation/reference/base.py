@@ -1,11 +1,11 @@
-"""What the reference models share: gains, friction, tolerance, and the search for an outcome that meets it."""
+"""What the reference models share: gains, friction, tolerance, and the search for what meets it."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,10 +70,11 @@ class ReferenceModel(CollisionModel):
 
         Raises
         ------
-        InputError : wrong shapes or NaN; torque missing; unknown overrides; a contact that does not end, or of
-            which the impulse is not found within the tolerance.
+        InputError : wrong shapes or NaN; torque missing; unknown overrides; a contact that does not end; an
+            impulse that is not found within the tolerance.
         """
-        return self.converged(q, v, torque, require_separation=require_separation, **overrides)[0]
+        given: dict[str, Any] = {"require_separation": require_separation, **overrides}
+        return self.converged(q, v, torque, **given)[0]
 
     def converged(
         self,
@@ -83,7 +84,7 @@ class ReferenceModel(CollisionModel):
         *,
         tolerance: float | None = None,
         require_separation: bool = True,
-        **overrides: ArrayLike,
+        **overrides: Any,
     ) -> tuple[Collision, float]:
         """(the collision as `collide` gives it; what its impulse changed by when it was integrated more
         exactly [N s]).
@@ -192,6 +193,6 @@ def converge(
             return found[-1], float(change)
     raise InputError(
         f"tolerance: {tolerance:g} is not met, the last time the impulse changed by {change:.2g} of "
-        f"{found[-1].impulse:.4g} N s: raise it; or the collision hangs on a hair, as a contact that nearly ends or a "
-        "board that nearly breaks"
+        f"{found[-1].impulse:.4g} N s: raise it; or the collision hangs on a hair, as where contact nearly "
+        "ends, or a board nearly breaks"
     )

@@ -43,7 +43,7 @@ class FullDynamics(ReferenceModel):
 
     Raises
     ------
-    InputError : as of `CollisionModel`; an unknown form; gains of a wrong shape or sign; a step or a tolerance
+    InputError : as of `CollisionModel`; an unknown form; gains of a wrong shape or sign; a step or tolerance
         that is not positive; in `collide`, a contact too fast to follow.
     """
 

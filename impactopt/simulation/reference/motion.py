@@ -4,8 +4,8 @@ The configuration is q = q_0 [+] u (Pinocchio's integrate): one chart of it cove
 is small, so the state is a plain vector, with du/dt = J_log(u) v for the free-flyer. SciPy's DOP853 (order
 eight) chooses the steps by the error that it estimates of each component of the state. A step goes by the
 forces of one phase, which go on smoothly beyond its end: where a phase ends within a step, the step is taken
-anew up to there. A target may jump where it switches, so that no stage may see it: steps lead up to there, and
-a hair's breadth across.
+anew up to there. A target may jump where it switches, so that no stage may see it: steps lead up to there,
+and a hair's breadth across.
 
 Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section II.10 (DOP853).
 """
@@ -32,10 +32,11 @@ Array = NDArray[np.float64]
 _BEYOND = 1e-10
 # places of a step at which it is looked for the end of the phase: it turns by less than a radian
 _PLACES = (0.25, 0.5, 0.75, 1.0)
-# some ten seconds of work; a contact with some ten thousand swings, or a mode far faster than all that happens
+# some ten seconds of work: of ten thousand swings, or a mode far faster than all that happens
 _MOST_LOOKS = 300_000
 _LEAST_INSTANTS = 50
-# of the contact's time scale: a time too short to matter, in which a target may jump; how far ahead a tie is decided
+# of the contact's time scale: a time too short to matter, in which a target may jump; how far ahead a tie
+# is decided
 _HAIR, _AHEAD = 1e-12, 1e-6
 
 
@@ -187,9 +188,11 @@ class Motion:
                 if switch.time - state.time <= hair:
                     self._watched = None
                     then = state.y + hair * self._slope(state.time, state.y, phase)
-                    pieces.append(_Piece(state.time, state.time + hair, lambda _, y=state.y: y, phase, (0.0, 0.0)))
-                    return self._look(state.time + hair, then), first
-                until = state.time + max(self._up_to_switch(state, phase, switch.time - state.time), hair / 2)
+                    across = state.time + hair
+                    pieces.append(_Piece(state.time, across, lambda _, y=then: y, phase, (0.0, 0.0)))
+                    return self._look(across, then), first
+                ahead = self._up_to_switch(state, phase, switch.time - state.time)
+                until = state.time + max(ahead, hair / 2)
                 solver = self._solver(state, phase, tolerance, until - state.time, until)
                 continue
             finally:
@@ -250,10 +253,10 @@ class Motion:
         failed = solver.step()
         if failed or self._looks > _MOST_LOOKS or not np.isfinite(solver.y).all():
             raise InputError(
-                f"the contact is too fast to follow with errors below the tolerance (at {solver.t:.3g} s of it, in "
-                f"steps of {solver.t - (solver.t_old or 0.0):.2g} s; it begins with a time scale of "
-                f"{self._scales.time:.2g} s): give a softer law, a heavier target or less damping, or a higher "
-                "tolerance"
+                f"the contact is too fast to follow with errors below the tolerance (at {solver.t:.3g} s of "
+                f"it, in steps of {solver.t - (solver.t_old or 0.0):.2g} s; it begins with a time scale of "
+                f"{self._scales.time:.2g} s): give a softer law, a heavier target or less damping, or a "
+                "higher tolerance"
             )
 
     def _end(self, before: _State, at: Any, length: float, phase: Phase) -> float | None:
@@ -306,9 +309,9 @@ class Motion:
 
     def _slope(self, time: float, y: Array, phase: Phase) -> Array:
         state = self._look(time, y)
-        if self._watched is not None and self._watched.size:
-            if (self._switches(state, phase) * self._watched < 0).any():
-                raise _Switches(time)
+        watched = self._watched
+        if watched is not None and watched.size and (self._switches(state, phase) * watched < 0).any():
+            raise _Switches(time)
         return self._rates(state, phase)[0]
 
     def _rates(self, state: _State, phase: Phase) -> tuple[Array, Array, float]:
@@ -362,8 +365,7 @@ class Motion:
         )
 
     def peak(self, run: Run) -> float:
-        """The largest force [N] of a run, which lies in the step that ends or begins with the largest, or beside
-        it."""
+        """The largest force [N] of a run: within the step with the largest at an end, or beside it."""
         if not run.pieces:
             return 0.0
         best = int(np.argmax([max(piece.forces) for piece in run.pieces]))
@@ -374,6 +376,7 @@ class Motion:
                 _, _, penetration, rate = self._of(self._look(time, piece.at(time)))
                 return -self.forces.contact(penetration, rate, piece.phase.compressing)
 
-            within = {"bounds": (piece.begin, piece.end), "options": {"xatol": 1e-4 * (piece.end - piece.begin)}}
-            peak = max(peak, -float(minimize_scalar(less, method="bounded", **within).fun))
+            near = {"xatol": 1e-4 * (piece.end - piece.begin)}
+            found = minimize_scalar(less, bounds=(piece.begin, piece.end), method="bounded", options=near)
+            peak = max(peak, -float(found.fun))
         return peak

@@ -81,20 +81,22 @@ class MujocoDynamics(ReferenceModel):
         damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
         fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
         step = min(self.step, 1 / fastest) if fastest > 0 else self.step
-        while not isinstance(found := self._run(step, q, v, forces, normal, scales), Collision):
-            step = min(step / 2, _RESOLVED / found)
-        first = found
+        first = None
+        while first is None:
+            try:
+                first = self._run(step, q, v, forces, normal, scales)
+            except _NotResolved as contact:
+                step = min(step / 2, _RESOLVED / contact.rate)
+        coarse = first
 
         def at(level: int) -> Collision:
-            finer = self._run(step / 2**level, q, v, forces, normal) if level else first
-            assert isinstance(finer, Collision)
-            return finer
+            return self._run(step / 2**level, q, v, forces, normal) if level else coarse
 
         return converge(at, tolerance, levels=_LEVELS, better=_extrapolated)
 
     def _run(
         self, step: float, q: Array, v: Array, forces: Forces, normal: Array, scales: Scales | None = None
-    ) -> Collision | float:
+    ) -> Collision:
         robot, frames, _, striker = self._held
         with no_log_file():
             world = HeldRobot(robot, frames, striker, step)
@@ -140,6 +142,14 @@ class HeldRobot(MujocoRobot):
         return found.ravel(), places
 
 
+class _NotResolved(Exception):
+    """Steps are too long for the contact, which changes at a rate of [1/s]."""
+
+    def __init__(self, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+
+
 def march(
     world: HeldRobot,
     forces: Forces,
@@ -147,10 +157,10 @@ def march(
     horizon: float,
     soles: int,
     scales: Scales | None = None,
-) -> Collision | float:
-    """The collision in the world's steps; or the contact's fastest rate [1/s] where they do not resolve it.
+) -> Collision:
+    """The collision in the world's steps.
 
-    scales : of the contact; None: the steps are taken as they are.
+    scales : of the contact; None: steps that do not resolve it are taken as they are.
     """
     data, step = world.data, world.step
     every = max(1, round(_RECORD / step))
@@ -168,8 +178,8 @@ def march(
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
         if k > _MOST_STEPS:
             raise InputError(
-                f"the contact is too fast to follow in MuJoCo: it takes steps of {step:.2g} s, and is not over after "
-                f"{_MOST_STEPS} of them; give a softer law or a heavier target, or take FullDynamics"
+                f"the contact is too fast to follow in MuJoCo: it takes steps of {step:.2g} s, and is not "
+                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or take FullDynamics"
             )
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
@@ -181,7 +191,7 @@ def march(
         if scales is not None and phase.touching:
             fastest = _fastest(forces, depth, rate, phase.compressing, scales)
             if fastest * step > 2 * _RESOLVED:
-                return fastest
+                raise _NotResolved(fastest)
         torque = forces.torque(demand, phase)
         ends = not phase.touching or time >= horizon * (1 - 1e-9)
         if ends:

@@ -28,7 +28,10 @@ def collision_from(
     forces: Forces,
     separated: bool,
 ) -> Collision:
-    """The result of a collision with that end and that largest force [N]; the first `soles` of the held frames are soles."""
+    """The result of a collision with that end, and that largest force [N].
+
+    soles : how many of the held frames, the first, are soles.
+    """
     columns: dict[str, Any] = {
         name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields
     }

@@ -54,11 +54,9 @@ _ITERATIONS, _SINGLE = 150, 100  # at most, of all bounds together and of one
 _LEAST = 600  # of the whole search, at least
 _TRIED = 5  # bounds that are tried alone
 _FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))  # of stiffness
-_BARRIER, _PUSH, _ROUGH = (
-    1e-2,
-    1e-3,
-    1e-4,
-)  # of a program that is nearly met, and its tolerance: three digits are told
+_STIFF = 60  # iterations of each: where there is a solution, most are there in half of them
+_BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
+_ROUGH = 1e-4  # its tolerance: three digits are told
 _MET = 1e-5  # violation of rows that counts as none here
 _NONE = 1e-4  # what a relaxation comes to that is none
 _ROOM = 0.02  # by how much more a value is told than what it takes: there the feasible set is one point
@@ -194,6 +192,8 @@ class _Relaxing:
             new = _or_none(p, law=law)
             if new is None:
                 continue
+            if self._budget.left == 0:
+                return
             t = program_for(self.t.with_apart({}), new, None)
             if self._run(t.program, first_iterate(t), _STIFF) is not None:
                 words = f"stiffness of the contact: {value:.2g} N/m for {known:.2g} N/m"

@@ -48,7 +48,7 @@ __all__ = ["Cause", "Search", "search"]
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Chosen = Callable[[Row], bool]
-_LOOSE = 10.0  # times longer, or shorter, than the problem asks for: what durations may become
+_LOOSE, _USUAL = 4.0, 1.0  # times longer, or shorter, that durations may become, or a usual one [s]
 _CONTACT = 0.2  # [s] that a phase of contact may become
 _ITERATIONS, _SINGLE = 150, 100  # at most, of all bounds together and of one
 _LEAST = 600  # of the whole search, at least
@@ -142,7 +142,7 @@ class _Relaxing:
         p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
         self.t = program_for(t, p, None)
         nothing = np.zeros(t.program.m), np.zeros(t.layout.n)
-        self.starts = carried_over(self.t, t, result.x, *nothing)[0], first_iterate(self.t)
+        own = carried_over(self.t, t, result.x, *nothing)[0], first_iterate(self.t)
         shortest, longest = p.contact_duration
         loose = changed(
             p,
@@ -151,6 +151,7 @@ class _Relaxing:
             contact_duration=(shortest, max(_CONTACT, longest)),
         )
         self.loose = program_for(self.t, loose, None)
+        self.starts = *own, first_iterate(self.loose)
         self.bounds = [each for of in (_durations, _of_bodies, _of_terms) for each in of(self.t)]
 
     def found(self) -> Search:
@@ -242,7 +243,8 @@ class _Relaxing:
 
 def _loosened(phase: Phase) -> Phase:
     shortest, longest = phase.duration
-    return replace(phase, duration=(max(shortest / _LOOSE, SHORTEST), min(longest * _LOOSE, LONGEST)))
+    shortest, longest = min(shortest / _LOOSE, _USUAL), max(longest * _LOOSE, _USUAL)
+    return replace(phase, duration=(max(shortest, SHORTEST), min(longest, LONGEST)))
 
 
 _NO = np.zeros(0, dtype=np.intp)

@@ -36,6 +36,7 @@ from impactopt.planning.solution import Solution
 from impactopt.planning.stopping import stopping
 from impactopt.planning.strike import clear_strike
 from impactopt.planning.verdict import lacks_rows, with_reason
+from impactopt.planning.window import window_caution
 from impactopt.problem.doubts import hopeless
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
@@ -174,6 +175,7 @@ def _planned(
     return Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
+        window=window_caution(t, result) if result.status.usable else "",
         causes=tuple(cause for cause in causes if cause.problem is not None),
         **planned_by(t, result),
         **fields,

@@ -137,6 +137,7 @@ class Solution(Solved):
     statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
     causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
         cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
+    window : what is to be said of the time that the contact may last; "" if that costs little.
     Its other attributes are those of :class:`Solved`.
     """
 
@@ -145,6 +146,7 @@ class Solution(Solved):
     contact_error: ContactError | None = None
     statement: str = ""
     causes: tuple[Cause, ...] = ()
+    window: str = ""
 
     @property
     def impulse(self) -> float:
@@ -381,7 +383,7 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way)))):
+        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way), self.window))):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 

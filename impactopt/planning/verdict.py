@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from impactopt.planning.causes import Cause
 from impactopt.planning.multistart import VIOLATED, Budget
+from impactopt.problem.doubts import too_weak
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.collision import Collision
@@ -67,18 +68,20 @@ def with_reason(
     if not lacks_rows(t, result):
         return result
     would_do = [cause for cause in causes if cause.problem is not None]
+    weak = too_weak(t.problem)
     if known:
         why = f"Infeasible: {'; '.join(known)}."
     elif would_do:
         first, *others = would_do
         why = f"Infeasible: {first.first}. {first.text} would do, with all else as it is"
         why += "".join(f"; or {other.text}" for other in others) + "."
+        why += f" Besides, {weak}." if weak else ""
     else:
-        masses = _too_stiff(t) or _too_long(t)
         beyond = [f"{cause.first}: {cause.text}, which may not be" for cause in causes]
-        if not masses and not beyond:
+        found = weak or _too_stiff(t) or _too_long(t) or "".join(beyond[:1])
+        if not found:
             return result
-        why = f"Infeasible: {masses or beyond[0]}."
+        why = f"Infeasible: {found}."
     rest = result.message.partition(". ")[2] or result.message
     return replace(result, status=Status.INFEASIBLE, message=f"{why} {rest}")
 

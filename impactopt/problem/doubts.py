@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
 
-__all__ = ["doubts", "hopeless"]
+__all__ = ["doubts", "hopeless", "too_weak"]
 
 Array = NDArray[np.float64]
 LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
@@ -29,10 +29,8 @@ DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, first what to mend first: a start beyond the target, a robot that cannot hold
-    its own weight there, a point out of balance.
-    """
-    found = [_beyond(problem), _too_weak(problem), _out_of_balance(problem)]
+    """What no solve can mend, first what to mend first: a start beyond the target, a point out of balance."""
+    found = [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
 
 
@@ -61,8 +59,10 @@ def _beyond(problem: ImpactProblem) -> str:
     )
 
 
-def _too_weak(problem: ImpactProblem) -> str:
-    """Whether no wrenches of what is held let the torques hold the robot at rest where it starts."""
+def too_weak(problem: ImpactProblem) -> str:
+    """Whether no wrenches of what is held let the torques hold the robot at rest where it starts, in words;
+    "" if some do. A motion that falls from there at once may be planned all the same.
+    """
     robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
     q = problem.start_posture
     weight = np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))

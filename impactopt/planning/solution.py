@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.planning.causes import Cause
 from impactopt.planning.chosen_gains import ChosenGains
 from impactopt.planning.gears import gear_caution
 from impactopt.planning.multistart import Attempt
@@ -134,6 +135,9 @@ class Solution(Solved):
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
     statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
+    causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
+        cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
+    window : what is to be said of the time that the contact may last; "" if that costs little.
     Its other attributes are those of :class:`Solved`.
     """
 
@@ -141,6 +145,8 @@ class Solution(Solved):
     nodes: MoreNodes = NO_MORE
     contact_error: ContactError | None = None
     statement: str = ""
+    causes: tuple[Cause, ...] = ()
+    window: str = ""
 
     @property
     def impulse(self) -> float:
@@ -377,7 +383,7 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way)))):
+        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way), self.window))):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 

@@ -32,7 +32,7 @@ from impactopt.planning.rounds import Refining
 from impactopt.planning.side_by_side import best_side_by_side, check_workers
 from impactopt.planning.solution import Solution
 from impactopt.planning.strike import clear_strike
-from impactopt.planning.verdict import with_reason
+from impactopt.planning.verdict import with_reason, with_soles_kept
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Callback, SolverResult, max_violation
 from impactopt.transcription.apart import ApartRow, Held
@@ -161,12 +161,13 @@ def _planned(
         t, fields = _on(refining, t, fields)
     t, fields = settled(t, fields, budget, report)
     result = fields["result"] = with_reason(t, fields["result"])
-    return Solution(
+    solution = Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
         **planned_by(t, result),
         **fields,
     )
+    return with_soles_kept(solution) if refine else solution
 
 
 def _meets_rows(t: Transcription, start: SolverResult) -> bool:

@@ -52,25 +52,23 @@ def failures(summary: dict[str, Any]) -> list[str]:
 
 
 def sole_failures(summary: dict[str, Any]) -> list[str]:
-    """Soles that keep less than half of a margin in the plan or on held soles, or are outside on free ones."""
+    """Soles that keep less than half of a margin, planned or held, or are outside of themselves on free ones."""
     wrong = []
-    asked, force = summary.get("sole_cop_margin_asked_mm", {}), summary.get("sole_force_asked_N", 0.0)
-    for where, numbers in (
-        ("", summary),
-        *((f"{k}.", summary.get(k, {})) for k in ("simulated", "replayed")),
-    ):
-        free = where == "replayed."
-        for key, least in (
-            ("sole_cop_margin_mm", {p: -EDGE if free else asked.get(p, 0.0) / 2 - EDGE for p in PHASES}),
-            ("sole_force_N", dict.fromkeys(PHASES, -EDGE if free else force / 2 - EDGE)),
+    for where in ("planned", "simulated", "replayed"):
+        numbers = summary if where == "planned" else summary.get(where, {})
+        for key, asked in (
+            ("sole_cop_margin_mm", summary.get("sole_cop_margin_asked_mm", {})),
+            ("sole_force_N", dict.fromkeys((*PHASES, "missed"), summary.get("sole_force_asked_N", 0.0))),
         ):
             soles = numbers.get(key)
             if not soles:
-                wrong.append(f"{where}{key} is missing")
-            for sole, kept in (soles or {}).items():
-                for phase, low in least.items():
-                    if not kept.get(phase, -math.inf) >= low:
-                        wrong.append(f"{where}{key}.{sole}.{phase} is {kept.get(phase)}, below {low:g}")
+                wrong.append(f"{where}: {key} is missing")
+                continue
+            for sole, kept in soles.items():
+                for phase in dict.fromkeys((*PHASES, *kept)):
+                    least = -EDGE + (0.0 if where == "replayed" else asked.get(phase, 0.0) / 2)
+                    if not kept.get(phase, -math.inf) >= least:
+                        wrong.append(f"{where}: {key}.{sole}.{phase} is {kept.get(phase)}, below {least:g}")
     return wrong
 
 

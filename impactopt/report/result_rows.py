@@ -101,7 +101,7 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
 
 
 def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
-    """Margins of each sole by itself, beside what the plan was asked for: of its centre of pressure to its own
+    """Margins of each sole by itself, beside what is asked of the plan: of its centre of pressure to its own
     edges in each phase, and its least normal force.
 
     Good is half of that in a plan and on held soles, and a sole that does not tip on free ones.

@@ -1,9 +1,9 @@
 """Is what is planned what happens? Punches, planned and then replayed with held soles and with free ones.
 
 One row a problem: how the solver ended; from the replay with held soles (Pinocchio) the impulse's error, the
-least ZMP margin, what each sole by itself keeps of the margins asked of it, and the largest torque demand over
-limit; from the replay with free soles (MuJoCo) the impulse's error, each sole's least margin and force, slip,
-lift in the collision, and whether the robot stands at the end. What fails stays in.
+least ZMP margin, what each sole by itself keeps of the margins asked of it, and the largest torque demand
+over limit; from the replay with free soles (MuJoCo) the impulse's error, each sole's least margin and force,
+slip, lift in the collision, and whether the robot stands at the end. What fails stays in.
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     millisecond of the plan, the missed blow and the replay (None: it has no meshes).
     cop_planned, cop_held, force_planned, force_held : least that a sole keeps of the margin of its centre of
     pressure and of its normal force, over what is asked of it, in the plan (its missed blow included) and in
-    its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers, by
-    sole and phase.
+    its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
+    by sole and phase.
     gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}

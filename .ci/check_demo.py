@@ -52,7 +52,7 @@ def failures(summary: dict[str, Any]) -> list[str]:
 
 
 def sole_failures(summary: dict[str, Any]) -> list[str]:
-    """Soles that keep less than half of a margin, planned or held, or are outside of themselves on free ones."""
+    """Soles that keep less than half of a margin, planned or held, or are beyond their edges on free ones."""
     wrong = []
     for where in ("planned", "simulated", "replayed"):
         numbers = summary if where == "planned" else summary.get(where, {})

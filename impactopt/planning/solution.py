@@ -343,6 +343,11 @@ class Solution(Solved):
         """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
         return self.plan.margins(self.trajectory, self.collision)
 
+    def sole_margins(self) -> dict[str, Any]:
+        """Margins of each sole by itself, as of `Plan.sole_margins`."""
+        missed = self.missed_trajectory if self.plan.abort is not None else None
+        return self.plan.sole_margins(self.trajectory, self.collision, missed)
+
     @cached_property
     def loads(self) -> DriveLoads:
         """What gears and motors bear at most, as planned with the expected target."""
@@ -362,6 +367,7 @@ class Solution(Solved):
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,
             **self.margins(),
+            **self.sole_margins(),
             **self.loads.summary(),
             **self.clearance(),
             "slide_mm": 1e3 * way,

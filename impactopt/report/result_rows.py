@@ -26,7 +26,7 @@ __all__ = [
     "worst_rows",
 ]
 
-PHASES = ("swing", "collision", "follow")
+PHASES = ("swing", "collision", "follow", "missed")
 Columns = Mapping[str, Mapping[str, Any]]
 
 

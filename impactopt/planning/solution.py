@@ -192,11 +192,15 @@ class Solution(Solved):
             missed=True, known=self.trajectory if self.plan.abort is not None else None
         )
 
+    @property
+    def _missed(self) -> Trajectory | None:
+        return self.missed_trajectory if self.plan.abort is not None else None
+
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
 
         engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
-        ``validate``).  options : of the engine, such as ``step`` [s].
+        ``validate``).  options : of the engine, such as ``step`` [s], or ``missing=True``: there is no target.
 
         Raises
         ------
@@ -204,8 +208,7 @@ class Solution(Solved):
         """
         from impactopt.simulation import simulate
 
-        if engine == "mujoco" and self.plan.abort is not None:
-            options.setdefault("missed", self.missed_trajectory)
+        options.setdefault("missed", self._missed)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
 
     def moved(self, *, polish: bool = True, **changes: Any) -> Solution:
@@ -306,7 +309,7 @@ class Solution(Solved):
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.abort is not None else (False,):
-            motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
+            motion = self.plan.motion(missed=missed, reference=self._missed if missed else self.trajectory)
             at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
@@ -341,7 +344,7 @@ class Solution(Solved):
 
     def margins(self) -> dict[str, dict[str, float]]:
         """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
-        return self.plan.margins(self.trajectory, self.collision)
+        return self.plan.margins(self.trajectory, self.collision, self._missed)
 
     def sole_margins(self) -> dict[str, Any]:
         """Margins of each sole by itself, as of `Plan.sole_margins`."""

@@ -160,11 +160,11 @@ def _planned(
     if margins is None and refine and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
     t, fields = settled(t, fields, budget, report)
-    result = fields["result"] = with_reason(t, fields["result"])
+    result = fields["result"] = refining.checked(t, with_reason(t, fields["result"]))
     return Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
-        **planned_by(t, result),
+        **planned_by(t, result, refining.contact(t, result.x) if result.status.usable else None),
         **fields,
     )
 

@@ -171,13 +171,14 @@ def _planned(
     if not known:
         t, fields, causes = _explained(t, fields, budget, each, report)
     t, fields = settled(t, fields, budget, report)
-    result = fields["result"] = with_reason(t, fields["result"], causes, known=known)
+    explained = with_reason(t, fields["result"], causes, known=known)
+    result = fields["result"] = refining.checked(t, explained)
     solution = Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
         window=window_caution(t, result) if result.status.usable else "",
         causes=tuple(cause for cause in causes if cause.problem is not None),
-        **planned_by(t, result),
+        **planned_by(t, result, refining.contact(t, result.x) if result.status.usable else None),
         **fields,
     )
     return with_soles_kept(solution) if refine else solution

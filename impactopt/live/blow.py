@@ -68,7 +68,7 @@ class LiveBlow(LivePage):
         names = ("robot", "striker", "normal", "law", "target", "stance")
         self._model = SDC(**{name: getattr(problem, name) for name in names}, freezes=_FREEZES)
         self._server, self.address = served(host, port)
-        self._drawing = Drawing(self._server, problem.robot)
+        self._drawing = Drawing(self._server, problem.robot, problem.ground_height)
         self._drawing.normal = problem.normal
         self._drawing.polygon(self._polygon)
         model = problem.robot.model

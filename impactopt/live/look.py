@@ -52,7 +52,7 @@ class LiveLook(LivePage):
         self.answer = replanning(self.wish, lambda: False)
         self._server, self.address = served(host, port)
         self._drawn, self._asking = threading.RLock(), threading.RLock()
-        self._drawing = Drawing(self._server, first.problem.robot)
+        self._drawing = Drawing(self._server, first.problem.robot, first.problem.ground_height)
         self._controls()
         track, problem = self._track, first.problem
         middle = float(track.places[0, 1:, 1].mean())

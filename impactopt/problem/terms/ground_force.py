@@ -54,3 +54,15 @@ class GroundForce(Term):
         lower, upper = np.full(len(sets), self.sole), np.full(len(sets), np.inf)
         lower[:1], upper[:1] = self.least, self.most
         return [name for name, _ in sets], matrix, lower, upper
+
+    def shortfall(self, loads: Array, share: float) -> Array:
+        """Distance (k,) of normal forces over the weight (k, soles) beyond their ranges; <= 0 within them.
+
+        share : of the least ones that has to be kept. The largest may be exceeded by 1 - share of its
+        distance to the weight.
+        """
+        total = loads.sum(axis=1)
+        beyond = [share * self.least - total, total - self.most - (1 - share) * (self.most - 1)]
+        if loads.shape[1] > 1:
+            beyond.append(share * self.sole - loads.min(axis=1))
+        return np.asarray(np.max(beyond, axis=0))

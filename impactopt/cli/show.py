@@ -40,6 +40,14 @@ def show(
         ),
     ] = None,
     open_: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
+    sheet: Annotated[
+        Path | None,
+        typer.Option(
+            "--sheet",
+            metavar="FILE.png",
+            help="Write a picture instead: the planned motion from three sides at seven instants.",
+        ),
+    ] = None,
     problem: OtherProblem = None,
     live: Annotated[
         bool,
@@ -65,6 +73,11 @@ def show(
     """
     if port is not None and not live:
         raise typer.BadParameter("it is for --live alone", param_hint="--port")
+    if sheet is not None:
+        if live or out is not None:
+            raise typer.BadParameter("it is a picture of a result, no page", param_hint="--sheet")
+        _sheet(what, problem, sheet)
+        return
     if live:
         if out is not None:
             raise typer.BadParameter("a live page is not written: leave one of them out", param_hint="--out")
@@ -81,6 +94,22 @@ def show(
         typer.echo(printable(str(written)))
         if open_:
             webbrowser.open(written.resolve().as_uri())
+
+
+def _sheet(result: Path, problem: Path | None, file: Path) -> None:
+    """Write the contact sheet of a result."""
+    with plain_errors("interrupted before the picture was written"):
+        from impactopt.errors import printable
+        from impactopt.files.output import make_directory
+        from impactopt.files.replay import load_planned
+        from impactopt.report.pictures.sheet import sheet
+
+        planned = load_planned(result, problem_file=problem)
+        picture = sheet(planned.record, planned.problem)
+        make_directory(file.parent)
+        with file.open("wb") as stream:
+            picture.write(stream)
+        typer.echo(printable(str(file)))
 
 
 def _live(what: Path, problem: Path | None, port: int | None, open_: bool) -> None:

@@ -1,0 +1,142 @@
+"""Contact sheet of a motion: the robot's meshes from three sides at seven instants."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from matplotlib.collections import PolyCollection
+
+from impactopt.bodies.solids import Solid, simplified
+from impactopt.bodies.surroundings import Part, surroundings_of
+from impactopt.files.output import Record
+from impactopt.problem.problem import ImpactProblem
+from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Array, Picture, styled, title
+from impactopt.report.stage import bodies_drawn
+from impactopt.report.tracks import Track, tracks_of
+
+__all__ = ["sheet"]
+
+CELL = 0.015  # [m] that meshes are simplified to: a limb is 40 pixels wide
+WIDTH = 11.0  # [in]
+GONE = 0.6  # [m] farther off a target is not shown
+LIGHT = np.array([0.45, -0.35, 0.82])
+# name of each view, the world's directions to its right and up, and the direction to the viewer
+VIEWS = (
+    ("front", np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])),
+    ("right side", np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])),
+    ("top", np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])),
+)
+PARTS = {"target": ORANGE, "held": "#b0b0b0", "obstacle": "#cccccc"}
+Drawn = tuple[int, Array, Array, Array]  # joint, triangles (k, 3, 3) [m] in its frame, normals, colour
+
+
+@styled
+def sheet(record: Record, problem: ImpactProblem) -> Picture:
+    """The planned motion from the front, the right side and the top, at seven instants.
+
+    The limb that strikes is blue. The target, what holds it and obstacles are as large as they are.
+    """
+    track = tracks_of(record, problem)[0]
+    chosen = _chosen(track)
+    solids, world = _solids(problem), [p for p in surroundings_of(problem.world) if not _hides(p)]
+    scenes = [_scene(track, k, solids, world, problem.normal) for k in chosen]
+    points = np.concatenate([scene[0].reshape(-1, 3) for scene in scenes])
+    ends = np.percentile(points, [0.05, 99.95], axis=0) + np.array([[-0.04], [0.04]])
+    ends[0, 2] = min(ends[0, 2], problem.ground_height or 0.0) - 0.02
+    sizes = [[np.ptp(ends @ np.abs(direction)) for direction in view[:2]] for _, view in VIEWS]
+    heights = [high for _, high in sizes]
+    scale = (WIDTH - 0.4) / (len(chosen) * max(wide for wide, _ in sizes))  # [in/m]
+    figure = Picture(WIDTH, scale * sum(heights) + 0.9)
+    axes = figure.subplots(len(VIEWS), len(chosen), squeeze=False, gridspec_kw={"height_ratios": heights})
+    for column, (k, scene) in enumerate(zip(chosen, scenes, strict=True)):
+        for row, (name, view) in enumerate(VIEWS):
+            ax = axes[row, column]
+            _draw(ax, *scene, view)
+            ax.plot(*(np.asarray(problem.point) @ view[:2].T), "o", color=VERMILION, markersize=2, zorder=5)
+            (left, right), (low, high) = (np.sort(ends @ direction) for direction in view[:2])
+            ax.set(xlim=(left, right), ylim=(low, high), aspect="equal")
+            ax.axis("off")
+            if row < 2 and problem.ground_height is not None:
+                ax.axhline(problem.ground_height, color="#999999", linewidth=0.6, zorder=0)
+            if column == 0:
+                ax.text(0.0, 1.0, name, transform=ax.transAxes, fontsize=7, va="top")
+        contact = abs(track.time[k] - track.contact_start) < 1e-6
+        axes[0, column].set_title(f"{'contact, ' if contact else ''}{track.time[k]:.2f} s")
+    figure.suptitle(title(record, "planned motion"))
+    return figure
+
+
+def _hides(part: Part) -> bool:
+    """Whether a body would hide the robot, as a wall does."""
+    return part.clear and part.kind != "obstacle"
+
+
+def _scene(
+    track: Track, k: int, solids: list[Drawn], world: list[Part], normal: Array
+) -> tuple[Array, Array, Array]:
+    """Triangles (n, 3, 3) [m], their normals and colours (n, 3) at an instant of a track."""
+    shown = [_placed(track, k, solid) for solid in solids]
+    for part in world:
+        corners = part.placed(float(track.travel[k]), normal)[part.solid.triangles]
+        if abs(track.travel[k]) < GONE or not part.moves:
+            shown.append((corners, _normals(corners), np.tile(_rgb(PARTS[part.kind]), (len(corners), 1))))
+    triangles, normals, colours = (np.concatenate([s[i] for s in shown]) for i in range(3))
+    return triangles, normals, colours
+
+
+def _rgb(colour: str) -> Array:
+    return np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+
+
+def _chosen(track: Track) -> list[int]:
+    """Indices of seven instants: three before contact beside the start, contact, its end, and two after."""
+    start, end = track.contact_start, track.contact_end
+    last = float(track.time[-1])
+    wanted = [*np.linspace(0.0, start, 5), end + 0.25 * (last - end), last]
+    return [int(np.argmin(np.abs(track.time - t))) for t in wanted]
+
+
+def _solids(problem: ImpactProblem) -> list[Drawn]:
+    """What the robot looks like: triangles of each joint, with their normals and colours."""
+    model = problem.robot.model
+    frames = [problem.robot.striker(name).model_frame for name in problem.strikers]
+    striking = {int(j) for f in frames for j in model.supports[model.frames[model.getFrameId(f)].parentJoint]}
+    standing = {
+        int(j)
+        for sole in problem.stance.soles(problem.robot)
+        for j in model.supports[model.frames[model.getFrameId(sole.frame)].parentJoint]
+    }
+    out = []
+    for body in bodies_drawn(problem.robot):
+        solid = simplified(body.solid, CELL) if len(body.solid.triangles) > 500 else body.solid
+        corners = _corners(solid)
+        own = _rgb(BLUE) if body.joint in striking - standing else np.asarray(body.colour[:3], dtype=float)
+        out.append((body.joint, corners, _normals(corners), np.tile(own, (len(corners), 1))))
+    return out
+
+
+def _corners(solid: Solid) -> Array:
+    return np.asarray(solid.vertices[solid.triangles])
+
+
+def _normals(corners: Array) -> Array:
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
+
+
+def _placed(track: Track, k: int, drawn: Drawn) -> tuple[Array, Array, Array]:
+    joint, corners, normals, colours = drawn
+    place = pin.XYZQUATToSE3(track.places[k, joint])
+    return corners @ place.rotation.T + place.translation, normals @ place.rotation.T, colours
+
+
+def _draw(ax: object, triangles: Array, normals: Array, colours: Array, view: Array) -> None:
+    """Triangles that face the viewer, the farthest first."""
+    facing = normals @ view[2] > 0
+    flat, depth = triangles[facing] @ view[:2].T, (triangles[facing] @ view[2]).mean(axis=1)
+    light = 0.45 + 0.55 * np.clip(normals[facing] @ (LIGHT / np.linalg.norm(LIGHT)), 0.0, 1.0)
+    order = np.argsort(depth)
+    shaded = (colours[facing] * light[:, None])[order]
+    ax.add_collection(  # type: ignore[attr-defined]
+        PolyCollection(flat[order], facecolors=shaded, edgecolors=shaded, linewidths=0.2, rasterized=True)
+    )

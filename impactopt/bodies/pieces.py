@@ -23,7 +23,7 @@ from impactopt.codegen.directory import kept
 from impactopt.robots.robot import Robot, Tool
 from impactopt.robots.tools import without
 
-__all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of"]
+__all__ = ["Piece", "bare_joints", "convex", "inertia_box", "pieces_of", "tool_solids"]
 
 Array = NDArray[np.float64]
 ROD = 0.012  # [m] radius of a tool
@@ -82,7 +82,7 @@ def pieces_of(robot: Robot) -> tuple[tuple[Piece, ...], str]:
         bare = bare_joints(robot, {piece.joint for piece in found})
         found += [piece for piece in _from_inertia(robot) if piece.joint in bare]
         source += f", and boxes of the inertia of {len(bare)} that have lost their meshes" if bare else ""
-    found += [_rod(robot, tool) for tool in robot.tools]
+    found += [piece for tool in robot.tools for piece in _of_tool(robot, tool)]
     return tuple(found), source
 
 
@@ -143,17 +143,29 @@ def inertia_box(inertia: Any) -> Solid:
     return rounded_box(sides).moved(axes, np.array(inertia.lever))
 
 
-def _rod(robot: Robot, tool: Tool) -> Piece:
+def _of_tool(robot: Robot, tool: Tool) -> Iterator[Piece]:
     frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
-    length = max(float(np.linalg.norm(tool.head)), 2 * ROD)
-    along = np.asarray(tool.head) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
-    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
-    solid = cylinder(ROD, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2]))
     place = frame.placement
-    solid = solid.moved(turn, np.zeros(3)).moved(place.rotation, place.translation)
-    piece = _hull(tool.name, int(frame.parentJoint), solid)
-    assert piece is not None  # a cylinder has a hull
-    return piece
+    for solid in tool_solids(tool):
+        piece = _hull(tool.name, int(frame.parentJoint), solid.moved(place.rotation, place.translation))
+        assert piece is not None  # a rod has a hull
+        yield piece
+
+
+def tool_solids(tool: Tool) -> list[Solid]:
+    """The solids of a tool in its own frame: a rod to the point that hits, or to the bar of a hammer."""
+    if tool.bar is None:
+        return [_rod(np.zeros(3), np.asarray(tool.head), ROD)]
+    back, middle = tool.head - tool.bar, tool.head - tool.bar / 2
+    return [_rod(np.zeros(3), middle, ROD), _rod(back, np.asarray(tool.head), tool.bar_width / 2)]
+
+
+def _rod(start: Array, end: Array, radius: float) -> Solid:
+    """A cylinder from one point to another [m]."""
+    length = max(float(np.linalg.norm(end - start)), 2 * ROD)
+    along = (end - start) / length if length > 2 * ROD else np.array([0.0, 0.0, 1.0])
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()
+    return cylinder(radius, length).moved(np.eye(3), np.array([0.0, 0.0, length / 2])).moved(turn, start)
 
 
 def _hull(link: str, joint: int, solid: Solid) -> Piece | None:

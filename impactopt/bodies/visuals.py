@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.bodies.mjcf import geoms_of
-from impactopt.bodies.pieces import ROD, bare_joints, inertia_box
+from impactopt.bodies.pieces import ROD, bare_joints, inertia_box, tool_solids
 from impactopt.bodies.solids import Solid, cylinder, sphere
 from impactopt.bodies.urdf import numbers, shapes_of, urdf_root
+from impactopt.robots.parts import Tool
 from impactopt.robots.robot import Robot, Striker
 
 __all__ = ["Visual", "visuals_of"]
@@ -35,7 +36,7 @@ class Visual:
 
 
 def visuals_of(robot: Robot) -> list[Visual]:
-    """The robot's visual shapes; tools are rods.
+    """The robot's visual shapes; tools are rods, with a bar across the end of a hammer.
 
     What has lost its meshes is drawn by boxes of the links' inertia and bones between the joints, and so is a
     robot without shapes.
@@ -47,8 +48,7 @@ def visuals_of(robot: Robot) -> list[Visual]:
         return _from_inertia(robot)
     bare = bare_joints(robot, {visual.joint for visual in found})
     found += [visual for visual in _from_inertia(robot) if visual.joint in bare] if bare else []
-    tools = robot.source.tools if robot.source is not None else ()
-    return [*found, *_bones_to(robot, [tool.striker for tool in tools])]
+    return [*found, *(visual for tool in robot.tools for visual in _of_tool(robot, tool))]
 
 
 def _from_urdf(robot: Robot, urdf: Path) -> list[Visual]:
@@ -97,6 +97,17 @@ def _from_inertia(robot: Robot) -> list[Visual]:
         if parent > robot.floating:
             found += _bone(parent, np.array(model.jointPlacements[j].translation))
     return found + _bones_to(robot, robot.strikers.values())
+
+
+def _of_tool(robot: Robot, tool: Tool) -> Iterator[Visual]:
+    """A tool as large as it is, with a ball at a rod's end."""
+    frame = robot.model.frames[robot.model.getFrameId(tool.own_frame)]
+    solids = tool_solids(tool)
+    if tool.bar is None:
+        solids.append(sphere(THIN).moved(np.eye(3), np.asarray(tool.head)))
+    for solid in solids:
+        moved = solid.moved(frame.placement.rotation, frame.placement.translation)
+        yield Visual(joint=int(frame.parentJoint), solid=moved, colour=JOINT)
 
 
 def _bones_to(robot: Robot, strikers: Iterable[Striker]) -> list[Visual]:

@@ -153,6 +153,8 @@ class Tool:
     mass [kg], center (3,) [m] : its centre of mass; inertia (3, 3) [kg m2] : about that, in the axes of
         `frame`; three numbers are its diagonal.
     head (3,) [m] : the point that hits.
+    bar (3,) [m] : of a hammer, from the back of the bar across its end to the face that hits, where `head`
+        is; None: the tool is a rod to `head`.  bar_width [m] : of that bar.
     grip : how a link holds it that does not hold it firmly. It makes a joint, called as the tool with
         ``_grip`` behind, and a frame ``tool:<name>``, where `frame` is while the spring is at rest.
 
@@ -168,6 +170,8 @@ class Tool:
     center: Array
     inertia: Array
     head: Array
+    bar: Array | None = None
+    bar_width: float = 0.03
     grip: SoftGrip | None = None
 
     def __post_init__(self) -> None:
@@ -192,6 +196,13 @@ class Tool:
         for part in ("center", "head"):
             point = check_array(f"{what}: {part} [m]", getattr(self, part), (3,), most=FARTHEST)
             object.__setattr__(self, part, read_only(point))
+        if self.bar is not None:
+            bar = check_array(f"{what}: bar [m]", self.bar, (3,), most=FARTHEST)
+            if not np.linalg.norm(bar) > 0:
+                raise InputError(f"{what}: its bar has no length; leave it out for a rod")
+            object.__setattr__(self, "bar", read_only(bar))
+        if not check_array(f"{what}: bar_width [m]", self.bar_width, (), most=FARTHEST) > 0:
+            raise InputError(f"{what}: bar_width is {self.bar_width:g} m; give a number > 0")
 
     @classmethod
     def hammer(
@@ -236,6 +247,8 @@ class Tool:
             center=np.array(whole.lever),
             inertia=np.array(whole.inertia),
             head=end + head_length / 2 * bar,
+            bar=head_length * bar,
+            bar_width=head_width,
         )
 
     @property

@@ -106,6 +106,10 @@ class ToolSection(Section):
         "about the centre of mass [kg m2]: its diagonal, or a matrix by rows", "inertia_kg_m2"
     )
     head: Vector = required("the point that hits, in the frame [m]", "head_m")
+    bar: Vector = optional(
+        "of a hammer: from its bar's back to the face that hits, in the frame [m]", "bar_m"
+    )
+    bar_width: Positive = optional("of that bar [m]", "bar_width_m")
 
 
 _OfActuator: Any = section_of(Actuator)

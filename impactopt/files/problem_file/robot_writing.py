@@ -173,6 +173,7 @@ def _tool(tool: Tool) -> dict[str, Any]:
         "center_m": tool.center.tolist(),
         "inertia_kg_m2": tool.inertia.tolist(),
         "head_m": tool.head.tolist(),
+        **({} if tool.bar is None else {"bar_m": tool.bar.tolist(), "bar_width_m": float(tool.bar_width)}),
     }
 
 

@@ -1,0 +1,123 @@
+"""Prices of the motion style, and the measures of a motion that they are for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad, trapezoid
+from support.small_plans import Planned
+
+from impactopt.errors import InputError
+from impactopt.kinematics.splines import CubicSpline
+from impactopt.problem.motion_style import STYLES, MotionPrices
+from impactopt.robots.presets import talos
+from impactopt.transcription.motion_measures import ground_force_share, motion_measures
+from impactopt.transcription.objective import style_prices
+from impactopt.transcription.transcription import Transcription
+
+
+def integrals(curve: CubicSpline, order: int) -> np.ndarray:
+    """Integrals (ny,) of the squares of a spline's derivative [per s^order], by adaptive quadrature."""
+    step = 1e-5
+
+    def value(time: float, k: int) -> float:
+        if order == 1:
+            return float(curve.sample(time)[1][0][k] ** 2)
+        later, sooner = (curve.sample(np.clip(time + d, 0, curve.duration))[2][0][k] for d in (step, -step))
+        return float(((later - sooner) / (2 * step)) ** 2)
+
+    inner = curve.breaks * curve.duration
+    size = curve.control.shape[1]
+    out = np.zeros(size)
+    for k in range(size):
+        for a, b in pairwise(inner):
+            out[k] += quad(value, a + 2 * step, b - 2 * step, args=(k,), epsrel=1e-6)[0]
+    return out
+
+
+def test_the_price_of_jerk_is_the_integral_of_its_square(
+    arm_plan: Planned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    t = priced(arm_plan.transcription, monkeypatch, jerk=2.0)
+    x = arm_plan.result.x.copy()
+    for motion in (t.swing, *t.follows):  # prices take a phase's typical duration
+        motion.T.write(x, float(np.mean(motion.phase.duration)))
+    found = style_prices(t.builder, [t.swing, *t.follows], t.follows).evaluate(x)
+    expected = 2.0 * sum(integrals(motion.spline(x), 3).sum() for motion in (t.swing, *t.follows))
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_price_of_speed_is_nearly_that_of_its_square(
+    arm_plan: Planned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the nodes' shares of a phase: a quadrature of its own, within a few per cent."""
+    t = priced(arm_plan.transcription, monkeypatch, speed=3.0)
+    x = arm_plan.result.x.copy()
+    for motion in (t.swing, *t.follows):
+        motion.T.write(x, float(np.mean(motion.phase.duration)))
+    found = style_prices(t.builder, [t.swing, *t.follows], t.follows).evaluate(x)
+    expected = 3.0 * sum(integrals(motion.spline(x), 1).sum() for motion in (t.swing, *t.follows))
+    assert found == pytest.approx(expected, rel=0.05)
+
+
+def priced(t: Transcription, monkeypatch: pytest.MonkeyPatch, **prices: float) -> Transcription:
+    """The program, whose problem has a style with these prices alone."""
+    monkeypatch.setitem(STYLES, "of this test", MotionPrices(**prices))
+    monkeypatch.setattr(t.builder, "problem", replace(t.problem, style="of this test"))
+    return t
+
+
+def test_idle_joints_are_those_of_the_other_arm_and_the_head() -> None:
+    from impactopt import FreeMass, ImpactProblem, SpringDamper
+
+    robot = talos()
+    problem = ImpactProblem(
+        robot=robot,
+        striker="right_hand",
+        point=[0.6, -0.25, 1.1],
+        normal=[1, 0, 0],
+        law=SpringDamper(stiffness=1e4, damping=300.0),
+        target=FreeMass(mass=5.0),
+    )
+    idle = {name for name, yes in zip(robot.joint_names, problem.idle_joints, strict=True) if yes}
+    assert idle == {n for n in robot.joint_names if n.startswith(("arm_left", "head"))}
+
+
+def test_an_unknown_style_is_told(arm_plan: Planned) -> None:
+    with pytest.raises(InputError, match="unknown style 'naturl' .did you mean 'natural'"):
+        replace(arm_plan.problem, style="naturl")
+
+
+def test_measures_are_those_of_the_reference(biped_plan: Planned) -> None:
+    problem, reference = biped_plan.problem, biped_plan.trajectory
+    found = motion_measures(problem, reference)
+    rate = reference.v[:, -problem.robot.n :]
+    idle = problem.idle_joints
+    travel = trapezoid(np.abs(rate[:, idle]), reference.time, axis=0).sum() if idle.any() else 0.0
+    assert found["idle_travel_rad"] == pytest.approx(travel, rel=1e-2, abs=1e-3)
+    q = [problem.robot.joint_positions(reference.q[k]) for k in (0, -1)]
+    assert found["end_posture_rad"] == pytest.approx(np.abs(q[1] - q[0]).max())
+    low, high = found["ground_force_share"]
+    weight = 9.81 * sum(body.mass for body in problem.robot.model.inertias)
+    assert low * weight == pytest.approx(reference.ground[:, 2].min())
+    assert high * weight == pytest.approx(reference.ground[:, 2].max())
+
+
+def test_a_robot_at_rest_presses_with_its_weight(biped_plan: Planned) -> None:
+    low, high = ground_force_share(biped_plan.problem, biped_plan.trajectory.ground[:1, 2]) or (0.0, 0.0)
+    assert low == high == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_ground_force_stays_in_its_range_at_the_nodes(biped_plan: Planned) -> None:
+    """Of all soles and of each, as planned."""
+    p = biped_plan.problem
+    t, x = biped_plan.transcription, biped_plan.result.x
+    ground = next(term for term in p.active_terms if term.name == "ground force")
+    weight = 9.81 * sum(body.mass for body in p.robot.model.inertias)
+    for _, wrench in t.wrenches():
+        normal = wrench.evaluate(x)[2::6] / weight
+        assert ground.least - 1e-4 <= normal.sum() <= ground.most + 1e-4
+        assert len(normal) == 1 or normal.min() >= ground.sole - 1e-4

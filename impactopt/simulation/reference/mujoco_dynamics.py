@@ -179,7 +179,7 @@ def march(
         if k > _MOST_STEPS:
             raise InputError(
                 f"the contact is too fast to follow in MuJoCo: it takes steps of {step:.2g} s, and is not "
-                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or take FullDynamics"
+                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or FullDynamics"
             )
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
@@ -193,7 +193,8 @@ def march(
             if fastest * step > 2 * _RESOLVED:
                 raise _NotResolved(fastest)
         torque = forces.torque(demand, phase)
-        ends = not phase.touching or time >= horizon * (1 - 1e-9)
+        # hand and target that neither approach nor part: the next step decides
+        ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end = world.state()
         world.apply(torque - forces.friction(velocity, phase), force)

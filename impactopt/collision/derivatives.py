@@ -88,7 +88,7 @@ def differentiable(
     compiled : (name, what, build) -> the compiled function of these, as `SymbolicModel._compiled`.
     """
 
-    def late(part: Part) -> tuple[Any, Mapping[str, Array]]:
+    def late(part: Part) -> tuple[Any, Mapping[str, Any]]:
         function = _late(model, whole, part, every, compiled)
         return function, function.sizes
 
@@ -107,7 +107,7 @@ def with_jacobian(
     whole: Any,
     parameters: tuple[str, ...],
     by: tuple[str, ...] | None,
-    derivatives: Callable[[Part], tuple[Any, Mapping[str, Array]]],
+    derivatives: Callable[[Part], tuple[Any, Mapping[str, Any]]],
     name: str = "",
 ) -> tuple[Any, Any]:
     """(ca.Function of q, v[, feedforward] and the parameters; its Jacobian's blocks, in CasADi's own form).

@@ -40,7 +40,7 @@ def export(
     native = native_collision(model, tuple(whole.name_out()), every=every)
     codes = {native.name: native.code}
 
-    def derivatives(part: Part) -> tuple[Any, Mapping[str, float]]:
+    def derivatives(part: Part) -> tuple[Any, Mapping[str, Any]]:
         what, build = native_part(model, part, every)
         codes[part.name] = build().code
         function = compiled(part.name, what, build)

@@ -162,21 +162,14 @@ class _Run:
             sign = np.clip(joint_rate / self.model.transition, -1.0, 1.0)
             net = torque - (self.viscous * joint_rate + self.coulomb * sign)
         compressing = rate > 0.0 or (rate == 0.0 and self._closing(y, depth, net))
-        return _Instant(
-            u=u,
-            demand=demand,
-            free=torque == demand,
-            net=net,
-            rate=rate,
-            compressing=compressing,
-            contact=compressing or self.law.left(depth, rate) > 0.0,
-        )
+        contact = compressing or self.law.left(depth, rate) > 0.0
+        return _Instant(u, demand, torque == demand, net, rate, compressing, contact)
 
     def _closing(self, y: Array, depth: float, net: Array) -> bool:
         """Whether hand and target, which neither approach nor part, are about to approach."""
         slope, parts, z = np.zeros(y.size), self.parts, y[self.parts["target"]]
-        force = max(self.law.force(depth, 0.0, False)[0], 0.0)
-        slope[parts["torque"]], slope[parts["impulse"]], slope[parts["time"]] = net, force, 1.0
+        slope[parts["torque"]], slope[parts["time"]] = net, 1.0
+        force = slope[parts["impulse"]] = max(self.law.force(depth, 0.0, False)[0], 0.0)
         gained = self.law.velocity(z + 1e-9 * self.law.rates(z, force)) - self.law.velocity(z)
         return bool(self.rows.speeds[-1] @ slope > gained / 1e-9)
 
@@ -298,8 +291,7 @@ class _Run:
         for b in self.switch_terms(s).T @ _HULL:
             if b[0] != 0.0:
                 falling.append(-b if b[0] < 0.0 else b)
-            elif b.any():
-                # a tie: the target goes by the piece that zero belongs to, which may not be the next
+            elif b.any():  # a tie: the target goes by the piece of zero, which may not be the next
                 places.append(0.0)
         places += [first_negative(b) for b in falling]
         return min((place for place in places if place is not None and place < end), default=None)

@@ -69,8 +69,8 @@ class SymbolicModel(SteppedModel):
         that `parameters` name (any of `settings`), in their order; the others are fixed. What no output needs
         is left out.
         If an input is NaN, or what holds the robot cannot be told apart at q, all outputs are NaN,
-        `separated` too. So are they if the contact has not ended at the horizon; ask for `separated` as an
-        output, and they are what happened so far.
+        `separated` too. So are they if the contact has not ended at the horizon, unless `separated` or
+        `duration` are among them, which tell it: then they are what happened so far.
 
         CasADi can differentiate it with respect to all inputs (jacobian, forward, reverse), and twice by
         differences. The code for this is compiled when it is first evaluated. A single scalar output has an

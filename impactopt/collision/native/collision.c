@@ -3,7 +3,7 @@
 static void evaluate(const double **arg, double **res, Work *w) {
   Course course;
   collide(arg, res, w, &course);
-#ifndef OUT_separated
+#if !defined OUT_separated && !defined OUT_duration
   /* nothing else would tell that it is not over */
   if (course.in_contact) {
     no_numbers(res);

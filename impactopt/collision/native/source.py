@@ -125,7 +125,7 @@ def native_differences(
 
 def _over(collision: SteppedModel, outputs: tuple[str, ...], every: int) -> ca.Function:
     """The graph, without numbers where the contact is not over and no output says so, as C code has it."""
-    named = outputs if "separated" in outputs else (*outputs, "separated")
+    named = outputs if {"separated", "duration"} & {*outputs} else (*outputs, "separated")
     graph = collision_graph(collision, named, every=every, as_compiled=True)
     if named is outputs:
         return graph

@@ -28,7 +28,7 @@ __all__ = [
     "worst_rows",
 ]
 
-PHASES = ("swing", "collision", "follow")
+PHASES = ("swing", "collision", "follow", "missed")
 SLIP = 5.0  # [mm] on free soles: a plan within its friction slides less
 EDGE = 0.1  # [mm, N] by which a sole that tips on its edge may seem to be outside
 Columns = Mapping[str, Mapping[str, Any]]

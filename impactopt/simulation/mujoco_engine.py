@@ -29,7 +29,7 @@ from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Touches
+from impactopt.simulation.touch import Followed, Touches
 
 Array = NDArray[np.float64]
 THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
@@ -62,6 +62,7 @@ class _Replay(MujocoRobot):
         super().__init__(robot, world, *(site_name(k + 1) for k in range(len(scene.strikers))))
         self.grips = Welds(self.world, scene.hands)
         self.besides = Besides(self.world, solids)
+        self.planned = self.followed = reference
         self.follow(reference)
         self.struck = Struck(self.scene)
         # the target's state, and how far it has gone [m]
@@ -86,18 +87,14 @@ class _Replay(MujocoRobot):
         self.start(self.reference_q[0])
 
     def follow(self, reference: Any) -> None:
-        """What the servo follows from now on."""
-        world = self.perturbation
+        """What servo and controller follow from now on."""
+        world, self.followed = self.perturbation, reference
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
         if self.floating:
             self.upright = _upright(self.reference_q[:, 3:7].T)
-
-    def miss(self, reference: Any) -> None:
-        """What they follow from now on, as nothing is hit."""
-        self.follow(reference)
         if self.wbc is not None:
-            self.wbc.miss(reference)
+            self.wbc.follow(None if reference is self.planned else reference)
 
     def asked(self, t: float, forces: Array) -> tuple[Array, Array]:
         """Torque demand (n,) [N m] at a time [s], and what saturation leaves of it."""
@@ -280,8 +277,8 @@ def simulate_mujoco(
     :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
-    missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
-        default: it does not notice.
+    missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
+        :class:`impactopt.simulation.touch.Followed`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 
@@ -310,6 +307,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
+    followed = Followed(reference, missed)
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     undriven = bool(passive.any())
     drive: Array | None = None  # torque of the motors
@@ -320,9 +318,9 @@ def simulate_mujoco(
         for k in range(round(min(float(reference.end) + settle, until) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
-            if missed is not None and t >= missed.contact_end and not touches.intervals:
-                replay.miss(missed)
-                servo, missed = replay.servo, None
+            if (now := followed.at(t, bool(touches.intervals))) is not replay.followed:
+                replay.follow(now)
+                servo = replay.servo
             if k % hold == 0:
                 asked = replay.asked(t, forces)
                 # at rest before the start, it asked for the same
@@ -386,5 +384,6 @@ def simulate_mujoco(
         fall=fall,
         touched=replay.besides.touched(),
         missed=world.missing,
+        expected=float(reference.contact_start),
     )
     return simulation if fall else replace(simulation, fall=replay.not_standing(simulation))

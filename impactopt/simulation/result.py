@@ -18,6 +18,7 @@ from impactopt.simulation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
 PHASES = ("swing", "collision", "follow")
+PHASES_OF_MISS = ("swing", "missed")  # up to the planned contact, and from there on
 REPORT = (
     "engine",
     "standing",
@@ -113,7 +114,8 @@ class Simulation:
     posture_error [rad]: of the joint, or of the base's orientation, that ends farthest from the reference's
     last posture.  touched: pairs of bodies that touched and should not have, if the engine has solids that
     push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
-    geometry, and which two.  missed: there was no target.  touches: start and end [s] and impulse [N s] of
+    geometry, and which two.  missed: there was no target.  expected [s]: when the reference has contact
+    begin.  touches: start and end [s] and impulse [N s] of
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
@@ -148,6 +150,7 @@ class Simulation:
     clearance: float = np.nan
     nearest: tuple[str, ...] = ()
     missed: bool = False
+    expected: float = np.nan
     touches: tuple[tuple[float, float, float], ...] = ()
     step_error: float = np.nan
     gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
@@ -195,9 +198,11 @@ class Simulation:
         Without contact there is no speed at contact and no error of its impulse: None.
         """
         hit = bool(np.isfinite(self.contact_start))
-        if not hit and self.fall is None:
+        if not hit and self.fall is None and not self.missed:
             raise InputError("the simulated motion never touched the target")
-        phase, known = self.phase(), bool(np.isfinite(self.clearance))
+        known = bool(np.isfinite(self.clearance))
+        phase = self.phase() if hit else (self.time >= self.expected).astype(int)
+        names = PHASES if hit else PHASES_OF_MISS
         out: dict[str, Any] = {
             "engine": self.engine,
             "standing": self.standing,
@@ -224,13 +229,13 @@ class Simulation:
             out["impulses_Ns"] = self.impulses.tolist()
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {
-            n: float(ratio[phase == k].max()) for k, n in enumerate(PHASES) if (phase == k).any()
+            n: float(ratio[phase == k].max()) for k, n in enumerate(names) if (phase == k).any()
         }
         if len(polygon):
             inside = distance_inside(polygon, self.zmp())
             out["zmp_margin_m"] = {
                 n: float(np.nanmin(inside[phase == k]))
-                for k, n in enumerate(PHASES)
+                for k, n in enumerate(names)
                 if np.isfinite(inside[phase == k]).any()
             }
             out |= least_margins(

@@ -252,8 +252,9 @@ class Plan:
             legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
         time, q, v, a_, torque, ground, wrench = (np.concatenate([p[k] for p in parts]) for k in range(1, 8))
-        # held while in contact: the collision model counts on what makes the robot coast at contact
-        torque[phases == 1] = self.collision.torque[0]
+        # held while in contact: the collision model counts on what makes the robot coast at contact. Beyond the
+        # planned contact nothing does, and postures on the way differ: there it is what coasting needs
+        torque[(phases == 1) & (time <= self.contact_end)] = self.collision.torque[0]
         return Trajectory(
             time=time,
             phase=phases,
@@ -342,14 +343,18 @@ class Plan:
         return np.array(q).reshape(len(y), self.problem.robot.nq)
 
     def margins(
-        self, trajectory: Trajectory | None = None, collision: PlannedCollision | None = None
+        self,
+        trajectory: Trajectory | None = None,
+        collision: PlannedCollision | None = None,
+        missed: Trajectory | None = None,
     ) -> dict[str, dict[str, float]]:
-        """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through.
+        """Planned ZMP margin [m] and torque demand over limit, in swing, collision, follow-through, and from
+        the planned contact on if nothing is hit.
 
         Of an impact without duration the plan knows neither, so there is no number for the collision.
 
         trajectory : the reference, if it is known.  collision : the planned one at more instants than the
-        program has, such as `ContactError.finer`.
+        program has, such as `ContactError.finer`.  missed : the reference of a robot that hits nothing.
         """
         ref = self.trajectory() if trajectory is None else trajectory
         limit = self.problem.robot.torque_limit
@@ -358,7 +363,10 @@ class Plan:
         grounds = [ref.ground[phase == 0], hit.ground, ref.ground[phase == 2]]
         during = hit.torque if len(hit.ground) else hit.torque[:0]
         torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
-        names = ("swing", "collision", "follow")
+        if missed is not None:
+            grounds.append(missed.ground[missed.phase > 0])
+            torques.append(missed.torque[missed.phase > 0])
+        names = ("swing", "collision", "follow", "missed")[: len(torques)]
         ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
         out = {"torque_ratio": ratio}
         if len(self.polygon):

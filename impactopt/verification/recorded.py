@@ -91,12 +91,11 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
     r, n = robot.robot, robot.n
     start, end = (float(arrays[f"{prefix}_contact_{side}"]) for side in ("start", "end"))
     worst.note(f"{prefix} times", _gap(start, v.one(swing.T)), "contact")
+    lasts = blow = sum(v.one(name) for name in p.blows[0].durations) if p.blows else end - start
     if not p.problem.lasts:
-        lasts = 0.0
-    elif last.kind == "abort":
+        lasts = blow = 0.0
+    if last.kind == "abort":
         lasts = float(p.problem.abort_after or 0.0)
-    else:
-        lasts = sum(v.one(name) for name in p.blows[0].durations) if p.blows else end - start
     worst.note(f"{prefix} times", _gap(end - start, lasts), "end of contact")
     worst.note(f"{prefix} times", _gap(float(arrays[f"{prefix}_end"]), end + v.one(last.T)), "end")
     angles = np.array([r.joint_positions(q) for q in a["q"]])
@@ -122,7 +121,7 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
         worst.note(f"{prefix} rates", _gap(a["v"][k], qd), where)
         worst.note(f"{prefix} accelerations", _gap(a["a"][k], qdd, max(1.0, np.abs(qdd).max())), where)
         demand = a["torque"][k] / r.torque_limit
-        if phase == 1:
+        if phase == 1 and time <= start + blow:
             worst.note(f"{prefix} torque", _gap(demand, ff), where)
         else:
             for what, off in _balanced(p, q, tau, a["torque"][k], a["ground"][k]):

@@ -173,7 +173,7 @@ class _World:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Followed:
+class FollowedContact:
     """A contact, from where it is planned to begin.
 
     impulse [N s] to the target.  peak [N] : the largest force of all strikers together.  outcome : of the
@@ -190,7 +190,7 @@ class Followed:
 
 def follow_contact(
     robot: Robot, reference: Any, scene: Scene, *, step: float, until: float, longest: float
-) -> Followed:
+) -> FollowedContact:
     """The contact alone, in the same full dynamics, from the state and at the time at which it is planned.
 
     reference : as of :func:`simulate_pinocchio`.  step [s].  until [s] since contact: it goes on for so long,
@@ -228,7 +228,7 @@ def follow_contact(
         side = now
         left = state.target if state.impulses.sum() > before.impulses.sum() else left
         check_not_diverged(state.v, start + since, step)
-    return Followed(
+    return FollowedContact(
         impulse=float(state.impulses.sum()),
         peak=peak,
         outcome=scene.target.outcome(left),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError
 from impactopt.planning.multistart import VIOLATED
 from impactopt.problem.problem import ImpactProblem
-from impactopt.simulation.pinocchio_engine import FollowedContact, follow_contact
+from impactopt.simulation.pinocchio_engine import Followed, follow_contact
 from impactopt.simulation.reference.coasting import independent_rates
 from impactopt.simulation.scene import scene_of
 from impactopt.solvers.program import SolverResult, Status
@@ -144,7 +144,7 @@ class PlannedContact:
 
 
 def _told(
-    problem: ImpactProblem, planned: Plan | PlannedStrike, found: FollowedContact, known: float
+    problem: ImpactProblem, planned: Plan | PlannedStrike, found: Followed, known: float
 ) -> ContactReplay:
     duration = planned.compression + planned.restitution
     gaps = [after[0] - before[1] for before, after in pairwise(found.touches)]

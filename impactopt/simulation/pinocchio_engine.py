@@ -22,7 +22,7 @@ from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Followed, Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 
@@ -173,7 +173,7 @@ class _World:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FollowedContact:
+class Followed:
     """A contact, from where it is planned to begin.
 
     impulse [N s] to the target.  peak [N] : the largest force of all strikers together.  outcome : of the
@@ -190,7 +190,7 @@ class FollowedContact:
 
 def follow_contact(
     robot: Robot, reference: Any, scene: Scene, *, step: float, until: float, longest: float
-) -> FollowedContact:
+) -> Followed:
     """The contact alone, in the same full dynamics, from the state and at the time at which it is planned.
 
     reference : as of :func:`simulate_pinocchio`.  step [s].  until [s] since contact: it goes on for so long,
@@ -228,7 +228,7 @@ def follow_contact(
         side = now
         left = state.target if state.impulses.sum() > before.impulses.sum() else left
         check_not_diverged(state.v, start + since, step)
-    return FollowedContact(
+    return Followed(
         impulse=float(state.impulses.sum()),
         peak=peak,
         outcome=scene.target.outcome(left),
@@ -257,7 +257,7 @@ def simulate_pinocchio(
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
     missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
-        ``missed.contact_end`` (see :class:`impactopt.simulation.touch.Followed`); default: it does not.
+        ``missed.contact_end`` (:class:`impactopt.simulation.touch.FollowedReference`); default: it does not.
 
     Raises
     ------
@@ -270,7 +270,7 @@ def simulate_pinocchio(
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
-    followed = Followed(reference, missed)
+    followed = FollowedReference(reference, missed)
     for k in range(round(end / step)):
         t = k * step
         if (now := followed.at(t, bool(touches.intervals))) is not world.followed:

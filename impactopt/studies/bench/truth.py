@@ -139,7 +139,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         out["impulse_planned_Ns"] = solution.impulse
         replay = solution.validate()
         told = solution.summary(replay)
-        held = told["simulated"]
+        held = _with_missed(told["simulated"], solution)
         out |= {
             "clearance_mm": _least(told["clearance_mm"], held["clearance_mm"]),
             "touches": len([*told["contacts_besides"], *(held["contacts_besides"] or ())]),
@@ -160,7 +160,9 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         return out
     try:
         replay = solution.validate(engine="mujoco", controller=controller)
-        free = solution.summary(replay)["simulated"]
+        free = _with_missed(
+            solution.summary(replay)["simulated"], solution, engine="mujoco", controller=controller
+        )
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}
         return out
@@ -179,6 +181,17 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         "reason": free["reason"],
     }
     return out
+
+
+def _with_missed(found: dict[str, Any], solution: Solution, **options: Any) -> dict[str, Any]:
+    """A replay's numbers with those of the soles in a replay of the missed blow, if the plan has one."""
+    if solution.plan.abort is None:
+        return found
+    miss = solution.summary(solution.validate(missing=True, **options))["simulated"]
+    for key in ("sole_cop_margin_mm", "sole_force_N"):
+        for sole, phases in (miss.get(key) or {}).items():
+            found[key][sole] |= {phase: kept for phase, kept in phases.items() if phase == "missed"}
+    return found
 
 
 def _soles(found: Mapping[str, Any]) -> dict[str, Any]:

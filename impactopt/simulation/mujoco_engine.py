@@ -378,5 +378,4 @@ def simulate_mujoco(
         fall=fall or replay.not_standing(ground[: len(scene.soles)], weight_of(robot)),
         touched=replay.besides.touched(),
         missed=world.missing,
-        expected=float(reference.contact_start),
     )

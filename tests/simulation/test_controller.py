@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco, solids
 from impactopt.simulation.controller import controller_of
+from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.cones import cone_of
 from impactopt.simulation.controller.estimate import StateEstimate
 from impactopt.simulation.controller.held import HeldDynamics
@@ -360,3 +362,41 @@ def test_only_links_that_a_shift_brings_nearer_are_looked_at() -> None:
     moves[model.joints[foot].idx_v] = 0.1
     assert all_pairs.links_between(model, moves).pairs == ((0, 2), (1, 2))
     assert all_pairs.links_between(model, np.r_[np.ones(6), np.zeros(robot.nv - 6)]).pairs == ()
+
+
+# ---- clearance
+
+
+def test_near_links_brake_by_how_their_distance_changes() -> None:
+    """Two cubes on sliders: what keeps them apart is known in closed form."""
+    model = pin.Model()
+    slider = pin.JointModelPX()
+    for k in range(2):
+        model.addJoint(0, slider, pin.SE3.Identity(), f"slider {k}")
+    cube = 0.05 * np.array(list(itertools.product((-1, 1), repeat=3)), dtype=float)
+    apart = Solids(
+        solids=tuple(Solid(name=f"cube {k}", joint=k + 1, vertices=cube) for k in range(2)), pairs=((0, 1),)
+    )
+
+    def constraints(of: Clearance, gap: float, speed: float) -> tuple[Array, Array]:
+        data, q, v = model.createData(), np.array([0.0, 0.1 + gap]), np.array([speed, 0.0])
+        pin.forwardKinematics(model, data, q, v, np.zeros(2))
+        pin.computeJointJacobians(model, data)
+        return of.constraints(data)
+
+    rows, least = constraints(Clearance(model, apart, period=1e-3), 0.01, 0.0)
+    np.testing.assert_allclose(rows, [[-1.0, 1.0]], atol=1e-9)
+    assert least[0] == pytest.approx(-(40.0**2) * (0.01 - 0.002))
+    # far apart at rest there is none; faster than they can be stopped in there is one that asks them to brake
+    near = Clearance(model, apart, period=1e-3)
+    assert len(constraints(near, 0.2, 0.0)[1]) == 0
+    constraints(near, 0.052, 2.0)
+    _, least = constraints(near, 0.05, 2.0)
+    assert least[0] == pytest.approx(2 * 40.0 * 2.0 - 40.0**2 * 0.048)
+    # who is held to it comes to rest before the distance is used up
+    near, gap, rate = Clearance(model, apart, period=1e-3), 0.1, -1.5
+    for _ in range(200):
+        _, least = constraints(near, gap, -rate)
+        rate += 1e-3 * (float(least[0]) if len(least) else 0.0)
+        gap += 1e-3 * rate
+    assert 0.002 < gap < 0.02 and abs(rate) < 0.1

@@ -67,9 +67,9 @@ class Clearance:
             result = self._distance(data, *pair)
             self._known[i], self._then[i] = result.min_distance, self._moved[pair].sum()
             found.append(self._constraint(data, *pair, result))
-        found.sort(key=lambda row: -row[1])
-        rows = [row for row, _ in found[:MOST]]
-        return np.reshape(rows, (len(rows), self._model.nv)), np.array([c for _, c in found[:MOST]])
+        found = sorted((row for row in found if row[1] > -HARDEST), key=lambda row: -row[1])[:MOST]
+        rows = np.reshape([row for row, _ in found], (len(found), self._model.nv))
+        return rows, np.array([least for _, least in found])
 
     def _follow(self, data: Any) -> None:
         """Adds what the bodies have moved: the middle's way, and the farthest point's turn about it."""

@@ -99,7 +99,8 @@ def load_planned(
 
 
 def _trajectory(record: Record, prefix: str) -> Trajectory:
-    given = {f.name: record.arrays[f"{prefix}_{f.name}"] for f in dataclasses.fields(Trajectory)}
+    named = {f.name: f"{prefix}_{f.name}" for f in dataclasses.fields(Trajectory)}
+    given = {name: record.arrays[key] for name, key in named.items() if key in record.arrays}
     fields: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in given.items()}
     return Trajectory(**fields)
 

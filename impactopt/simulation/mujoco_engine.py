@@ -8,6 +8,7 @@ feed-forward), the robot's numbers and the scene's.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
+from impactopt.robots.sole_margins import BEARS, weight_of
 from impactopt.simulation.besides import Besides
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.gears import GearWatch
@@ -26,15 +28,15 @@ from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
-from impactopt.simulation.soles import BEARS, sole_names, weight_of
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Followed, Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
+SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
 
 
 class _Replay(MujocoRobot):
@@ -229,8 +231,8 @@ class _Replay(MujocoRobot):
         w, x, y, z = self.data.qpos[3:7].tolist()
         return np.arccos(np.clip(self.upright[rows] @ _upright((x, y, z, w)), -1.0, 1.0))
 
-    def not_standing(self, sole_ground: Array, weight: float) -> str:
-        """Why the robot does not stand at the end, "" if it does."""
+    def not_standing(self, simulation: Simulation) -> str:
+        """Why the robot does not stand at the end of its simulation, where it stood; "" if it does."""
         if not self.floating:
             return ""
         lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
@@ -238,9 +240,13 @@ class _Replay(MujocoRobot):
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STIRS:
             return f"still moves at the end: base at {speed:.2f} m/s"
-        for name, wrench in zip(sole_names(self.robot, self.scene), sole_ground, strict=True):
-            if wrench[2] < BEARS * weight:
+        least = BEARS * weight_of(self.robot)
+        normal, slip = simulation.sole_normal[-1], simulation.slip.max(axis=0)
+        for name, force, slid in zip(simulation.soles, normal, slip, strict=True):
+            if force < least:
                 return f"the sole {name!r} bears no load at the end"
+            if slid > SLID:
+                return f"the sole {name!r} slid: {1e3 * slid:.0f} mm along the floor"
         return ""
 
 
@@ -272,7 +278,7 @@ def simulate_mujoco(
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
-        :class:`impactopt.simulation.touch.Followed`); default: it does not notice.
+        :class:`impactopt.simulation.touch.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 
@@ -301,7 +307,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
-    followed = Followed(reference, missed)
+    followed = FollowedReference(reference, missed)
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     undriven = bool(passive.any())
     drive: Array | None = None  # torque of the motors
@@ -362,7 +368,7 @@ def simulate_mujoco(
                 if fall:
                     fall = f"{fall} at t = {t:.2f} s"
                     break
-    return simulation_of(
+    simulation = simulation_of(
         robot,
         replay.scene,
         rows,
@@ -375,7 +381,8 @@ def simulate_mujoco(
         saturated=saturated,
         cuts=cuts.told() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
-        fall=fall or replay.not_standing(ground[: len(scene.soles)], weight_of(robot)),
+        fall=fall,
         touched=replay.besides.touched(),
         missed=world.missing,
     )
+    return simulation if fall else replace(simulation, fall=replay.not_standing(simulation))

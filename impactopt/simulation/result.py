@@ -12,6 +12,7 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads
+from impactopt.robots.sole_margins import least_margins
 from impactopt.simulation.motors import MotorCut
 from impactopt.simulation.solids import Solids, Touched
 
@@ -48,9 +49,9 @@ REPORT = (
     "motor_cut_joint",
     "motor_cuts",
     "sole_lift_collision_mm",
-    "min_normal_force_N",
     "hand_speed_m_s",
-    "sole_cop_margin_m",
+    "sole_cop_margin_mm",
+    "sole_force_N",
     "target",
     "grip_force_N",
     "clearance_mm",
@@ -102,9 +103,9 @@ class Simulation:
     q (k, nq) and v (k, nv), pin's; force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m]
     servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
     each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; soles:
-    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, nan
-    where it bears no load; slip, lift (k, soles) [m]: how far the corner of a sole that moved most went along
-    the ground, and rose.
+    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, as
+    of :func:`impactopt.robots.sole_margins.cop_margin`; slip, lift (k, soles) [m]: how far the corner of a
+    sole that moved most went along the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
     integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
     outcome: the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
@@ -237,12 +238,12 @@ class Simulation:
                 for k, n in enumerate(names)
                 if np.isfinite(inside[phase == k]).any()
             }
-            out["min_normal_force_N"] = float(self.sole_normal.min())  # of any one sole
-            out["sole_cop_margin_m"] = {
-                n: float(np.nanmin(m))
-                for n, m in zip(self.soles, self.cop_margin.T, strict=True)
-                if np.isfinite(m).any()
-            }
+            out |= least_margins(
+                self.soles,
+                self.cop_margin,
+                self.sole_normal,
+                {"missed": phase == 0} if self.missed else {n: phase == k for k, n in enumerate(PHASES)},
+            )
             if self.grip_force.size:
                 out["grip_force_N"] = float(self.grip_force.max())
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())

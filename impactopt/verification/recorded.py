@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
+from impactopt.problem.terms import ContactWrenchCone
+from impactopt.robots.sole_margins import SHARE, cop_margin, least_kept
 from impactopt.verification.motions import Way
 from impactopt.verification.program import Program
 from impactopt.verification.variables import Variables
@@ -141,7 +143,8 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
 def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) -> Iterator[tuple[str, float]]:
     """Whether torques and the ground's wrench are what a motion needs, that needs tau (nv,) without soles.
 
-    Each sole's wrench follows from its leg's torques; together they have to be the ground's.
+    Each sole's wrench follows from its leg's torques; together they have to be the ground's, and each has to
+    keep half of the margins that the problem asks for.
     """
     robot, limit = p.robot, p.problem.robot.torque_limit
     free, rest = np.setdiff1d(np.arange(robot.n), robot.dependent), tau.copy()
@@ -156,6 +159,12 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
     six = robot.wrench_scale[:6]
     yield "ground wrench", _gap(world, ground, six)
     yield "equation of motion of the base", _gap(rest[: robot.base] / six, np.zeros(robot.base))
+    if robot.standing:
+        corners = [leg.sole.polygon for leg, *_ in robot.soles if leg.sole is not None]
+        own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
+        kept = float(cop_margin(robot.robot, corners, own[None]).min())
+        yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept
+        yield "normal force of a sole", (SHARE * cone.minimum_force - float(own[:, 2].min())) / robot.weight
 
 
 def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:

@@ -96,7 +96,7 @@ class WholeBodyController:
         self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
     def follow(self, missed: Any | None) -> None:
-        """Goes over to the reference of a robot that hits nothing; None: to the plan's."""
+        """Track from now on the plan's blow (None), or the reference of a robot that hits nothing."""
         self.target = self.of_blow
         if missed is not None:
             self.target = Target(self.robot, missed, self.scene.strikers, spread=False)
@@ -201,7 +201,7 @@ class WholeBodyController:
         for k, place in enumerate(held.places):
             lift[3:, 6 * k : 6 * k + 3] = pin.skew((place.translation - com) / mass)
         # the divergent component of motion: com + rate / omega
-        gain, omega = s.capture_gain, math.sqrt(9.81 / max(com[2], 0.1))
+        gain, omega = s.capture_gain, math.sqrt(np.linalg.norm(self.gravity) / max(com[2], 0.1))
         error = Ag @ lag
         if recovers:  # the centre of mass has an aim of its own, the joints' motion does not bring it there
             error[:3] = mass * aim.com[1] - data.hg.linear

@@ -345,8 +345,7 @@ class Solution(Solved):
 
     def sole_margins(self) -> dict[str, Any]:
         """Margins of each sole by itself, as of `Plan.sole_margins`."""
-        missed = self.missed_trajectory if self.plan.abort is not None else None
-        return self.plan.sole_margins(self.trajectory, self.collision, missed)
+        return self.plan.sole_margins(self.trajectory, self.collision, self._missed)
 
     @cached_property
     def loads(self) -> DriveLoads:

@@ -400,3 +400,33 @@ def test_near_links_brake_by_how_their_distance_changes() -> None:
         rate += 1e-3 * (float(least[0]) if len(least) else 0.0)
         gap += 1e-3 * rate
     assert 0.002 < gap < 0.02 and abs(rate) < 0.1
+
+
+def test_a_link_that_turns_and_an_obstacle_brake_by_their_distances_second_rate() -> None:
+    """A cube's corner above a floor of its own: the least rate, against differences of the distance."""
+    model = pin.Model()
+    places = pin.SE3.Identity(), pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.1]))
+    for k, (joint, place) in enumerate(zip((pin.JointModelRY(), pin.JointModelRX()), places, strict=True)):
+        model.addJoint(k, joint, place, f"joint {k}")
+    cube = 0.05 * np.array(list(itertools.product((-1, 1), repeat=3)), dtype=float)
+    plate = Solid(
+        name="plate", half=np.array([1.0, 1.0, 0.05]), place=np.array([0.0, 0.0, -0.3]), rotation=np.eye(3)
+    )
+    apart = Solids(solids=(Solid(name="cube", joint=2, vertices=cube), plate), pairs=((0, 1),))
+    q, v, a, h = np.array([0.9, 0.4]), np.array([1.3, -0.8]), np.array([0.7, 2.0]), 1e-4
+
+    def height(t: float) -> float:
+        """Of the lowest corner above the plate, by kinematics."""
+        data = model.createData()
+        pin.forwardKinematics(model, data, q + t * v + t**2 / 2 * a)
+        return float(min(data.oMi[2].act(corner)[2] for corner in cube) + 0.25)
+
+    data = model.createData()
+    pin.forwardKinematics(model, data, q, v, np.zeros(2))
+    pin.computeJointJacobians(model, data)
+    rows, least = Clearance(model, apart, period=1e-3).constraints(data)
+    before, now, after = (height(t) for t in (-h, 0.0, h))
+    rate, second = (after - before) / (2 * h), (after - 2 * now + before) / h**2
+    # what the accelerations have beyond what is asked for, is what the second rate has
+    beyond = second + 2 * 40.0 * rate + 40.0**2 * (now - 0.002)
+    assert float(rows[0] @ a - least[0]) == pytest.approx(beyond, abs=1e-4)

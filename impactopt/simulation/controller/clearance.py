@@ -58,62 +58,77 @@ class Clearance:
         data : Pinocchio's, with the joints' placements, velocities, Jacobians, and with accelerations for
             a = 0.
         """
-        self._follow(data)
+        places = self._follow(data)
         gap = self._known - (self._moved[self._pairs].sum(axis=1) - self._then)
         speed = self._moves[self._pairs].sum(axis=1) / self._period
-        found = []
-        for i in np.flatnonzero(_least(gap, -speed) > -HARDEST):
-            pair = [int(k) for k in self._pairs[i]]
-            result = self._distance(data, *pair)
-            self._known[i], self._then[i] = result.min_distance, self._moved[pair].sum()
-            found.append(self._constraint(data, *pair, result))
-        found = sorted((row for row in found if row[1] > -HARDEST), key=lambda row: -row[1])[:MOST]
-        rows = np.reshape([row for row, _ in found], (len(found), self._model.nv))
-        return rows, np.array([least for _, least in found])
+        looked = np.flatnonzero(_least(gap, -speed) > -HARDEST)
+        if not len(looked):
+            return np.zeros((0, self._model.nv)), np.zeros(0)
+        pairs = self._pairs[looked]
+        found = self._distances(data, pairs)
+        distance = np.array([result.min_distance for result in found])
+        self._known[looked], self._then[looked] = distance, self._moved[pairs].sum(axis=1)
+        normals = np.array([result.normal for result in found])  # from the one to the other
+        points = np.array([(r.getNearestPoint1(), r.getNearestPoint2()) for r in found])
+        joints = self._joints[pairs]
+        arms = points - places[joints]
+        velocity, acceleration = _of_points(data, joints, arms)
+        rate = (normals * (velocity[:, 1] - velocity[:, 0])).sum(axis=1)
+        drift = (normals * (acceleration[:, 1] - acceleration[:, 0])).sum(axis=1)
+        least = _least(distance, rate) - drift
+        chosen = [k for k in np.argsort(-least)[:MOST] if least[k] > -HARDEST]
+        rows = np.zeros((len(chosen), self._model.nv))
+        for row, k in zip(rows, chosen, strict=True):
+            for joint, arm, sign in zip(joints[k], arms[k], (-1.0, 1.0), strict=True):
+                if joint:
+                    J = pin.getJointJacobian(self._model, data, int(joint), _AXES)
+                    row += sign * (normals[k] @ J[:3] + np.cross(arm, normals[k]) @ J[3:])
+        return rows, least[chosen]
 
-    def _follow(self, data: Any) -> None:
-        """Adds what the bodies have moved: the middle's way, and the farthest point's turn about it."""
+    def _follow(self, data: Any) -> Array:
+        """Adds what the bodies have moved: the middle's way, and the farthest point's turn about it. Places
+        (joints, 3) [m].
+        """
         turns = np.array([place.rotation for place in data.oMi])[self._joints]
-        places = np.array([place.translation for place in data.oMi])[self._joints]
-        places = places + (turns @ self._middles[:, :, None])[:, :, 0]
+        origins = np.array([place.translation for place in data.oMi])
+        middles = origins[self._joints] + (turns @ self._middles[:, :, None])[:, :, 0]
         if self._last is not None:
-            way = np.linalg.norm(places - self._last[1], axis=1)
+            way = np.linalg.norm(middles - self._last[1], axis=1)
             chord = np.linalg.norm(turns - self._last[0], axis=(1, 2)) / np.sqrt(2.0)
             self._moves = way + self._radii * chord
             self._moved += self._moves
-        self._last = turns, places
+        self._last = turns, middles
+        return origins
 
-    def _distance(self, data: Any, one: int, other: int) -> Any:
-        result = coal.DistanceResult()
-        (a, place_a), (b, place_b) = (self._shapes[k] for k in (one, other))
-        at = [data.oMi[int(self._joints[k])] * place for k, place in ((one, place_a), (other, place_b))]
-        coal.distance(
-            a,
-            coal.Transform3s(at[0].rotation, at[0].translation),
-            b,
-            coal.Transform3s(at[1].rotation, at[1].translation),
-            self._asked,
-            result,
-        )
-        return result
+    def _distances(self, data: Any, pairs: NDArray[np.intp]) -> list[Any]:
+        at = {}
+        for k in map(int, np.unique(pairs)):
+            place = data.oMi[int(self._joints[k])] * self._shapes[k][1]
+            at[k] = coal.Transform3s(place.rotation, place.translation)
+        found = []
+        for one, other in pairs.tolist():
+            found.append(coal.DistanceResult())
+            (a, _), (b, _) = self._shapes[one], self._shapes[other]
+            coal.distance(a, at[one], b, at[other], self._asked, found[-1])
+        return found
 
-    def _constraint(self, data: Any, one: int, other: int, found: Any) -> tuple[Array, float]:
-        """The row of a pair, and the least of its second rate beyond what it has without accelerations."""
-        normal = np.array(found.normal)  # from the one to the other
-        row, rate, drift = np.zeros(self._model.nv), 0.0, 0.0
-        for k, point, sign in ((one, found.getNearestPoint1(), -1.0), (other, found.getNearestPoint2(), 1.0)):
-            joint = int(self._joints[k])
-            if joint == 0:
-                continue
-            arm = np.array(point) - data.oMi[joint].translation
-            J = pin.getJointJacobian(self._model, data, joint, _AXES)
-            v = pin.getVelocity(self._model, data, joint, _AXES)
-            a = pin.getClassicalAcceleration(self._model, data, joint, _AXES)
-            row += sign * (normal @ J[:3] + np.cross(arm, normal) @ J[3:])
-            rate += sign * float(normal @ (v.linear + np.cross(v.angular, arm)))
-            turn = np.cross(a.angular, arm) + np.cross(v.angular, np.cross(v.angular, arm))
-            drift += sign * float(normal @ (a.linear + turn))
-        return row, _least(found.min_distance, rate) - drift
+
+def _of_points(data: Any, joints: NDArray[np.intp], arms: Array) -> tuple[Array, Array]:
+    """Velocities and accelerations (k, 2, 3) of points that joints (k, 2) carry, at ends of arms (k, 2, 3)
+    from their origins, in world axes.
+    """
+    turns = np.array([place.rotation for place in data.oMi])
+
+    def world(motions: Any) -> tuple[Array, Array]:
+        own = np.array([motion.vector for motion in motions]).reshape(-1, 2, 3, 1)
+        linear, angular = np.moveaxis((turns[:, None] @ own)[..., 0], 1, 0)
+        return linear[joints], angular[joints]
+
+    (linear, angular), (spatial, turning) = world(data.v), world(data.a)
+    velocity = linear + np.cross(angular, arms)
+    # of a point that moves with the joint: its spatial acceleration, and omega x v of where it is
+    acceleration = spatial + np.cross(turning, arms) + np.cross(angular, velocity)
+    return velocity, acceleration
 
 
 def _least(distance: Any, rate: Any) -> Any:

@@ -163,10 +163,11 @@ class WholeBodyController:
         m = self.cones.m
         C, c = np.zeros((m + MOST, n + 2)), np.full(m + MOST, -1.0)  # what there is no pair for holds
         C[:m, : n + 1], c[:m] = self.cones.look(held.places, B, held.b0)
-        rows, least = self.clearance.constraints(held.data)
-        its = slice(m, m + len(least))
-        C[its, :n], C[its, n + 1] = rows @ A / FAST, 1.0
-        c[its] = (least - rows @ held.a0) / FAST
+        if recovers or self.target.bounced:  # up to the blow the plan keeps bodies apart, at speed
+            rows, least = self.clearance.constraints(held.data)
+            its = slice(m, m + len(least))
+            C[its, :n], C[its, n + 1] = rows @ A / FAST, 1.0
+            c[its] = (least - rows @ held.a0) / FAST
         begun = time.process_time()
         x = self.qp.solve(P, g, C, c, self.low, self.high)
         self.seconds.append(time.process_time() - begun)

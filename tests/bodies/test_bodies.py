@@ -462,6 +462,28 @@ def test_a_boxs_face_has_the_point_in_its_middle(
     assert core.core and core.before and not core.strikable and not core.moves
 
 
+@pytest.mark.parametrize(
+    ("target", "body", "told"),
+    [
+        (FreeMass(mass=1.0), TargetBody(), "assumed: box, 18 x 18 x 18 cm"),
+        (RigidWall(), TargetBody(), "assumed: wall, 150 x 150 x 10 cm"),
+        (FreeMass(mass=1.0), TargetBody(shape="ball"), "assumed: ball, 18 cm"),
+        (FreeMass(mass=1.0), TargetBody(shape="ball", size=(0.1,)), "ball, 10 cm"),
+        (FreeMass(mass=1.0), TargetBody(size=(0.9, 2.0, 0.04)), "box, 90 x 200 x 4 cm"),
+        (FreeMass(mass=1.0), TargetBody(shape="none"), "none: nothing keeps off it"),
+    ],
+)
+def test_a_problem_says_which_body_its_target_has_and_whether_it_is_assumed(
+    target: Any, body: TargetBody, told: str
+) -> None:
+    problem = dataclasses.replace(arm_problem(), target=target, body=body)
+    assert problem.describe()["target_body"] == told
+    # and it is that size
+    for found in bodies_at(target, body).get("target", []):
+        sides = 2 * (found.half if found.radius == 0 else np.array([found.radius]))
+        assert " x ".join(f"{100 * side:.3g}" for side in sides) in told
+
+
 def test_a_ball_begins_at_the_point() -> None:
     (ball,) = bodies_at(FreeMass(mass=1.0), TargetBody(shape="ball", size=(0.1,)))["target"]
     np.testing.assert_allclose(ball.place, POINT + 0.05 * NORMAL)

@@ -26,6 +26,8 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
         "law": repr(p.law),
         "hash": p.hash,
     }
+    if not p.robot.floating:
+        out["ground"] = "none" if p.ground_height is None else f"z = {p.ground_height:g} m"
     if p.collision != "full":
         frozen = f", {p.freezes} freezes" if p.freezes else ""
         more = {"rigid": f", restitution {p.coefficient_of_restitution:g}", "sdc": frozen}

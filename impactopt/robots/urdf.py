@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from os import PathLike
+from pathlib import Path
 from typing import Any
 from xml.dom import expatbuilder
 from xml.parsers.expat import ExpatError
@@ -43,11 +44,16 @@ def read_urdf(
     """
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
+    root = _parsed(urdf)
+    if any(tag.tagName.startswith("xacro:") for tag in root.getElementsByTagName("*")):
+        raise InputError(
+            f"URDF {urdf} is written in xacro, which makes a URDF of it: run `xacro {Path(urdf).name} > "
+            "robot.urdf`, and give that"
+        )
     try:
         model = pin.buildModelFromUrdf(urdf, *joints)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
-    root = _parsed(urdf)
     _check_links(root, urdf, moments=not repaired)
     if srdf is not None:
         file = existing(srdf, "SRDF")

@@ -252,7 +252,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<gravity>`": (
         [_before("</robot>", '<gazebo reference="one"><turnGravityOff>true</turnGravityOff></gazebo>')],
-        "'one' is without gravity",
+        "without gravity .* have their weight here: one",
     ),
     "`<transmission>`": (
         [

@@ -28,7 +28,8 @@ def check(
     with plain_errors("interrupted", verbose=verbose):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.doubts import doubts, hopeless
+        from impactopt.problem.doubts import hopeless
+        from impactopt.problem.plausibility import doubts
 
         try:
             problem = read_problem_file(file, parse_settings(settings or ())).build()

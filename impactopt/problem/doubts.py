@@ -9,39 +9,48 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.kinematics.balanced import Reach, reach
+from impactopt.kinematics.holding import least_holding_share
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.kinematics.support import support_polygon
+from impactopt.problem.plausibility import giant_soles
+from impactopt.problem.terms import TorqueLimit
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
-    from impactopt.robots.robot import Robot
 
-__all__ = ["doubts", "hopeless"]
+__all__ = ["hopeless"]
 
 Array = NDArray[np.float64]
 LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
 OFF = 0.005  # [m] of a posture that counts as one
+SLACK = 1e-6  # of a torque limit, for rounded numbers
 PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers
 DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, first what to mend first: a start beyond the target, a point out of balance."""
-    found = [_beyond(problem), _out_of_balance(problem)]
+    """What no solve can mend, first what to mend first: soles of a giant, torque that does not hold the start
+    posture, a start beyond the target, a point out of balance.
+    """
+    found = [*giant_soles(problem.robot), _too_weak(problem)]
+    found += [] if any(found) else [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
 
 
-def doubts(robot: Robot) -> list[str]:
-    """What a robot's numbers lack that a blow depends on."""
-    driven = zip(robot.joint_names, robot.armature, robot.passive, strict=True)
-    without = [joint for joint, a, passive in driven if a == 0 and not passive]
-    if not without:
-        return []
-    which = "no joint has" if len(without) == robot.n - np.sum(robot.passive) else f"{', '.join(without)}: no"
-    return [
-        f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too light "
-        "and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, by joint"
-    ]
+def _too_weak(problem: ImpactProblem) -> str:
+    """A start posture that torque limits cannot hold at rest, whatever soles and hands bear."""
+    robot, q = problem.robot, problem.start_posture
+    frames = problem.stance.constraint_frames(robot)
+    limit = robot.torque_limit * problem.term(TorqueLimit).fraction
+    needed = least_holding_share(robot, q, frames, limit)
+    if needed is None or needed.share <= 1 + SLACK:
+        return ""
+    joint = needed.joint
+    return (
+        f"the start posture cannot be held at rest: gravity asks {needed.torque:.3g} N m of joint "
+        f"{robot.joint_names[joint]!r}, and {limit[joint]:.3g} N m is the most that the problem allows it; "
+        "correct the torque limits, or start from another posture"
+    )
 
 
 def _beyond(problem: ImpactProblem) -> str:

@@ -17,7 +17,8 @@ from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
-from impactopt.problem.doubts import doubts, hopeless
+from impactopt.problem.doubts import hopeless
+from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
@@ -148,6 +149,64 @@ def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     data = read_toml(_drafted(tmp_path, urdfs.arm()).text)
     (striker,) = data["robot"]["strikers"]
     assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
+
+
+def _flange(tool: str = "", *, axis: str = "0 0 1") -> str:
+    """An arm of four joints and a flange, whose shape is behind its frame; tool : more links."""
+    parts, parent = [urdfs.link("base", 10.0, (0.3, 0.3, 0.4), (0.0, 0.0, 0.2))], "base"
+    for name, turn, z, long in (
+        ("turn", "0 0 1", 0.4, 0.1),
+        ("shoulder", "0 1 0", 0.1, 0.3),
+        ("elbow", "0 1 0", 0.3, 0.3),
+        ("wrist", "0 1 0", 0.3, 0.1),
+    ):
+        parts += [urdfs.link(f"{name}_link", 2.0, (0.08, 0.08, long), (0.0, 0.0, long / 2))]
+        parts += [urdfs.joint(name, parent, f"{name}_link", turn, (0.0, 0.0, z), (-2.2, 2.2))]
+        parent = f"{name}_link"
+    parts += [urdfs.link("flange", 0.2, (0.07, 0.07, 0.03), (0.0, 0.0, -0.015))]
+    parts += [urdfs.joint("roll", parent, "flange", axis, (0.0, 0.0, 0.13), (-2.2, 2.2))]
+    return urdfs.robot("flanged", *parts, tool)
+
+
+def _fixed(parent: str, child: str, place: str) -> str:
+    return (
+        f'<link name="{child}"/><joint name="{child}_fixed" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin {place}/></joint>'
+    )
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "0 1 0"], ids=["rolls", "pitches"])
+def test_of_a_flange_behind_its_frame_the_face_away_from_the_arm_strikes(tmp_path: Path, axis: str) -> None:
+    (striker,) = read_toml(_drafted(tmp_path, _flange(axis=axis)).text)["robot"]["strikers"]
+    assert striker["frame"] == "flange" and striker["point_m"] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "point"),
+    [
+        ("tool0", 'xyz="0 0 0"', [0.0, 0.0, 0.0]),
+        ("gripper_tcp", 'xyz="0 0 0.12"', [0.0, 0.0, 0.0]),
+        ("link_eef", 'xyz="0 0 0.05" rpy="0 -1.5707963267948966 0"', [0.0, 0.0, 0.0]),
+        ("tool0", 'xyz="0 0 -0.02"', [0.0, 0.0, 0.02]),  # the flange's face is ahead of it
+    ],
+)
+def test_a_tool_frame_wins_over_shapes(tmp_path: Path, name: str, place: str, point: list[float]) -> None:
+    problem = _problem(tmp_path, _flange(_fixed("flange", name, place)))
+    striker = problem.robot.striker(problem.striker)
+    assert striker.frame == name and striker.point == pytest.approx(point, abs=1e-6)
+
+
+def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -> None:
+    text = urdfs.arm().replace(
+        '<collision><origin xyz="0.0 0.0 0.05"/><geometry><box size="0.08 0.08 0.1"/>',
+        '<collision><origin xyz="0.0 0.6 0.05"/><geometry><box size="0.08 0.08 0.1"/>',
+    )
+    assert text != urdfs.arm()
+    problem = _problem(tmp_path, text)
+    (told,) = [line for line in doubts(problem.robot) if "wrist_link" in line]
+    assert "a shape of link 'wrist_link', 0.15 m large, is 0." in told and "correct its <origin>" in told
+    point = problem.robot.striker(problem.striker).point
+    assert abs(point[1]) < 0.05 and point[2] > 0.05
 
 
 def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:

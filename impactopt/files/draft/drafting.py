@@ -14,19 +14,22 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.files.draft.aim import WAYS, Arm, aims, ready
-from impactopt.files.draft.guesses import DOUBT, ROTOR
+from impactopt.files.draft.guesses import DOUBT
 from impactopt.files.draft.limbs import renumbered
 from impactopt.files.draft.postures import half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
-from impactopt.files.draft.soles import find_soles, find_striker, sides
+from impactopt.files.draft.soles import find_soles, sides
+from impactopt.files.draft.strikers import find_striker
 from impactopt.files.problem_file.describing import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import sole_data, striker_data
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.problem.doubts import hopeless
+from impactopt.problem.plausibility import far_shapes
 from impactopt.robots.inertias import REPAIRED
 from impactopt.robots.parts import Sole, Striker
 from impactopt.robots.robot import Robot
+from impactopt.robots.rotors import USUAL_ROTOR
 
 __all__ = ["Draft", "draft_problem"]
 
@@ -162,7 +165,7 @@ def _aimed(
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
     guessed = {
-        "armature_kg_m2": f"{DOUBT}: {1e3 * ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
+        "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
         "torque_limit_N_m": f"{DOUBT}: from what gravity can ask; the file has none",
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
@@ -232,6 +235,7 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
                 f"five joints hold sole {sole.name!r}: the foot may turn on it about {sole.hinge}, by "
                 f"{sole.hinge_range:g} rad, and it bears no moment about that axis"
             )
+    yield from far_shapes(robot)
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
     for key, what in (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.fit import Planes
 from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
-from impactopt.bodies.world import WorldBody
+from impactopt.bodies.world import BEHIND, WorldBody
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 
@@ -155,7 +155,8 @@ class Bodies:
                 rooted = j in standing or (not robot.floating and robot.model.parents[j] == 0)
                 on_ground = body.ground and rooted
                 mine = j in striking
-                if on_ground or (mine and body.strikable) or (body.core and not mine):
+                core = mine and not self._strikes_from_inside(j)
+                if on_ground or (mine and body.strikable) or (body.core and not core):
                     continue
                 if strict and not body.ground and self.exact(at, 0, (j, -1 - w)) < 0:
                     raise InputError(
@@ -166,6 +167,20 @@ class Bodies:
                     self.touching.append((self.links.name(j), body.name))
                     continue
                 self.world_pairs.append((j, w))
+
+    def _strikes_from_inside(self, joint: int) -> bool:
+        """Whether a link's body surrounds its strikers by more than a target's core is behind the face.
+
+        Such a body, as a box of inertia about a point mass, meets the core however it strikes.
+        """
+        frames, depths = self.robot.model.frames, []
+        for striker in self.robot.strikers.values():
+            frame = frames[self.robot.model.getFrameId(striker.model_frame)]
+            if frame.parentJoint == joint:
+                depths.append(
+                    max(piece.depth(frame.placement.translation) for piece in self.links.of_joint[joint])
+                )
+        return bool(depths) and min(depths) > BEHIND
 
     # ------------------------------------------------------------------ by spheres and planes
     @cached_property

@@ -18,7 +18,7 @@ from impactopt.errors import MOST, InputError, check_array
 from impactopt.kinematics.stance import Stance, usual_stance
 from impactopt.robots.robot import Robot
 
-__all__ = ["Held", "frame_jacobians", "holding_torque", "striking_velocity"]
+__all__ = ["Held", "holding_torque", "striking_velocity"]
 
 Array = NDArray[np.float64]
 _DEPENDENT = 1e-12  # of the largest: a robot of few joints has rows that depend on each other
@@ -39,7 +39,7 @@ class Held:
         """Of a configuration (nq,), with frames by their names in the model."""
         data = model.createData()
         upper = np.triu(pin.crba(model, data, q))
-        rows = frame_jacobians(model, q, [*frames, striker])
+        rows = _jacobians(model, q, [*frames, striker])
         return cls(upper + np.triu(upper, 1).T, rows[:-6], rows[-6:-3])
 
     def inverse_mass(self) -> Array:
@@ -110,12 +110,12 @@ def holding_torque(
     bias = pin.nonLinearEffects(robot.model, robot.model.createData(), q, v)
     if not np.all(np.isfinite(bias)):
         raise InputError("q, v: the forces of this motion are no finite numbers; give smaller ones")
-    held = frame_jacobians(robot.model, q, held_by.constraint_frames(robot))
+    held = _jacobians(robot.model, q, held_by.constraint_frames(robot))
     columns = np.hstack([np.eye(robot.nv)[:, -robot.n :], held.T])
     return np.array(np.linalg.lstsq(columns, bias, rcond=None)[0][: robot.n])
 
 
-def frame_jacobians(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
+def _jacobians(model: pin.Model, q: Array, frames: Sequence[str]) -> Array:
     """(6 a frame, nv), one below the other."""
     data = model.createData()
     pin.computeJointJacobians(model, data, q)

@@ -94,8 +94,16 @@ def check_world(problem: Any) -> None:
 
 
 def check_stance(problem: Any) -> None:
-    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own."""
+    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own, soles on a
+    ground that is not level.
+    """
     robot, stance = problem.robot, problem.stance
+    pull = np.array(robot.model.gravity.linear)
+    if stance.sole_frames(robot) and not (pull[2] < 0 and not pull[:2].any()):
+        raise InputError(
+            f"gravity is {pull.tolist()} m/s2, and soles that stand need one along -z: turn it, as <option "
+            "gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
+        )
     if np.any(stance.compliance > 0):
         raise InputError(
             f"a plan holds its soles exactly: give {type(stance).__name__} without the virtual base "

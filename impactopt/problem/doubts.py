@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from impactopt.kinematics.balanced import Reach, reach
-from impactopt.kinematics.holding import least_holding_share
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.plausibility import giant_soles
@@ -18,39 +18,22 @@ from impactopt.problem.terms import TorqueLimit
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
 
-__all__ = ["hopeless"]
+__all__ = ["hopeless", "too_weak"]
 
 Array = NDArray[np.float64]
 LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
 OFF = 0.005  # [m] of a posture that counts as one
-SLACK = 1e-6  # of a torque limit, for rounded numbers
+_ROUNDED = 1e-6
 PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers
 DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, first what to mend first: soles of a giant, torque that does not hold the start
-    posture, a start beyond the target, a point out of balance.
+    """What no solve can mend, first what to mend first: soles of a giant, a start beyond the target, a
+    point out of balance.
     """
-    found = [*giant_soles(problem.robot), _too_weak(problem)]
-    found += [] if any(found) else [_beyond(problem), _out_of_balance(problem)]
+    found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
-
-
-def _too_weak(problem: ImpactProblem) -> str:
-    """A start posture that torque limits cannot hold at rest, whatever soles and hands bear."""
-    robot, q = problem.robot, problem.start_posture
-    frames = problem.stance.constraint_frames(robot)
-    limit = robot.torque_limit * problem.term(TorqueLimit).fraction
-    needed = least_holding_share(robot, q, frames, limit)
-    if needed is None or needed.share <= 1 + SLACK:
-        return ""
-    joint = needed.joint
-    return (
-        f"the start posture cannot be held at rest: gravity asks {needed.torque:.3g} N m of joint "
-        f"{robot.joint_names[joint]!r}, and {limit[joint]:.3g} N m is the most that the problem allows it; "
-        "correct the torque limits, or start from another posture"
-    )
 
 
 def _beyond(problem: ImpactProblem) -> str:
@@ -62,6 +45,40 @@ def _beyond(problem: ImpactProblem) -> str:
         f"the motion starts beyond the target: the start posture has {problem.striker!r} at "
         f"{np.round(at, 3).tolist()} m, {1e3 * past:.0f} mm past the target's plane along the normal; start "
         "from a posture behind it, move the point further along the normal, or turn the normal round"
+    )
+
+
+def too_weak(problem: ImpactProblem) -> str:
+    """Whether no wrenches of what is held let the torques hold the robot at rest where it starts, in words;
+    "" if some do. A motion that falls from there at once may be planned all the same.
+    """
+    robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
+    q = problem.start_posture
+    weight = np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
+    held = c.sole_jacobians(q)[0].T if c.legs else np.zeros((robot.nv, 0))
+    base = robot.nv - robot.n
+    driven = np.flatnonzero(~(robot.passive | robot.hinges))
+    rows, most = base + driven, robot.torque_limit[driven]
+    # the least largest share of a limit: a linear program in the wrenches and that share
+    each = held[rows] / most[:, None]
+    asked = weight[rows] / most
+    ones = np.ones((len(rows), 1))
+    found = linprog(
+        np.append(np.zeros(held.shape[1]), 1.0),
+        A_ub=np.vstack([np.hstack([-each, -ones]), np.hstack([each, -ones])]),
+        b_ub=np.concatenate([-asked, asked]),
+        A_eq=np.hstack([held[c.undriven], np.zeros((len(c.undriven), 1))]) if len(c.undriven) else None,
+        b_eq=weight[c.undriven] if len(c.undriven) else None,
+        bounds=(None, None),
+    )
+    if found.status != 0 or found.fun <= limit + _ROUNDED:
+        return ""
+    share = np.abs(asked - each @ found.x[:-1])
+    joint = robot.joint_names[int(driven[int(share.argmax())])]
+    return (
+        f"the torque limits do not hold the robot's own weight: at rest at its start {joint} bears "
+        f"{share.max():.3g} of its limit, and [terms.torque_limit] fraction lets it bear {limit:.3g}; "
+        "raise the limits or the fraction, or start from another posture"
     )
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from support.small_plans import biped_problem
 from support.small_robots import biped
+from typer.testing import CliRunner
 
-from impactopt import FixedBase, Robot, arm7, planar_arm
-from impactopt.kinematics.holding import least_holding_share
+from impactopt import Robot, arm7, load_problem, planar_arm
+from impactopt.cli.app import app
+from impactopt.files.problem_file import write_problem
 from impactopt.problem.doubts import hopeless
 from impactopt.problem.plausibility import doubts
 
@@ -57,48 +60,17 @@ def test_soles_on_the_wrong_side_and_unlike_ones_are_doubted() -> None:
     assert any("are not alike" in text for text in doubts(longer))
 
 
-def test_torque_that_does_not_hold_the_start_is_refused_before_a_solve() -> None:
-    problem = biped_problem()
-    weak = dataclasses.replace(problem.robot, torque_limit=np.full(problem.robot.n, 0.5))
-    (told,) = hopeless(dataclasses.replace(problem, robot=weak))
-    assert (
-        told.startswith("the start posture cannot be held at rest: gravity asks")
-        and "correct the torque" in told
-    )
+def test_torque_that_does_not_hold_the_start_is_doubted(tmp_path: Path) -> None:
+    file = tmp_path / "weak.toml"
+    text = write_problem(load_problem("arm7"))
+    assert json.loads(_checked(file, text))["doubts"] == []
+    told, *_ = json.loads(_checked(file, text, "robot.torque_limit_N_m=2.0"))["doubts"]
+    assert told.startswith("the torque limits do not hold the robot's own weight: at rest at its start")
 
 
-def test_an_arm_is_held_by_its_gravity_torque_alone() -> None:
-    """Closed form: nothing but the joints bears a fixed base's weight."""
-    robot = arm7()
-    q = next(iter(robot.postures.values()))
-    gravity = np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
-    share = gravity / robot.torque_limit
-    found = least_holding_share(robot, q, FixedBase().constraint_frames(robot), robot.torque_limit)
-    assert found is not None
-    assert found.share == pytest.approx(share.max(), rel=1e-6)
-    assert found.joint == int(np.argmax(share))
-    assert found.torque == pytest.approx(gravity[found.joint], rel=1e-6)
-
-
-def test_two_legs_share_the_weight_as_well_as_they_can() -> None:
-    """No wrench of the soles does with less: 200 drawn ones, each with the torque that it leaves."""
-    problem = biped_problem()
-    robot, q = problem.robot, problem.start_posture
-    frames = problem.stance.constraint_frames(robot)
-    found = least_holding_share(robot, q, frames, robot.torque_limit)
-    assert found is not None
-    model, data = robot.model, robot.model.createData()
-    gravity = pin.computeGeneralizedGravity(model, data, q)
-    pin.computeJointJacobians(model, data, q)
-    pin.updateFramePlacements(model, data)
-    J = np.vstack(
-        [pin.getFrameJacobian(model, data, model.getFrameId(f), pin.LOCAL_WORLD_ALIGNED) for f in frames]
-    )
-    base = J.T[:6]
-    one = np.linalg.lstsq(base, gravity[:6], rcond=None)[0]
-    free = np.eye(base.shape[1]) - np.linalg.pinv(base) @ base
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        wrench = one + free @ (50 * rng.standard_normal(len(one)))
-        assert np.abs(gravity[:6] - base @ wrench).max() < 1e-8
-        assert np.max(np.abs((gravity - J.T @ wrench)[6:] / robot.torque_limit)) >= found.share * (1 - 1e-9)
+def _checked(file: Path, text: str, *settings: str) -> str:
+    file.write_text(text, encoding="utf-8")
+    words = [word for setting in settings for word in ("--set", setting)]
+    done = CliRunner().invoke(app, ["check", str(file), "--json", *words])
+    assert done.exit_code == 0, done.output
+    return done.stdout

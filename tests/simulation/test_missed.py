@@ -78,7 +78,9 @@ def test_a_missed_blow_asks_for_no_more_torque_than_planned(short: Solution, eng
     # a servo whose reference is where the robot is asks for nothing but the feed-forward
     times = sim.time[sim.time >= short.plan.contact_start]
     demand = sim.demand[-len(times) :]
-    feed = np.array([np.interp(times, short.missed_trajectory.time, u) for u in short.missed_trajectory.torque.T])
+    feed = np.array(
+        [np.interp(times, short.missed_trajectory.time, u) for u in short.missed_trajectory.torque.T]
+    )
     limit = short.problem.robot.torque_limit
     assert np.abs((demand - feed.T) / limit).max() < 0.1
 

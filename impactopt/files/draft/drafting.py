@@ -79,8 +79,8 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool 
     else:
         data = _data(drafted, robot, soles, strikers, strong.start, folder)
         way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
-        for phase, usual, times in (("swing", SWING, 3.0), ("follow", FOLLOW, 2.0)):
-            data[phase]["duration_s"] = duration(robot, way, usual, times)
+        for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
+            data[phase]["duration_s"] = duration(robot, way, usual)
         data = _aimed(data, robot, arms[0], iter([strong.point]), strong.normal, folder)
     said = [*_said(data, drafted, robot), *([_told_strike(strong)] if strong else [])]
     return Draft(text=_text(data, drafted, robot), said=tuple(said))

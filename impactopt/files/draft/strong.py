@@ -27,8 +27,12 @@ __all__ = ["Strong", "duration", "strongest"]
 Array = NDArray[np.float64]
 STRIKES, LOOKED_AT = 4, 60  # blows that are solved as strikes; estimated ones that are looked at for them
 ALIKE = 0.2  # of the reach: how far apart points with one normal are
-BACK = (0.9, 0.7, 0.5, 0.35)  # [rad], [m] that the joint which moves farthest goes from the start to contact
+# [s] that joints at their contact speed need from the start to contact, and [rad], [m] that the one which moves
+# farthest goes there, between these
+RUN, BACK = 0.7, (0.35, 0.9)
+SHORTER = (1.0, 0.75, 0.55, 0.4)  # of that way, where joints or bodies leave no more
 BEHIND = 0.06  # [m] of the start behind the target's plane at least
+PARTS = (0.8, 3.0)  # of the time that joints need for their way: shortest and longest duration
 SECONDS = 10.0  # [s] of a strike
 
 
@@ -68,14 +72,14 @@ def strongest(robot: Robot, arm: Arm, q: Array, **given: Any) -> Strong | None:
     return best
 
 
-def duration(robot: Robot, way: Array, usual: tuple[float, float], times: float) -> list[float]:
-    """[shortest, longest] [s] of a phase in which joints go a way (n,) [rad] so many times, and come to rest.
+def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:
+    """[shortest, longest] [s] of a phase in which joints go a way (n,) [rad] there, or back and there.
 
-    At a speed that rises and falls evenly, a joint takes twice the way over its largest speed. The shortest time
-    is the usual one: a solver that may take longer finds by itself what a motion needs.
+    The usual times are those of fast robots. Slow joints need the way over their largest speed at least; thrice
+    that leaves room to wind up, and no more than a spline of few intervals can follow.
     """
-    needed = times * 2.0 * float(np.max(np.abs(way) / robot.velocity_limit))
-    return [usual[0], max(usual[1], float(f"{needed:.2g}"))]
+    needed = float(np.max(np.abs(way) / robot.velocity_limit))
+    return [max(short, float(f"{part * needed:.2g}")) for short, part in zip(usual, PARTS, strict=True)]
 
 
 def _sound(
@@ -102,8 +106,9 @@ def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> Im
     """A blow's problem, from a start on the way that it comes; None: there is a fault in it."""
     point = np.round(blow.point, 3) + 0.0
     size = float(np.abs(blow.v).max())
-    for back in BACK:
-        start = np.array(pin.integrate(robot.model, blow.q, -back / size * blow.v))
+    way = blow.v / size * float(np.clip(RUN * size, *BACK))
+    for part in SHORTER:
+        start = np.array(pin.integrate(robot.model, blow.q, -part * way))
         angles = robot.joint_positions(start)
         edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
         inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)

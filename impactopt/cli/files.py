@@ -12,6 +12,7 @@ from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_probl
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 if TYPE_CHECKING:
+    from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -55,8 +56,22 @@ def check(
                 typer.echo(printable(f"  {name:<10} {text}"))
         if lost := _lost_meshes(problem.robot):
             typer.echo(printable(f"  {'meshes':<10} {lost}"))
+        if strength := _strength(problem):
+            typer.echo(printable(f"  {'strength':<10} {strength}"))
         for doubt in doubtful:
             typer.echo(printable(f"  {'doubt':<10} {doubt}"))
+
+
+def _strength(problem: ImpactProblem) -> str:
+    """What share of the hardest blow nearby this one is, by estimates; "" where that is not known."""
+    from impactopt.problem.strength import best_share
+
+    found = best_share(problem)
+    if found is None:
+        return ""
+    share, best = found
+    where = f"point_m = {best.point.round(2).tolist()}, normal = {best.normal.tolist()}"
+    return f"{100 * share:.0f} % of the hardest blow nearby, by a rough estimate; that one: {where}"
 
 
 def _lost_meshes(robot: Robot) -> str:

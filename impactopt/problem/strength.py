@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -11,15 +13,22 @@ from numpy.typing import NDArray
 
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import FreeMass, Target
+from impactopt.errors import InputError
+from impactopt.kinematics.inverse_kinematics import inverse_kinematics
 from impactopt.problem.terms import TorqueLimit
 from impactopt.robots.robot import Robot
 
-__all__ = ["NORMALS", "Blow", "Strength", "drawn_blows"]
+if TYPE_CHECKING:
+    from impactopt.problem.problem import ImpactProblem
+
+__all__ = ["Blow", "Strength", "best_share", "drawn_blows"]
 
 Array = NDArray[np.float64]
 SWING = 1.2  # [rad], [m] of a joint's way from rest to contact at most
 INSIDE = 0.05  # of a joint's range that a posture at contact keeps off its limits
 DRAWN = 600
+TRIED = 8  # postures at the point of a problem
+NEARBY = 0.4  # [m] from a problem's point
 AHEAD = 0.25  # of the reach: a target stands so far ahead of the base at least
 NORMALS = tuple(np.array(n) for n in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)))
 PRESSED = 1e-3  # [m] at which a law's stiffness is read
@@ -50,9 +59,10 @@ class Strength:
     def at(self, q: Array, normals: Sequence[Array]) -> list[Blow]:
         """Blows in a configuration (nq,), one along each normal (3,) that the striking point can move along.
 
-        The impulse is mu s: mu is the reduced mass of target and effective mass, and s the largest speed, without
-        any across the normal, that these leave: joint speeds; torques that accelerate all joints evenly over
-        the room behind them; and gears, which bear their rotors' deceleration under the peak force.
+        The impulse is mu s: mu is the reduced mass of target and effective mass, and s the largest speed,
+        without any across the normal, that these leave: joint speeds; torques that accelerate all joints
+        evenly over the room behind them; and gears, which bear their rotors' deceleration under the peak
+        force.
         """
         robot = self.robot
         model, data = robot.model, robot.model.createData()
@@ -135,3 +145,27 @@ def drawn_blows(strength: Strength, q: Array, normals: Sequence[Array] = NORMALS
     reach = max((float(np.linalg.norm(blow.point[:2])) for blow in blows), default=0.0)
     ahead = [blow for blow in blows if blow.point[0] > AHEAD * reach]
     return sorted(ahead, key=lambda blow: -blow.impulse)
+
+
+def best_share(problem: ImpactProblem) -> tuple[float, Blow] | None:
+    """Impulse of a problem's blow over that of the hardest one nearby, by estimates of both, and that one.
+
+    Nearby are points within `NEARBY`, hit along the problem's normal, to the front, to a side or down. A
+    rough number: postures are drawn, and estimates know nothing of bodies. None: of a robot on soles, whose
+    balance decides, and of targets that are no free mass.
+    """
+    p = problem
+    if p.robot.floating or p.second is not None or not isinstance(p.target, FreeMass):
+        return None
+    strength = Strength(robot=p.robot, striker=p.striker, law=p.law, target=p.target)
+    rng, postures = np.random.default_rng(0), [p.contact_posture]
+    for _ in range(TRIED):
+        guess = pin.integrate(p.robot.model, p.contact_posture, rng.standard_normal(p.robot.nv))
+        with suppress(InputError):
+            postures.append(inverse_kinematics(p.coordinates, p.striker, p.point, guess, starts=1))
+    own = [blow.impulse for q in postures for blow in strength.at(q, [p.normal])]
+    drawn = drawn_blows(strength, p.start_posture, (*NORMALS, p.normal))
+    near = [blow for blow in drawn if np.linalg.norm(blow.point - p.point) < NEARBY]
+    if not near or not own or not near[0].impulse > 0:
+        return None
+    return min(max(own) / near[0].impulse, 1.0), near[0]

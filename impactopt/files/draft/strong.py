@@ -27,8 +27,8 @@ __all__ = ["Strong", "duration", "strongest"]
 Array = NDArray[np.float64]
 STRIKES, LOOKED_AT = 4, 60  # blows that are solved as strikes; estimated ones that are looked at for them
 ALIKE = 0.2  # of the reach: how far apart points with one normal are
-# [s] that joints at their contact speed need from the start to contact, and [rad], [m] that the one which moves
-# farthest goes there, between these
+# [s] that joints at their contact speed need from the start to contact; and [rad], [m] that the one which
+# moves farthest goes there, between these
 RUN, BACK = 0.7, (0.35, 0.9)
 SHORTER = (1.0, 0.75, 0.55, 0.4)  # of that way, where joints or bodies leave no more
 BEHIND = 0.06  # [m] of the start behind the target's plane at least
@@ -50,7 +50,7 @@ class Strong:
 
 
 def strongest(robot: Robot, arm: Arm, q: Array, **given: Any) -> Strong | None:
-    """The best strike of the blows that are estimated best; None: no blow is found that check finds no fault with.
+    """The best strike of the blows that are estimated best; None: check finds a fault with all of them.
 
     q (nq,) : what does not strike stays as in it.  given : law, target and terms, as of `ImpactProblem`.
     """
@@ -75,8 +75,8 @@ def strongest(robot: Robot, arm: Arm, q: Array, **given: Any) -> Strong | None:
 def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:
     """[shortest, longest] [s] of a phase in which joints go a way (n,) [rad] there, or back and there.
 
-    The usual times are those of fast robots. Slow joints need the way over their largest speed at least; thrice
-    that leaves room to wind up, and no more than a spline of few intervals can follow.
+    The usual times are those of fast robots. Slow joints need the way over their largest speed at least;
+    thrice that leaves room to wind up, and no more than a spline of few intervals can follow.
     """
     needed = float(np.max(np.abs(way) / robot.velocity_limit))
     return [max(short, float(f"{part * needed:.2g}")) for short, part in zip(usual, PARTS, strict=True)]
@@ -135,6 +135,6 @@ def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> Im
 
 def _touches(problem: ImpactProblem, *postures: Array) -> bool:
     """Whether bodies touch in one of these configurations (nq,), before contact."""
-    none = np.zeros(len(postures))
+    none: Array = np.zeros(len(postures))
     at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
-    return bool(problem.bodies.survey(np.arange(len(postures)) * 1e-3, at).touches)
+    return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

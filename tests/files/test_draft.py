@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from support import urdfs
 from typer.testing import CliRunner
 
+from impactopt import optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.draft.description import find_description
@@ -20,6 +23,7 @@ from impactopt.files.problem_file.toml import read_toml
 from impactopt.problem.doubts import hopeless
 from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import best_share
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 
@@ -149,6 +153,57 @@ def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     data = read_toml(_drafted(tmp_path, urdfs.arm()).text)
     (striker,) = data["robot"]["strikers"]
     assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
+
+
+def _strike(problem: ImpactProblem) -> float:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        solved = optimize_strike(problem)
+    return solved.impulse if solved.status.usable else 0.0
+
+
+def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
+    """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
+    problem = _problem(tmp_path, urdfs.arm())
+    drafted, model = _strike(problem), problem.robot.model
+    rng, data, elsewhere = np.random.default_rng(1), model.createData(), []
+    frame = model.getFrameId(f"striker:{problem.striker}")
+    while len(elsewhere) < 20:
+        q = rng.uniform(problem.robot.lower, problem.robot.upper)
+        pin.framesForwardKinematics(model, data, q)
+        point, normal = np.array(data.oMf[frame].translation), np.eye(3)[rng.integers(3)]
+        normal = normal * (1.0 if normal[0] else rng.choice([-1.0, 1.0]))
+        if point[0] < 0.2 or point[2] < 0.1:
+            continue
+        try:
+            elsewhere.append(_strike(dataclasses.replace(problem, point=point, normal=normal)))
+        except InputError:  # out of reach with all joints inside, or the start is in the target
+            continue
+    assert drafted > 0.8 * max(elsewhere) > 0
+    found = best_share(problem)
+    assert found is not None and found[0] > 0.6
+
+
+def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
+    problem = _problem(tmp_path, urdfs.arm())
+    strong = best_share(problem)
+    weak = best_share(dataclasses.replace(problem, normal=np.array([1.0, 0.0, 0.0])))
+    assert strong is not None and weak is not None and problem.normal[0] != 1.0
+    assert weak[0] < strong[0] and weak[1].normal[0] != 1.0
+    done = CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")])
+    assert f"{100 * strong[0]:.0f} % of the hardest blow nearby" in done.output
+
+
+@pytest.mark.parametrize("velocity", [0.3, 4.0])
+def test_phases_last_as_long_as_slow_joints_need(tmp_path: Path, velocity: float) -> None:
+    problem = _problem(tmp_path, urdfs.arm(velocity=velocity))
+    robot = problem.robot
+    way = robot.joint_positions(problem.contact_posture) - robot.joint_positions(problem.start_posture)
+    needed = float(np.max(np.abs(way) / robot.velocity_limit))
+    for phase in (problem.swing, problem.follow):
+        assert phase.duration[1] > 1.2 * needed
+    if velocity == 0.3:
+        assert solve(problem, refine=False).status.usable
 
 
 def _flange(tool: str = "", *, axis: str = "0 0 1") -> str:

@@ -17,6 +17,7 @@ _EXPORTS = {
     "CacheWarning": "errors",
     "Perturbation": "simulation.perturbation",
     "FixedBase": "kinematics.stance",
+    "Free": "kinematics.stance",
     "FullDynamics": "simulation.reference",
     "GainFactor": "robots.gains",
     "Ground": "bodies.shapes",

@@ -164,7 +164,7 @@ def _planned(
     return Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
-        **planned_by(t, result, refining.contact(t, result.x) if result.status.usable else None),
+        **planned_by(t, result, refining.known_contact(t, result.x)),
         **fields,
     )
 

@@ -118,8 +118,16 @@ class Refining:
         """
         if t.problem.gains:
             return None
+        known = self.known_contact(t, x)
+        if known is None:
+            known = planned_contact(t, x, t.decode(x))
+            self._contact = t, x, known
+        return known
+
+    def known_contact(self, t: Transcription, x: Array) -> PlannedContact | None:
+        """The same if it was the last one that was asked for."""
         if self._contact is None or self._contact[0] is not t or self._contact[1] is not x:
-            self._contact = t, x, planned_contact(t, x, t.decode(x))
+            return None
         return self._contact[2]
 
     def replay(self, t: Transcription, x: Array) -> ContactReplay | None:

@@ -276,7 +276,17 @@ class Collision(ContactNumbers, Collocated):
         b.equal("target's motion", place, states, first + part["target"], of_size)
         b.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
+        k, still = self.stages[i].phase, [0.0] * target.n_states
         if i in self.end:
+            if target.reserve(still, 0.0, k):
+                b.rows.add(
+                    term=target.guards[k],
+                    place=place,
+                    components=["reserve"],
+                    outputs=first + part["reserve"],
+                    lower=0,
+                    measure=percent("short"),
+                )
             return
         if self._switches and target.guards:
             back = self._restitution(i)
@@ -289,7 +299,6 @@ class Collision(ContactNumbers, Collocated):
                 upper=0.0 if back else np.inf,
                 measure=Measure("m/s", 1.0, "the other way"),
             )
-        k, still = self.stages[i].phase, [0.0] * target.n_states
         if target.invariant(still, 0.0, k):
             b.rows.add(
                 term=target.guards[min(k, len(target.guards) - 1)],

@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main", "program"]
 
-WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
-
 app = typer.Typer(
     name="impactopt",
     help="Impact motions of humanoid robots: planned by the impulse they deliver, checked in full dynamics.",
@@ -136,8 +134,8 @@ def solve(
 ) -> None:
     """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
 
-    Ctrl-C stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if there is a
-    good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    Ctrl-C, or SIGTERM, stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if
+    there is a good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
     with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
         from impactopt.files.output import make_directory
@@ -251,11 +249,15 @@ def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Sol
     from impactopt.errors import InputError
     from impactopt.files.output import record_of
     from impactopt.files.replay import has_mujoco
+    from impactopt.planning.multistart import VIOLATED
+    from impactopt.solvers.program import Status
 
     done, violation = {}, solution.result.max_violation
     engines = {"pinocchio": "in full dynamics", "mujoco": "on free soles"}
-    if validate and not violation <= WORTH_REPLAYING:
-        progress.say(f"no replay: rows of the plan are off by up to {violation:.2g}")
+    if validate and solution.status is Status.INTERRUPTED:
+        progress.say("no replay of what was interrupted; `impactopt validate` does it")
+    elif validate and not violation <= VIOLATED:
+        progress.say(f"no replay: what meets its constraints only to {violation:.2g} is no plan")
     elif validate:
         for engine, how in engines.items():
             if engine == "mujoco" and not has_mujoco():

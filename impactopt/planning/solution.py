@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.planning.causes import Cause
 from impactopt.planning.chosen_gains import ChosenGains
 from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gears import gear_caution
@@ -130,6 +131,9 @@ class Solution(Solved):
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
     statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
+    causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
+        cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
+    window : what is to be said of the time that the contact may last; "" if that costs little.
     Its other attributes are those of :class:`Solved`.
     """
 
@@ -137,6 +141,8 @@ class Solution(Solved):
     nodes: MoreNodes = NO_MORE
     contact_error: ContactError | None = None
     statement: str = ""
+    causes: tuple[Cause, ...] = ()
+    window: str = ""
 
     @property
     def impulse(self) -> float:
@@ -182,11 +188,16 @@ class Solution(Solved):
             missed=True, known=self.trajectory if self.plan.abort is not None else None
         )
 
+    @property
+    def _missed(self) -> Trajectory | None:
+        return self.missed_trajectory if self.plan.abort is not None else None
+
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
 
         engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
-        ``validate``).  options : of the engine, such as ``step`` [s].
+        ``validate``).  options : of the engine, such as ``step`` [s], or ``missing=True``: there is no
+            target.
 
         Raises
         ------
@@ -194,8 +205,7 @@ class Solution(Solved):
         """
         from impactopt.simulation import simulate
 
-        if engine == "mujoco" and self.plan.abort is not None:
-            options.setdefault("missed", self.missed_trajectory)
+        options.setdefault("missed", self._missed)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
 
     def moved(self, *, polish: bool = True, **changes: Any) -> Solution:
@@ -296,7 +306,7 @@ class Solution(Solved):
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.abort is not None else (False,):
-            motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
+            motion = self.plan.motion(missed=missed, reference=self._missed if missed else self.trajectory)
             at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
@@ -331,7 +341,12 @@ class Solution(Solved):
 
     def margins(self) -> dict[str, dict[str, float]]:
         """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
-        return self.plan.margins(self.trajectory, self.collision)
+        return self.plan.margins(self.trajectory, self.collision, self._missed)
+
+    def sole_margins(self) -> dict[str, Any]:
+        """Margins of each sole by itself, as of `Plan.sole_margins`."""
+        missed = self.missed_trajectory if self.plan.abort is not None else None
+        return self.plan.sole_margins(self.trajectory, self.collision, missed)
 
     @cached_property
     def loads(self) -> DriveLoads:
@@ -352,6 +367,7 @@ class Solution(Solved):
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,
             **self.margins(),
+            **self.sole_margins(),
             **self.loads.summary(),
             **self.clearance(),
             "slide_mm": 1e3 * way,
@@ -373,7 +389,7 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way)))):
+        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way), self.window))):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 

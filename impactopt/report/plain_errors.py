@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import signal
+import threading
 import traceback
 import warnings
 from collections.abc import Iterator
@@ -19,17 +21,32 @@ BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130  # exit codes
 
 
 @contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM raises KeyboardInterrupt, in the main thread and where nobody else handles it."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
 def plain_errors(interrupted: str, *, verbose: bool = False) -> Iterator[Console]:
     """A console on stderr, for a command's body.
 
-    interrupted : what Ctrl-C prints, where the body does not catch it.  verbose : bad input has a traceback.
+    interrupted : what Ctrl-C prints, where the body does not catch it; SIGTERM, as of a time limit or a
+        scheduler, is the same.  verbose : bad input has a traceback.
     """
     from rich.console import Console
 
     from impactopt.errors import InputError, printable
 
     console = Console(stderr=True)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _terminated_as_interrupted():
         warnings.showwarning = lambda message, *_a, **_k: console.print(
             printable(f"warning: {message}"), markup=False
         )

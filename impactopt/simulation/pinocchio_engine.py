@@ -22,7 +22,7 @@ from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 
@@ -53,14 +53,18 @@ class _Rates:
 
 
 class _World:
-    def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
-        self.robot, self.scene = robot, scene
+    def __init__(self, robot: Robot, scene: Scene, reference: Any, *, missing: bool = False) -> None:
+        self.robot, self.scene, self.missing, self.followed = robot, scene, missing, reference
         self.model, self.base = robot.model, robot.model.nv - robot.n
         self.body = PinocchioBody(
             robot, (*scene.soles, *scene.hands), np.zeros(6), scene.strikers, scene.normal
         )
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
+
+    def follow(self, reference: Any) -> None:
+        """What the servo follows from now on."""
+        self.servo, self.followed = Servo(self.robot, reference), reference
 
     def at_start(self, reference: Any) -> _State:
         """Where the motion begins: at rest, with motors that give what is asked for."""
@@ -79,7 +83,10 @@ class _World:
         return _State(q, v, travel, self.struck.untouched, np.zeros(len(self.scene.strikers)), drive)
 
     def depths(self, s: _State) -> Array:
-        """(h,) [m] of the striking points in the target, at the state at which the body has been last."""
+        """(h,) [m] of the striking points in the target, at the state at which the body has been last; -inf
+        where there is none."""
+        if self.missing:
+            return np.full(len(self.scene.strikers), -np.inf)
         return self.struck.depths(self.body.hand_places(), s.x)
 
     def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
@@ -238,6 +245,8 @@ def simulate_pinocchio(
     step: float = 1e-4,
     settle: float = 0.3,
     record: int = 5,
+    missing: bool = False,
+    missed: Any = None,
     until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, in constrained forward dynamics.
@@ -247,20 +256,25 @@ def simulate_pinocchio(
         order).  settle [s] : simulated beyond the end of the reference's motion.
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
+    missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
+        ``missed.contact_end`` (:class:`impactopt.simulation.touch.FollowedReference`); default: it does not.
 
     Raises
     ------
     InputError : the simulation diverges (with the time at which it did).
     """
-    world = _World(robot, scene, reference)
+    world = _World(robot, scene, reference, missing=missing)
     state = world.at_start(reference)
     left = state.target  # as the last touch has left it
     end = min(float(reference.end) + settle, until)
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
+    followed = FollowedReference(reference, missed)
     for k in range(round(end / step)):
         t = k * step
+        if (now := followed.at(t, bool(touches.intervals))) is not world.followed:
+            world.follow(now)
         first = world.rates(t, state, step=step)
         world.delay.keep(t, first.asked)
         cuts.look(t, first.wanted, first.cut, step)
@@ -294,6 +308,8 @@ def simulate_pinocchio(
         outcome=scene.target.outcome(left),
         saturated=saturated,
         cuts=cuts.told() if world.motors.lines else None,
-        posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
+        posture_error=posture_error(robot.model, state.q, np.asarray(world.followed.q[-1])),
         fall=None,
+        missed=missing,
+        expected=float(reference.contact_start),
     )

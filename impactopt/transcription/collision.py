@@ -84,7 +84,8 @@ class Collision(ContactNumbers, Collocated):
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
         least = 0.0 if p.target.guards or pulls_apart(p.law) or guarded else np.where(last, 0.0, -np.inf)
-        # what is driven and rattles is held on to meanwhile: see `Solved.contact_replay`; of no use where forces are wanted
+        # what is driven and rattles is held on to meanwhile, and the check of plans says what that leaves
+        # out; of no use where forces are wanted
         self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
         if self.holds:
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])

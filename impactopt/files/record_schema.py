@@ -156,6 +156,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         (
             "duration_s?",
             "collision_error_pct?",
+            "contact_replay_pct?",
             "nodes_added?",
             "motion_price_pct?",
             "capture_margin_m?",

@@ -75,6 +75,13 @@ def _truth(controller: Controller = ControllerName.servo) -> None:
     """Every problem of problems/ and variants of the demo: planned, replayed on held and on free soles."""
 
 
+@_command("contacts")
+def _contacts(
+    count: Annotated[int, typer.Option(min=1, help="Number of problems.")] = 200, seed: Seed = 0
+) -> None:
+    """Solved, and true? Drawn boards, nails and masses on three arms, planned and replayed."""
+
+
 @_command("robustness")
 def _robustness(
     file: Annotated[
@@ -300,6 +307,7 @@ def _all(
 
     drawn = {"seed": seed, "workers": workers}
     options: dict[str, dict[str, Any]] = {
+        "contacts": {"count": FEW_PROBLEMS, "seed": seed},
         "robustness": {"draws": draws, **drawn},
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},

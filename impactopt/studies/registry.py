@@ -17,6 +17,7 @@ __all__ = ["BENCHES", "REPRODUCED", "names_of", "reproduce", "run_bench"]
 # name -> module in `bench`; `impactopt bench all` runs them in this order
 BENCHES = {
     "truth": "truth",
+    "contacts": "contacts",
     "robustness": "robustness",
     "replay": "replay",
     "baselines": "baselines",

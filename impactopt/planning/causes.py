@@ -58,6 +58,8 @@ _STIFF = 60  # iterations of each: where there is a solution, most are there in 
 _BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
 _ROUGH = 1e-4  # its tolerance: three digits are told
 _MET = 1e-5  # violation of rows that counts as none here
+_TIMES = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}
+_TRIES = 4  # of a value
 _NONE = 1e-4  # what a relaxation comes to that is none
 _ROOM = 0.02  # by how much more a value is told than what it takes: there the feasible set is one point
 _FAR = 0.1  # [m] between bodies that count as much as a bound's own size
@@ -76,11 +78,13 @@ class Cause:
 
     first : its kind in a word: "time", "speed".  text : with the value that would do.
     problem : with that value; None where no value does that the bound may take.
+    nearer : of a time: the same with a value that is so far (0 to 1) on the way to a usual one.
     """
 
     first: str
     text: str
     problem: ImpactProblem | None
+    nearer: Callable[[float], Cause] | None = None
 
     def __str__(self) -> str:
         return f"{self.first}: {self.text}"
@@ -142,7 +146,7 @@ class _Relaxing:
         p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
         self.t = program_for(t, p, None)
         nothing = np.zeros(t.program.m), np.zeros(t.layout.n)
-        own = carried_over(self.t, t, result.x, *nothing)[0], first_iterate(self.t)
+        own = carried_over(self.t, t, result.x, *nothing)[0]
         shortest, longest = p.contact_duration
         loose = changed(
             p,
@@ -151,7 +155,11 @@ class _Relaxing:
             contact_duration=(shortest, max(_CONTACT, longest)),
         )
         self.loose = program_for(self.t, loose, None)
-        self.starts = *own, first_iterate(self.loose)
+        once = (_USUAL, _USUAL)
+        usual = changed(
+            loose, swing=replace(loose.swing, duration=once), follow=replace(loose.follow, duration=once)
+        )
+        self.starts = own, first_iterate(program_for(self.t, usual, None))
         self.bounds = [each for of in (_durations, _of_bodies, _of_terms) for each in of(self.t)]
 
     def found(self) -> Search:
@@ -168,7 +176,7 @@ class _Relaxing:
         for bound in tried[:_TRIED]:
             alone = self._solved([bound], x, _SINGLE)
             if alone is not None:
-                causes += bound.told(alone[0])
+                causes += filter(None, map(self._confirmed, bound.told(alone[0])))
         if not any(cause.problem for cause in causes):
             causes += self._stiffness()
         causes.sort(key=lambda cause: cause.problem is None)
@@ -181,6 +189,22 @@ class _Relaxing:
             if found is not None:
                 return found
         return None
+
+    def _confirmed(self, cause: Cause) -> Cause | None:
+        """A cause whose value makes the problem solvable from a plain start; of a time where the least one
+        does not, one nearer to usual ones. None if it does not; one that may not be is as it is.
+        """
+        for again in range(_TRIES):
+            if cause.problem is None or (again and cause.nearer is None):
+                break
+            one = cause if not again or cause.nearer is None else cause.nearer(again / _TRIES)
+            if one.problem is None:
+                break
+            t = program_for(self.t, one.problem, None)
+            self._iterations += _STIFF
+            if self._run(t.program, first_iterate(t), _ITERATIONS) is not None:
+                return one
+        return cause if cause.problem is None else None
 
     def _stiffness(self) -> Iterator[Cause]:
         """A contact as stiff as it would have to be: what no bound says, and is found by trying."""
@@ -268,16 +292,15 @@ def _durations(t: Transcription) -> Iterator[_Bound]:
             low, high = own if kind == "contact" else own.duration
             times = x[at] * scale[kind]
             longer = times.max() > high
-            bound, value = (high, times.max()) if longer else (low, times.min())
-            if not longer and value >= bound:
+            value = float(times.max() if longer else times.min())
+            if not longer and value >= low:
                 return
-            value = _outward(value, bound)
-            both = (value, value) if low == high else (low, value) if longer else (value, high)
-            new = both if kind == "contact" else replace(own, duration=both)
-            name = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}[kind]
-            words = f"{name}: {_seconds(value)} for {_seconds(bound)}"
-            key = {"contact": "[collision] duration_s"}.get(kind, f"[{kind}] duration_s")
-            yield Cause(first="time", text=f"{words} ({key})", problem=_or_none(p, **{field: new}))
+            common = {"name": kind, "low": low, "high": high, "longer": longer}
+
+            def cause(more: float, least: float = value, common: dict[str, Any] = common) -> Cause:
+                return _time(p, least * (_USUAL / least) ** more, **common)
+
+            yield replace(cause(0.0), nearer=None if kind == "contact" else cause)
 
         yield _Bound(
             name=kind,
@@ -287,6 +310,19 @@ def _durations(t: Transcription) -> Iterator[_Bound]:
             told=told,
             is_time=True,
         )
+
+
+def _time(p: ImpactProblem, value: float, *, name: str, low: float, high: float, longer: bool) -> Cause:
+    """A duration that would do beside its bounds."""
+    bound = high if longer else low
+    value = _outward(value, bound)
+    both = (value, value) if low == high else (low, value) if longer else (value, high)
+    text = f"{_TIMES[name]}: {value:.3g} s for {bound:.3g} s"
+    if name == "contact":
+        new = _or_none(p, contact_duration=both)
+        return Cause(first="time", text=f"{text} ([collision] duration_s)", problem=new)
+    new = _or_none(p, **{name: replace(getattr(p, name), duration=both)})
+    return Cause(first="time", text=f"{text} ([{name}] duration_s)", problem=new)
 
 
 def _of_bodies(t: Transcription) -> Iterator[_Bound]:
@@ -462,7 +498,3 @@ def _outward(value: float, bound: float) -> float:
     value += _ROOM * (value - bound) + (1 if up else -1) * 1e-3 * abs(value)
     size = 10.0 ** (np.floor(np.log10(max(abs(value), 1e-12))) - 2)
     return float(f"{(np.ceil if up else np.floor)(value / size) * size:.3g}")
-
-
-def _seconds(value: float) -> str:
-    return f"{value:.3g} s"

@@ -19,6 +19,7 @@ _EXPORTS = {
     "FixedBase": "kinematics.stance",
     "FullDynamics": "simulation.reference",
     "GainFactor": "robots.gains",
+    "Ground": "bodies.shapes",
     "ImpactProblem": "problem.problem",
     "InputError": "errors",
     "JointFriction": "collision",

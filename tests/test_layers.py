@@ -85,6 +85,7 @@ BROUGHT_BY = {
     "annotated_types": "pydantic",
     "coal": "pin",
     "mcap_ros2": "mcap-ros2-support",
+    "websockets": "viser",
     "pinocchio": "pin",
     "pounce": "pounce-solver",
 }

@@ -134,6 +134,22 @@ class Obstacle(Described):
         return np.asarray(about_z @ about_y @ about_x)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Ground(Described):
+    """The floor below a robot on a fixed base, which nothing of the robot may touch.
+
+    Left out: there is none. A robot on soles stands on the ground z = 0.
+    """
+
+    height: float = field(
+        default=0.0, metadata=about("height of the floor, in the frame of the robot's root link", unit="m")
+    )
+
+    def __post_init__(self) -> None:
+        height = check_array("Ground.height [m]", self.height, (), most=FARTHEST)
+        object.__setattr__(self, "height", float(height))
+
+
 def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) rows: the normal, the direction across (level, to the left), and up, at right angles to both.
 

@@ -16,7 +16,7 @@ from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.targets import Board, Nail, RigidWall, Target
 
-__all__ = ["BEHIND", "WorldBody", "ground", "obstacle_bodies", "target_bodies"]
+__all__ = ["BEHIND", "WorldBody", "ground_body", "obstacle_bodies", "target_bodies"]
 
 Array = NDArray[np.float64]
 BEHIND = 0.08  # [m] behind its face a target is its core, which the striker has not to reach before contact
@@ -35,7 +35,7 @@ class WorldBody:
     half zero: a sphere; only its last number not zero: a capsule along its z axis.
     of_target : it comes and goes with the target.  moves : with it, along the normal.
     strikable : the link that strikes may touch it.  before : it is there until contact only.
-    core : of the target, which the striker is to reach from its face.
+    core : of the target, which the striker is to reach from its face.  ground : it is the floor.
     """
 
     name: str
@@ -48,6 +48,7 @@ class WorldBody:
     strikable: bool = False
     before: bool = False
     core: bool = False
+    ground: bool = False
 
     @cached_property
     def planes(self) -> Planes:
@@ -69,13 +70,14 @@ class WorldBody:
         return own.moved(self.rotation, self.place)
 
 
-def ground() -> WorldBody:
-    """The half-space below z = 0, as a large box."""
+def ground_body(height: float) -> WorldBody:
+    """The half-space below a height [m], as a large box."""
     return WorldBody(
         name="ground",
         half=np.array([FLOOR, FLOOR, THICK]),
-        place=np.array([0.0, 0.0, -THICK]),
+        place=np.array([0.0, 0.0, height - THICK]),
         rotation=np.eye(3),
+        ground=True,
     )
 
 

@@ -163,8 +163,8 @@ def solve(
                 kept.keep(solution, read)
                 progress.say(f"started from {near}" if near else f"no plan in {store} is near enough")
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
-            if solution.rattle is not None:
-                progress.say(str(solution.rattle))
+            if solution.caution:
+                progress.say(solution.caution)
             record = _record(solution, read, validate, progress)
             record.summary["command"] = command_line(context)
             if baseline:

@@ -35,7 +35,7 @@ from impactopt.planning.side_by_side import best_side_by_side, check_workers
 from impactopt.planning.solution import Solution
 from impactopt.planning.stopping import stopping
 from impactopt.planning.strike import clear_strike
-from impactopt.planning.verdict import lacks_rows, with_reason
+from impactopt.planning.verdict import lacks_rows, with_reason, with_soles_kept
 from impactopt.planning.window import window_caution
 from impactopt.problem.doubts import hopeless
 from impactopt.problem.problem import ImpactProblem
@@ -171,15 +171,17 @@ def _planned(
     if not known:
         t, fields, causes = _explained(t, fields, budget, each, report)
     t, fields = settled(t, fields, budget, report)
-    result = fields["result"] = with_reason(t, fields["result"], causes, known=known)
-    return Solution(
+    explained = with_reason(t, fields["result"], causes, known=known)
+    result = fields["result"] = refining.checked(t, explained)
+    solution = Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
         window=window_caution(t, result) if result.status.usable else "",
         causes=tuple(cause for cause in causes if cause.problem is not None),
-        **planned_by(t, result),
+        **planned_by(t, result, refining.contact(t, result.x) if result.status.usable else None),
         **fields,
     )
+    return with_soles_kept(solution) if refine else solution
 
 
 def _explained(

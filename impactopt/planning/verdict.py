@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.errors import InputError
 from impactopt.planning.causes import Cause
 from impactopt.planning.multistart import VIOLATED, Budget
+from impactopt.planning.solution import Solution
 from impactopt.problem.doubts import too_weak
+from impactopt.robots.sole_margins import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.guess import Parting, fastest, parting
 
 Array = NDArray[np.float64]
+TOLD = 3  # margins at most, in a message
 
 
 def second_look(
@@ -84,6 +89,20 @@ def with_reason(
         why = f"Infeasible: {found}."
     rest = result.message.partition(". ")[2] or result.message
     return replace(result, status=Status.INFEASIBLE, message=f"{why} {rest}")
+
+
+def with_soles_kept(solution: Solution) -> Solution:
+    """A solution whose soles keep at least half of each margin between its program's nodes, too; one of which
+    some keeps less is acceptable at best, and says so.
+    """
+    if solution.status is not Status.SOLVED:
+        return solution
+    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+        if short := shortfalls(solution.sole_margins()):
+            message = f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:TOLD])}."
+            result = replace(solution.result, status=Status.ACCEPTABLE, message=message)
+            return replace(solution, result=result)
+    return solution
 
 
 def _too_stiff(t: ContactProgram) -> str:

@@ -296,7 +296,7 @@ class Collision(ContactNumbers, Collocated):
                 place=place,
                 components=["target"],
                 outputs=first + part["invariant"],
-                lower=0,
+                lower=target.margin(k, self.stages[i].place),
                 measure=percent("out of turn"),
             )
 

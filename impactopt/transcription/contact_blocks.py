@@ -146,7 +146,7 @@ def collision(
     servo = ff + (stiff * ahead + damped * c.configuration(u0 - u, slower)[c.base :]) / limit
     out = {
         "closure": c.closure(y, legs),
-        "base": tau[: c.base] / base_scale(c, weight, lever),
+        "base": tau[: c.base, :] / base_scale(c, weight, lever),
         "joints": tau[c.base :] / limit - servo,
         "torque": servo,
         **slopes,
@@ -286,7 +286,7 @@ def carried(c: StanceCoordinates) -> BlockExpression:
     force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv)) - c.sole_wrench_map(
         y, legs, w
     )
-    out = {"base": force[: c.base] / base_scale(c, weight, lever)}
+    out = {"base": force[: c.base, :] / base_scale(c, weight, lever)}
     return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
 
 
@@ -321,7 +321,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
     e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
     out = {
-        "base": balance[: c.base] / (0.1 * base_scale(c, weight, lever)),
+        "base": balance[: c.base, :] / (0.1 * base_scale(c, weight, lever)),
         "joints": balance[c.base :] / (0.1 * limit),
         "blow": blow * inverse_mass + lost - (1 + e) * approach,
     }
@@ -351,7 +351,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {
-        "base": balance[: c.base] / base_scale(c, weight, lever),
+        "base": balance[: c.base, :] / base_scale(c, weight, lever),
         "joints": balance[c.base :] / limit,
         "law": (f - law.branch(0.0, ca.dot(push, v) - before, True, named)) / FORCE_SCALE,
         "rotors": -armature * (a + jump)[c.base :] / limit,

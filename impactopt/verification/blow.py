@@ -304,7 +304,8 @@ class Blow:
             rows.append(("approach speed", place, ["striker and target"], *way))
         if guarded:
             name = target.guards[min(phase, len(target.guards) - 1)]
-            rows.append((name, place, ["target"], 0.0, np.inf))
+            least = target.margin(phase, self.stages[i].place)
+            rows.append((name, place, ["target"], least, np.inf))
         return [Piece.of(value, rows)]
 
     def _ends(self) -> list[Piece]:

@@ -24,7 +24,7 @@ from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface
 from impactopt.bodies.pieces import convex, inertia_box, pieces_of
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.shapes import Obstacle, face_axes
-from impactopt.bodies.world import BEHIND, WorldBody, ground, obstacle_bodies, target_bodies
+from impactopt.bodies.world import BEHIND, WorldBody, ground_body, obstacle_bodies, target_bodies
 from impactopt.contact import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
@@ -405,7 +405,7 @@ def test_the_target_comes_goes_and_moves() -> None:
     q = np.tile(problem.start_posture, (4, 1))
     places = Places.of(problem.robot, q, np.array([0.0, 0.0, 0.2, 0.0]), np.array([0, 1, 2, MISSED]))
     there = {body.name: bodies.present(body, places).tolist() for body in bodies.world}
-    assert there["ground"] == [True] * 4
+    assert "ground" not in there, "the base is fixed"
     assert there["target"] == [True, False, False, False], "a board is broken"
     assert there["target's support"] == [True, True, True, False]
     free = arm_problem().bodies
@@ -500,7 +500,7 @@ def test_a_nail_stands_out_of_its_block() -> None:
 
 
 def test_the_ground_is_what_is_below() -> None:
-    floor = ground()
+    floor = ground_body(0.0)
     assert distance(coal.Sphere(0.1), at(np.array([1.0, 2.0, 0.3])), floor.shape, at(floor.place)) == (
         pytest.approx(0.2, abs=1e-9)
     )
@@ -591,7 +591,7 @@ def test_a_start_in_something_is_refused() -> None:
     with pytest.raises(InputError, match=r"at the start the link '\w+' is in the body 'post'"):
         _ = inside.bodies
     free = dataclasses.replace(inside, terms=(KeepOut(enabled=False),))
-    assert len(free.bodies.world) == len(inside.obstacles) + 3, "who switches it off is not told"
+    assert len(free.bodies.world) == len(inside.obstacles) + 2, "who switches it off is not told"
     large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)))
     moved = dataclasses.replace(large, point=np.array(problem.point) - np.array([0.0, 0.4, 0.0]))
     with pytest.raises(InputError, match="is in the body 'target"):

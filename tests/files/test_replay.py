@@ -62,7 +62,7 @@ def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -
     assert report["impulse_error_pct"] == pytest.approx(100 * (report["impulse_Ns"] / punch.impulse - 1))
     assert report["zmp_margin_m"] == min(report["zmp_margin_by_phase_m"].values())
     assert report["torque_ratio"] == max(report["torque_ratio_by_phase"].values())
-    assert report["sole_cop_margin_m"].keys() == {"left", "right"}
+    assert report["sole_cop_margin_mm"].keys() == {"left", "right"}
     written = {path.name for path in (tmp_path / "new" / "place").iterdir()}
     assert written == {"replay.json", "replay.png"}
     assert json.loads((tmp_path / "new" / "place" / "replay.json").read_text()) == report

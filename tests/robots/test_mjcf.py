@@ -203,7 +203,7 @@ def test_own_numbers_win_over_the_files(tree: Path) -> None:
         (
             '<joint name="turn"',
             '<joint name="sway" axis="1 0 0" range="-10 10"/><joint name="turn"',
-            "'sway' and another one move the same body.*lock one",
+            "joints 'sway', 'turn' move the same body.*lock one",
         ),
         ("<mujoco model", "<mujoco nonsense='1' model", "MJCF .*tree.xml: .*nonsense"),
     ],

@@ -121,6 +121,14 @@ class Target(Described, ABC):
         """Expressions of order 1 that are not negative while a phase lasts: one, or none."""
         return []
 
+    def margin(self, phase: int, place: float) -> float:
+        """How far `invariant` stays from zero at a place in a phase, 0 where it begins and 1 where it ends.
+
+        So that an event which ends a phase is the first of its kind, and not one that a small error brings
+        earlier.
+        """
+        return 0.0
+
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         """What the blow has done to the target, from the state at separation; named by `results`."""
         return []

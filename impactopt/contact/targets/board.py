@@ -11,6 +11,8 @@ from impactopt.contact.targets.base import Target
 
 __all__ = ["Board"]
 
+MARGIN = 0.1  # of the breaking force where the board is touched; none where it breaks
+
 
 @dataclass(frozen=True, kw_only=True)
 class Board(Target):
@@ -73,6 +75,12 @@ class Board(Target):
     ) -> list[Any]:
         """Before the break the spring's force is below the breaking force."""
         return [] if phase else [-self.guard(state, force, 0.0, phase, parameters)]
+
+    def margin(self, phase: int, place: float) -> float:
+        """A board that only just holds may break, so an earlier peak of its swing keeps off the break, and
+        the break is come to with a speed.
+        """
+        return MARGIN * (1.0 - place) if phase == 0 else 0.0
 
     def _beyond(self, state: Any, p: Parameters) -> Any:
         return state[1] - p["breaking_force"] / p["stiffness"]

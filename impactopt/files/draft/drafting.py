@@ -43,17 +43,17 @@ class Draft:
     said: tuple[str, ...]
 
 
-def draft_problem(path: Path, *, folder: Path, mjcf: bool = False) -> Draft:
+def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool = False) -> Draft:
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
-    folder : that the file is to be in.
+    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.
 
     Raises
     ------
     InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
         posture or no target is found.
     """
-    drafted = draft_robot(path, mjcf=mjcf)
+    drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
     model, forward = drafted.robot.model, np.array(WAYS[0])
     soles: list[Sole] = []
     if drafted.legs:
@@ -223,6 +223,8 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
     stands = "on two legs" if drafted.legs else "on a fixed base"
     joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
     yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
+    if drafted.freed:
+        yield "the MJCF has no free joint: it stands on its two legs here; --bolted leaves it bolted"
     across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
     if across:
         yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"
@@ -234,6 +236,7 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
             )
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
+    yield from robot.source.notes if robot.source is not None else ()
     for key, what in (
         ("armature_kg_m2", "rotor inertias"),
         ("torque_limit_N_m", "torque limits"),

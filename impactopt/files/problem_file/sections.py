@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from impactopt.bodies.shapes import Obstacle
+from impactopt.bodies.shapes import Ground, Obstacle
 from impactopt.errors import InputError
 from impactopt.files.problem_file.contacts import Contact, Target
 from impactopt.files.problem_file.described import section_of
@@ -143,6 +143,7 @@ class CollisionSection(Section):
 
 ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
+GroundSection: Any = section_of(Ground)
 ControllerSection: Any = section_of(ControllerSettings)
 
 
@@ -172,6 +173,7 @@ class File(Section):
     collision: CollisionSection = optional("")
     scenarios: list[ScenarioSection] = optional("")
     obstacles: list[ObstacleSection] = optional("")
+    ground: GroundSection = optional("")
     objectives: ObjectiveSections = optional("")
     objective: ObjectiveSection = optional("")
     terms: TermSections = optional("")
@@ -249,6 +251,8 @@ class File(Section):
             out["body"] = self.target.body.build()
         if self.obstacles is not None:
             out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
+        if self.ground is not None:
+            out["ground"] = self.ground.build()
         if self.scenarios is not None:
             out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
         for name, section in (("terms", self.terms), ("objectives", self.objectives)):

@@ -80,6 +80,7 @@ class WholeBodyController:
         stands = robot.floating and bool(scene.soles) and settings.follow == "recover"
         recovery = Recovery(robot, reference, scene, settings) if stands else None
         self.target = Target(robot, reference, scene.strikers, spread=settings.spreads, recovery=recovery)
+        self.of_blow = self.target
         self.estimate = StateEstimate(robot, scene.soles, q0)
         self.loads, self.points = np.ones(soles), np.zeros((soles, 3))
         self.acceleration = np.zeros(robot.nv)
@@ -90,9 +91,11 @@ class WholeBodyController:
         self.sprung = bool(robot.sprung.any())
         self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
-    def miss(self, reference: Any) -> None:
-        """What it tracks from now on, as it has hit nothing."""
-        self.target = Target(self.robot, reference, self.scene.strikers, spread=False)
+    def follow(self, missed: Any | None) -> None:
+        """What it tracks from now on: the plan's blow (None), or the reference of a robot that hits nothing."""
+        self.target = self.of_blow
+        if missed is not None:
+            self.target = Target(self.robot, missed, self.scene.strikers, spread=False)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:
         """Torque demand (n,) [N m] at a time [s], from what the sensors make of the true state."""
@@ -188,7 +191,7 @@ class WholeBodyController:
         for k, place in enumerate(held.places):
             lift[3:, 6 * k : 6 * k + 3] = pin.skew((place.translation - com) / mass)
         # the divergent component of motion: com + rate / omega
-        gain, omega = s.capture_gain, math.sqrt(9.81 / max(com[2], 0.1))
+        gain, omega = s.capture_gain, math.sqrt(np.linalg.norm(self.gravity) / max(com[2], 0.1))
         error = Ag @ lag
         if recovers:  # the centre of mass has an aim of its own, the joints' motion does not bring it there
             error[:3] = mass * aim.com[1] - data.hg.linear

@@ -1,14 +1,14 @@
 """Is what is planned what happens? Punches, planned and then replayed with held soles and with free ones.
 
 One row a problem: how the solver ended; from the replay with held soles (Pinocchio) the impulse's error, the
-least ZMP margin, the largest torque demand over limit and the least normal force of a sole; from the replay
-with free soles (MuJoCo) the impulse's error, slip, lift in the collision, and whether the robot stands at the
-end. What fails stays in.
+least ZMP margin, what each sole by itself keeps of the margins asked of it, and the largest torque demand
+over limit; from the replay with free soles (MuJoCo) the impulse's error, each sole's least margin and force,
+slip, lift in the collision, and whether the robot stands at the end. What fails stays in.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +53,13 @@ HELD = (
     ("N s", "impulse_planned_Ns", 2),
     ("error %", "impulse_error_pct", 2),
     ("ZMP mm", "zmp_margin_mm", 1),
+    ("CoP planned", "cop_planned", 2),
+    ("held", "cop_held", 2),
     ("torque", "torque_ratio", 2),
     ("gear planned", "gear_planned", 2),
     ("gear", "gear_held", 2),
-    ("force N", "min_normal_force_N", 0),
+    ("force planned", "force_planned", 2),
+    ("held", "force_held", 2),
     ("apart mm", "clearance_mm", 1),
     ("touches", "touches", 0),
     ("in meshes", "mesh_touches", 0),
@@ -65,6 +68,8 @@ FREE = (
     ("problem", "problem", 0),
     ("error %", "replay_impulse_error_pct", 2),
     ("gear", "gear_free", 2),
+    ("CoP mm", "cop_free_mm", 1),
+    ("force N", "force_free_N", 0),
     ("slip mm", "replay_slip_mm", 1),
     ("lift mm", "replay_lift_collision_mm", 2),
     ("apart mm", "replay_clearance_mm", 1),
@@ -120,6 +125,10 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
     mesh_touches : pairs that are in each other by the exact meshes of the robot's URDF, looked at every
     millisecond of the plan, the missed blow and the replay (None: it has no meshes).
+    cop_planned, cop_held, force_planned, force_held : least that a sole keeps of the margin of its centre of
+    pressure and of its normal force, over what is asked of it, in the plan (its missed blow included) and in
+    its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
+    by sole and phase.
     gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}
@@ -140,7 +149,9 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
             "torque_ratio": max(held["torque_ratio"].values()),
             "gear_planned": told.get("gear_ratio"),
             "gear_held": held.get("gear_ratio"),
-            "min_normal_force_N": held.get("min_normal_force_N"),
+            **_kept(told, told, "planned"),
+            **_kept(held, told, "held"),
+            "soles": {name: _soles(found) for name, found in (("planned", told), ("held", held))},
         }
     except InputError as error:
         out["status"] = out.get("status", "error")
@@ -153,7 +164,10 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}
         return out
+    out["soles"]["free"] = _soles(free)
     out |= {
+        "cop_free_mm": _least_of(free.get("sole_cop_margin_mm")),
+        "force_free_N": _least_of(free.get("sole_force_N")),
         "replay_impulse_error_pct": free["impulse_error_pct"],
         "gear_free": free.get("gear_ratio"),
         "replay_slip_mm": free.get("sole_slip_mm"),
@@ -165,6 +179,31 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         "reason": free["reason"],
     }
     return out
+
+
+def _soles(found: Mapping[str, Any]) -> dict[str, Any]:
+    """What a summary says of each sole by itself."""
+    return {key: value for key, value in found.items() if key.startswith(("sole_cop_margin", "sole_force"))}
+
+
+def _least_of(soles: Mapping[str, Mapping[str, float]] | None) -> float | None:
+    return _least(*(kept for phases in (soles or {}).values() for kept in phases.values()))
+
+
+def _kept(found: Mapping[str, Any], told: Mapping[str, Any], name: str) -> dict[str, float | None]:
+    """Least share of what is asked of a sole; a centre of pressure of which nothing is asked is left out."""
+    asked, force = told.get("sole_cop_margin_asked_mm") or {}, told.get("sole_force_asked_N")
+    shares = [
+        kept / asked[phase]
+        for phases in (found.get("sole_cop_margin_mm") or {}).values()
+        for phase, kept in phases.items()
+        if asked.get(phase)
+    ]
+    least = _least_of(found.get("sole_force_N"))
+    return {
+        f"cop_{name}": _least(*shares),
+        f"force_{name}": least / force if force and least is not None else None,
+    }
 
 
 def _planned(solution: Solution) -> list[Array]:

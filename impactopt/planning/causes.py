@@ -203,8 +203,8 @@ class _Relaxing:
             t = program_for(self.t, one.problem, None)
             self._iterations += _STIFF
             if self._run(t.program, first_iterate(t), _ITERATIONS) is not None:
-                return one
-        return cause if cause.problem is None else None
+                return replace(one, nearer=None)
+        return replace(cause, nearer=None) if cause.problem is None else None
 
     def _stiffness(self) -> Iterator[Cause]:
         """A contact as stiff as it would have to be: what no bound says, and is found by trying."""

@@ -196,7 +196,8 @@ class Solution(Solved):
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
 
         engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
-        ``validate``).  options : of the engine, such as ``step`` [s], or ``missing=True``: there is no target.
+        ``validate``).  options : of the engine, such as ``step`` [s], or ``missing=True``: there is no
+            target.
 
         Raises
         ------

@@ -29,7 +29,7 @@ from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Followed, Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
@@ -278,7 +278,7 @@ def simulate_mujoco(
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
     missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
-        :class:`impactopt.simulation.touch.Followed`); default: it does not notice.
+        :class:`impactopt.simulation.touch.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 
@@ -307,7 +307,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
-    followed = Followed(reference, missed)
+    followed = FollowedReference(reference, missed)
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     undriven = bool(passive.any())
     drive: Array | None = None  # torque of the motors

@@ -22,7 +22,7 @@ from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Followed, Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 
@@ -257,7 +257,7 @@ def simulate_pinocchio(
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
     missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
-        ``missed.contact_end`` (see :class:`impactopt.simulation.touch.Followed`); default: it does not.
+        ``missed.contact_end`` (:class:`impactopt.simulation.touch.FollowedReference`); default: it does not.
 
     Raises
     ------
@@ -270,7 +270,7 @@ def simulate_pinocchio(
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
-    followed = Followed(reference, missed)
+    followed = FollowedReference(reference, missed)
     for k in range(round(end / step)):
         t = k * step
         if (now := followed.at(t, bool(touches.intervals))) is not world.followed:

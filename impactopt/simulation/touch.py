@@ -16,7 +16,7 @@ def parts_from(reference: Any, missed: Any) -> float:
     return min(float(reference.contact_end), float(missed.contact_end))
 
 
-class Followed:
+class FollowedReference:
     """Choice of the servo's reference, by whether the robot has felt a contact.
 
     A robot knows that it has hit something when it feels it, but that it has hit nothing only at

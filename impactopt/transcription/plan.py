@@ -252,8 +252,8 @@ class Plan:
             legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
         time, q, v, a_, torque, ground, wrench = (np.concatenate([p[k] for p in parts]) for k in range(1, 8))
-        # held while in contact: the collision model counts on what makes the robot coast at contact. Beyond the
-        # planned contact nothing does, and postures on the way differ: there it is what coasting needs
+        # held while in contact: the collision model counts on what makes the robot coast at contact. Beyond
+        # the planned contact nothing does, and postures on the way differ: there it is what coasting needs
         torque[(phases == 1) & (time <= self.contact_end)] = self.collision.torque[0]
         return Trajectory(
             time=time,

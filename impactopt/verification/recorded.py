@@ -160,7 +160,7 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
     yield "ground wrench", _gap(world, ground, six)
     yield "equation of motion of the base", _gap(rest[: robot.base] / six, np.zeros(robot.base))
     if robot.standing:
-        corners = [leg.sole.polygon for leg, *_ in robot.soles[: robot.standing]]
+        corners = [leg.sole.polygon for leg, *_ in robot.soles if leg.sole is not None]
         own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
         kept = float(cop_margin(robot.robot, corners, own[None]).min())
         yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept

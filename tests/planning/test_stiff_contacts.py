@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from impactopt.transcription.rattle import rattle_of
 
 from impactopt import optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail
@@ -18,7 +19,6 @@ from impactopt.transcription.collision import Collision
 from impactopt.transcription.contact_error import ASKED
 from impactopt.transcription.guess import fastest, parting
 from impactopt.transcription.phases import shortest_phases
-from impactopt.transcription.rattle import rattle_of
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import StrikeTranscription
 from impactopt.transcription.transcription import block_functions

@@ -11,7 +11,7 @@ import pytest
 from impactopt import FixedBase, FreeMass, ImpactProblem, Scenario, SpringDamper, planar_arm, solve
 from impactopt.planning.solution import Solution
 from impactopt.robots.robot import Robot
-from impactopt.simulation.touch import Followed
+from impactopt.simulation.touch import FollowedReference
 from impactopt.transcription.plan import Trajectory
 
 LATE = 0.03  # [s] after the planned contact that the robot notices
@@ -48,7 +48,7 @@ def rates(reference: Trajectory, robot: Robot, t: float) -> np.ndarray:
 
 def test_the_reference_of_a_robot_that_feels_nothing_is_continuous(short: Solution) -> None:
     reference, missed, robot = short.trajectory, short.missed_trajectory, short.problem.robot
-    followed = Followed(reference, missed)
+    followed = FollowedReference(reference, missed)
     times = np.arange(reference.contact_start - 0.01, missed.contact_end + 0.02, EVERY)
     told = np.array([rates(followed.at(t, False), robot, t) for t in times])
     jumps = np.abs(np.diff(told, axis=0)).max(axis=1)
@@ -78,7 +78,8 @@ def test_a_missed_blow_asks_for_no_more_torque_than_planned(short: Solution, eng
     # a servo whose reference is where the robot is asks for nothing but the feed-forward
     times = sim.time[sim.time >= short.plan.contact_start]
     demand = sim.demand[-len(times) :]
-    feed = np.array([np.interp(times, short.missed_trajectory.time, u) for u in short.missed_trajectory.torque.T])
+    missed = short.missed_trajectory
+    feed = np.array([np.interp(times, missed.time, u) for u in missed.torque.T])
     limit = short.problem.robot.torque_limit
     assert np.abs((demand - feed.T) / limit).max() < 0.1
 
@@ -86,22 +87,22 @@ def test_a_missed_blow_asks_for_no_more_torque_than_planned(short: Solution, eng
 def test_it_goes_over_to_the_blow_where_it_feels_one_late(short: Solution) -> None:
     reference, missed = short.trajectory, short.missed_trajectory
     between = (reference.contact_end + missed.contact_end) / 2
-    followed = Followed(reference, missed)
+    followed = FollowedReference(reference, missed)
     assert followed.at(reference.contact_start, False) is reference
     assert followed.at(between, False) is missed
     assert followed.at(between + EVERY, True) is reference
     assert followed.at(missed.contact_end + EVERY, True) is reference
     # once it aborts, it does not come back: what it touches then is in the way of its stop
-    aborts = Followed(reference, missed)
+    aborts = FollowedReference(reference, missed)
     assert aborts.at(missed.contact_end, False) is missed
     assert aborts.at(missed.contact_end + EVERY, True) is missed
-    assert Followed(reference).at(missed.contact_end, False) is reference
+    assert FollowedReference(reference).at(missed.contact_end, False) is reference
 
 
 def test_a_contact_longer_than_that_ends_with_the_abort_motion(short: Solution) -> None:
     reference, missed = short.trajectory, short.missed_trajectory
     long = dataclasses.replace(reference, contact_end=missed.contact_end + 0.01)
-    followed = Followed(long, missed)
+    followed = FollowedReference(long, missed)
     assert followed.at(missed.contact_end - EVERY, False) is long
     assert followed.at(missed.contact_end, False) is missed
-    assert Followed(long, missed).at(missed.contact_end, True) is long
+    assert FollowedReference(long, missed).at(missed.contact_end, True) is long

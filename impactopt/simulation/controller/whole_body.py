@@ -92,7 +92,7 @@ class WholeBodyController:
         self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
     def follow(self, missed: Any | None) -> None:
-        """What it tracks from now on: the plan's blow (None), or the reference of a robot that hits nothing."""
+        """Track from now on the plan's blow (None), or the reference of a robot that hits nothing."""
         self.target = self.of_blow
         if missed is not None:
             self.target = Target(self.robot, missed, self.scene.strikers, spread=False)

@@ -179,7 +179,8 @@ def march(
         if k > _MOST_STEPS:
             raise InputError(
                 f"the contact is too fast to follow in MuJoCo: it takes steps of {step:.2g} s, and is not "
-                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or take FullDynamics"
+                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or take "
+                "FullDynamics"
             )
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)

@@ -24,6 +24,7 @@ BENCHES = {
     "feedback": "feedback",
     "models": "models",
     "moved": "moved",
+    "causes": "causes",
     "fidelity": "fidelity",
     "freezes": "freezes",
     "gains": "gains",

@@ -33,11 +33,12 @@ __all__ = ["Cause", "Search", "search"]
 Array = NDArray[np.float64]
 _LOOSE = 4.0  # times longer, or shorter, that durations may become, or usual
 _CONTACT = 0.2  # [s] that a phase of contact may become
-_ITERATIONS, _SINGLE = 150, 100  # at most, of all bounds together and of one
-_LEAST = 600  # of the whole search, at least
+# at most, of all bounds together, of one, and of a plain start where it has moved: most take a third of it
+_ITERATIONS, _SINGLE, _PLAIN = 100, 60, 200
+_LEAST = 400  # of the whole search, at least
 _TRIED = 5  # bounds that are tried alone
 _FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))  # of stiffness
-_STIFF = 60  # iterations of each: where there is a solution, most are there in half of them
+_STIFF = 50  # iterations of each: where there is a solution, most are there in half of them
 _BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
 _ROUGH = 1e-4  # its tolerance: three digits are told
 _TRIES = 4  # of a value
@@ -134,8 +135,8 @@ class _Relaxing:
             if one.problem is None:
                 break
             t = program_for(self.t, one.problem, None)
-            self._iterations += _STIFF
-            if self._run(t.program, first_iterate(t), _ITERATIONS) is not None:
+            self._iterations += _PLAIN
+            if self._run(t.program, first_iterate(t), _PLAIN) is not None:
                 return replace(one, nearer=None)
         return replace(cause, nearer=None) if cause.problem is None else None
 
@@ -143,7 +144,7 @@ class _Relaxing:
         """A contact as stiff as it would have to be: what no bound says, and is found by trying."""
         p = self.t.problem
         known = p.law.parameters.get("stiffness")
-        self._iterations += _STIFF * len(_FACTORS)
+        self._iterations = _STIFF * len(_FACTORS)
         for factor in () if known is None else _FACTORS:
             value = float(f"{known * factor:.2g}")
             law: ContactLaw = replace(p.law, stiffness=value)  # type: ignore[type-var]

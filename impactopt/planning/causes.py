@@ -190,7 +190,7 @@ class _Relaxing:
             relaxed = RelaxedProgram(program, [bound.relaxation(self.loose) for bound in bounds], start)
         finally:
             program.x_lower, program.x_upper = wide
-        durations = np.concatenate([bound.variables for bound in self.bounds if bound.is_time])
+        durations = np.array([j for bound in bounds if bound.is_time for j in bound.variables], dtype=np.intp)
         relaxed.x_lower[durations] = np.maximum(relaxed.x_lower[durations], wide[0][durations])
         relaxed.x_upper[durations] = np.minimum(relaxed.x_upper[durations], wide[1][durations])
         result = self._run(relaxed, relaxed.start(start, _BARRIER), most, barrier=_BARRIER, push=_PUSH)

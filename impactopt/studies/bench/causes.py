@@ -30,7 +30,7 @@ STIFFNESS, DURATION, INTERVALS, TORQUE = (3.5, 7.5), (-0.82, 0.48), (6, 40), (0.
 MOST = 10_000
 COLUMNS = (
     ("problem", "problem", 0),
-    ("N/m", "stiffness_N_m", "{:.2g}"),
+    ("N/m", "stiffness_N_m", ".2g"),
     ("swing [s]", "swing_s", 2),
     ("intervals", "intervals", 0),
     ("torque", "torque", 2),

@@ -192,6 +192,11 @@ def _moved(
     """Plans bent for other points, masses and stiffnesses: first order, and polished by the solver."""
 
 
+@_command("causes")
+def _causes(draws: Draws = 26, seed: Seed = 0) -> None:
+    """Drawn variants of the arms that ask too much: is there a plan where the message says there is?"""
+
+
 @_command("fidelity")
 def _fidelity(
     workers: Compilers = 2,
@@ -314,6 +319,7 @@ def _all(
         "feedback": {"problems": ["punch"], "draws": min(draws, FEW_DRAWS), **drawn},
         "models": {"quick": True},
         "moved": {"shifts": min(draws, FEW_DRAWS), "quick": True, "seed": seed},
+        "causes": {"seed": seed},
         "fidelity": {"workers": workers, "quick": True},
         "freezes": drawn,
         "gains": {"quick": True},

@@ -25,6 +25,7 @@ BENCHES = {
     "feedback": "feedback",
     "models": "models",
     "moved": "moved",
+    "causes": "causes",
     "fidelity": "fidelity",
     "freezes": "freezes",
     "gains": "gains",

@@ -12,6 +12,7 @@ from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_probl
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 if TYPE_CHECKING:
+    from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -28,13 +29,15 @@ def check(
     with plain_errors("interrupted", verbose=verbose):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.doubts import doubts, hopeless
+        from impactopt.problem.doubts import hopeless, too_weak
+        from impactopt.problem.plausibility import doubts
 
         try:
             problem = read_problem_file(file, parse_settings(settings or ())).build()
             found = Mistakes()
             found.found += hopeless(problem)
             found.raise_if_any(str(file))
+            doubtful = [text for text in (too_weak(problem), *doubts(problem.robot)) if text]
         except InputError as error:
             if not as_json:
                 raise
@@ -44,7 +47,7 @@ def check(
             raise typer.Exit(BAD_INPUT) from None
         if as_json:
             told = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
-            typer.echo(json.dumps(told | {"doubts": doubts(problem.robot)}, indent=2))
+            typer.echo(json.dumps(told | {"doubts": doubtful}, indent=2))
             return
         typer.echo(printable(f"{file} is sound:"))
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
@@ -53,8 +56,22 @@ def check(
                 typer.echo(printable(f"  {name:<10} {text}"))
         if lost := _lost_meshes(problem.robot):
             typer.echo(printable(f"  {'meshes':<10} {lost}"))
-        for doubt in doubts(problem.robot):
+        if strength := _strength(problem):
+            typer.echo(printable(f"  {'strength':<10} {strength}"))
+        for doubt in doubtful:
             typer.echo(printable(f"  {'doubt':<10} {doubt}"))
+
+
+def _strength(problem: ImpactProblem) -> str:
+    """What share of the hardest blow nearby this one is, by estimates; "" where that is not known."""
+    from impactopt.problem.strength import best_share
+
+    found = best_share(problem)
+    if found is None:
+        return ""
+    share, best = found
+    where = f"point_m = {best.point.round(2).tolist()}, normal = {best.normal.tolist()}"
+    return f"{100 * share:.0f} % of the hardest blow nearby, by a rough estimate; that one: {where}"
 
 
 def _lost_meshes(robot: Robot) -> str:

@@ -16,6 +16,7 @@ from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
+from impactopt.kinematics.stance import Free
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.motion_style import STYLES
 from impactopt.problem.terms import Grip, Term
@@ -99,6 +100,11 @@ def check_stance(problem: Any) -> None:
     ground that is not level.
     """
     robot, stance = problem.robot, problem.stance
+    if isinstance(stance, Free):
+        raise InputError(
+            f"a plan stands {robot.name!r} on soles or on a fixed base, and Free() lets it float: models of "
+            "a collision have that (SDC, FullDynamics, effective_mass; impactopt collide)"
+        )
     pull = np.array(robot.model.gravity.linear)
     if stance.sole_frames(robot) and not (pull[2] < 0 and not pull[:2].any()):
         raise InputError(

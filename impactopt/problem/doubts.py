@@ -12,13 +12,13 @@ from scipy.optimize import linprog
 from impactopt.kinematics.balanced import Reach, reach
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.kinematics.support import support_polygon
+from impactopt.problem.plausibility import giant_soles
 from impactopt.problem.terms import TorqueLimit
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
-    from impactopt.robots.robot import Robot
 
-__all__ = ["doubts", "hopeless", "too_weak"]
+__all__ = ["hopeless", "too_weak"]
 
 Array = NDArray[np.float64]
 LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
@@ -29,22 +29,11 @@ DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, first what to mend first: a start beyond the target, a point out of balance."""
-    found = [_beyond(problem), _out_of_balance(problem)]
+    """What no solve can mend, first what to mend first: soles of a giant, a start beyond the target, a
+    point out of balance.
+    """
+    found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
-
-
-def doubts(robot: Robot) -> list[str]:
-    """What a robot's numbers lack that a blow depends on."""
-    driven = zip(robot.joint_names, robot.armature, robot.passive, strict=True)
-    without = [joint for joint, a, passive in driven if a == 0 and not passive]
-    if not without:
-        return []
-    which = "no joint has" if len(without) == robot.n - np.sum(robot.passive) else f"{', '.join(without)}: no"
-    return [
-        f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too light "
-        "and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, by joint"
-    ]
 
 
 def _beyond(problem: ImpactProblem) -> str:

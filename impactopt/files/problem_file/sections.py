@@ -39,7 +39,7 @@ from impactopt.files.problem_file.values import (
     UnitVector,
     Vector,
 )
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
+from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.second import SecondStriker
@@ -86,7 +86,11 @@ class SecondSection(Section):
 class StanceSection(Section):
     """The soles that are held, and the hands that hold on."""
 
-    soles: str = Field(default="both", description='"both", or the name of the sole that is held')
+    soles: str = Field(
+        default="both",
+        description='"both", or the name of the sole that is held; "none": the robot floats freely, in '
+        "`impactopt collide` and sweeps of collisions",
+    )
     hands: HandNames = Field(
         default=[],
         description="strikers that hold on, each to where it is in the start posture; see [terms.grip]",
@@ -215,6 +219,12 @@ class File(Section):
         soles = self.stance.soles if self.stance else "both"
         hands = tuple(self.stance.hands) if self.stance else ()
         stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
+        if soles == "none":
+            if hands:
+                raise InputError(
+                    "[stance]: a robot that floats freely holds on with no hand: leave hands out"
+                )
+            stance = Free()
         if not robot.floating:
             if self.stance:
                 raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")

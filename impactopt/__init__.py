@@ -26,6 +26,7 @@ _EXPORTS = {
     "JointFriction": "collision",
     "MujocoDynamics": "simulation.reference",
     "NoCompilerWarning": "errors",
+    "NotSolvedWarning": "errors",
     "Obstacle": "bodies.shapes",
     "OneSole": "kinematics.stance",
     "Phase": "problem.problem",

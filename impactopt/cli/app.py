@@ -137,7 +137,8 @@ def solve(
     Ctrl-C, or SIGTERM, stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if
     there is a good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
+    said = "interrupted before there was a plan to keep"
+    with plain_errors(said, verbose=verbose, keeps=True) as console:
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.solved import SolvedFolder

@@ -7,83 +7,42 @@ a motion is known that meets the whole program.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.contact.fields import abouts, snake_case
+from impactopt.contact.fields import snake_case
 from impactopt.contact.laws import ContactLaw
 from impactopt.errors import InputError
+from impactopt.planning.bounds import MET, USUAL, Bound, Cause, bounds_of, changed_or_none
 from impactopt.planning.changes import changed
 from impactopt.planning.multistart import Budget
 from impactopt.planning.on_demand import program_for, with_rows
 from impactopt.problem.phase import LONGEST, SHORTEST, Phase
-from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import (
-    DEFAULT_TERMS,
-    ON_DEMAND_TERMS,
-    Balance,
-    ContactWrenchCone,
-    GearLoad,
-    KeepOut,
-    PositionLimit,
-    SelfCollision,
-    Term,
-    TorqueLimit,
-    VelocityLimit,
-)
-from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation, row_violations
-from impactopt.solvers.relaxed import Relaxation, RelaxedProgram
+from impactopt.solvers.program import NonlinearProgram, SolverResult, max_violation
+from impactopt.solvers.relaxed import RelaxedProgram
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.transcription.rows import Row
 from impactopt.transcription.start import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription
 
 __all__ = ["Cause", "Search", "search"]
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Chosen = Callable[[Row], bool]
-_LOOSE, _USUAL = 4.0, 1.0  # times longer, or shorter, that durations may become, or a usual one [s]
+_LOOSE = 4.0  # times longer, or shorter, that durations may become, or usual
 _CONTACT = 0.2  # [s] that a phase of contact may become
-_ITERATIONS, _SINGLE = 150, 100  # at most, of all bounds together and of one
-_LEAST = 600  # of the whole search, at least
+# at most, of all bounds together, of one, and of a plain start where it has moved: most take a third of it
+_ITERATIONS, _SINGLE, _PLAIN = 100, 60, 200
+_LEAST = 400  # of the whole search, at least
 _TRIED = 5  # bounds that are tried alone
 _FACTORS = tuple(10.0 ** (sign * k / 2) for k in (1, 2, 3, 4) for sign in (1, -1))  # of stiffness
-_STIFF = 60  # iterations of each: where there is a solution, most are there in half of them
+_STIFF = 50  # iterations of each: where there is a solution, most are there in half of them
 _BARRIER, _PUSH = 1e-2, 1e-3  # of a program that is nearly met
 _ROUGH = 1e-4  # its tolerance: three digits are told
-_MET = 1e-5  # violation of rows that counts as none here
+_TRIES = 4  # of a value
 _NONE = 1e-4  # what a relaxation comes to that is none
-_ROOM = 0.02  # by how much more a value is told than what it takes: there the feasible set is one point
-_FAR = 0.1  # [m] between bodies that count as much as a bound's own size
-_PROBES = 6  # of a term's number, at most
-_OF_TERM: dict[str, type[Term]] = {
-    "capture point": Balance,
-    "vertical speed": Balance,
-    "angular momentum": Balance,
-    "normal force": ContactWrenchCone,
-}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Cause:
-    """A bound that stands alone between a problem and a plan.
-
-    first : its kind in a word: "time", "speed".  text : with the value that would do.
-    problem : with that value; None where no value does that the bound may take.
-    """
-
-    first: str
-    text: str
-    problem: ImpactProblem | None
-
-    def __str__(self) -> str:
-        return f"{self.first}: {self.text}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,27 +55,6 @@ class Search:
 
     causes: tuple[Cause, ...] = ()
     met: tuple[Transcription, Array] | None = None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Bound:
-    """Bounds of a program that come from one number of its problem.
-
-    chosen : which rows; variables : and whose bounds.  unit : as of a `Relaxation`.
-    told : for variables (n,) that meet all else, the causes that they show.
-    """
-
-    name: str
-    chosen: Chosen | None
-    variables: Index
-    unit: float
-    told: Callable[[Array], Iterable[Cause]]
-    is_time: bool = False
-
-    def relaxation(self, t: Transcription) -> Relaxation:
-        """Of a program with the same variables."""
-        rows = _NO if self.chosen is None else _rows(t, self.chosen)
-        return Relaxation(rows, self.variables, self.unit)
 
 
 def search(t: Transcription, result: SolverResult, budget: Budget) -> Search:
@@ -142,7 +80,7 @@ class _Relaxing:
         p = with_rows(t.problem, [snake_case(type(term).__name__) for term in t.problem.on_demand])
         self.t = program_for(t, p, None)
         nothing = np.zeros(t.program.m), np.zeros(t.layout.n)
-        own = carried_over(self.t, t, result.x, *nothing)[0], first_iterate(self.t)
+        own = carried_over(self.t, t, result.x, *nothing)[0]
         shortest, longest = p.contact_duration
         loose = changed(
             p,
@@ -151,8 +89,12 @@ class _Relaxing:
             contact_duration=(shortest, max(_CONTACT, longest)),
         )
         self.loose = program_for(self.t, loose, None)
-        self.starts = *own, first_iterate(self.loose)
-        self.bounds = [each for of in (_durations, _of_bodies, _of_terms) for each in of(self.t)]
+        once = (USUAL, USUAL)
+        usual = changed(
+            loose, swing=replace(loose.swing, duration=once), follow=replace(loose.follow, duration=once)
+        )
+        self.starts = own, first_iterate(program_for(self.t, usual, None))
+        self.bounds = bounds_of(self.t)
 
     def found(self) -> Search:
         common = self._common()
@@ -168,7 +110,7 @@ class _Relaxing:
         for bound in tried[:_TRIED]:
             alone = self._solved([bound], x, _SINGLE)
             if alone is not None:
-                causes += bound.told(alone[0])
+                causes += filter(None, map(self._confirmed, bound.told(alone[0])))
         if not any(cause.problem for cause in causes):
             causes += self._stiffness()
         causes.sort(key=lambda cause: cause.problem is None)
@@ -182,15 +124,31 @@ class _Relaxing:
                 return found
         return None
 
+    def _confirmed(self, cause: Cause) -> Cause | None:
+        """A cause whose value makes the problem solvable from a plain start; of a time where the least one
+        does not, one nearer to usual ones. None if it does not; one that may not be is as it is.
+        """
+        for again in range(_TRIES):
+            if cause.problem is None or (again and cause.nearer is None):
+                break
+            one = cause if not again or cause.nearer is None else cause.nearer(again / _TRIES)
+            if one.problem is None:
+                break
+            t = program_for(self.t, one.problem, None)
+            self._iterations += _PLAIN
+            if self._run(t.program, first_iterate(t), _PLAIN) is not None:
+                return replace(one, nearer=None)
+        return replace(cause, nearer=None) if cause.problem is None else None
+
     def _stiffness(self) -> Iterator[Cause]:
         """A contact as stiff as it would have to be: what no bound says, and is found by trying."""
         p = self.t.problem
         known = p.law.parameters.get("stiffness")
-        self._iterations += _STIFF * len(_FACTORS)
+        self._iterations = _STIFF * len(_FACTORS)
         for factor in () if known is None else _FACTORS:
             value = float(f"{known * factor:.2g}")
             law: ContactLaw = replace(p.law, stiffness=value)  # type: ignore[type-var]
-            new = _or_none(p, law=law)
+            new = changed_or_none(p, law=law)
             if new is None:
                 continue
             if self._budget.left == 0:
@@ -221,9 +179,9 @@ class _Relaxing:
 
     def _meets(self, x: Array) -> bool:
         program = self.t.program
-        return max_violation(program, x, program.constraints(x)) <= _MET
+        return max_violation(program, x, program.constraints(x)) <= MET
 
-    def _solved(self, bounds: Sequence[_Bound], start: Array, most: int) -> tuple[Array, Array] | None:
+    def _solved(self, bounds: Sequence[Bound], start: Array, most: int) -> tuple[Array, Array] | None:
         """Variables (n,) and how far each of the bounds has moved, at least; None if nothing is found."""
         program, own = self.loose.program, self.t.program
         wide = program.x_lower.copy(), program.x_upper.copy()
@@ -232,7 +190,7 @@ class _Relaxing:
             relaxed = RelaxedProgram(program, [bound.relaxation(self.loose) for bound in bounds], start)
         finally:
             program.x_lower, program.x_upper = wide
-        durations = np.concatenate([bound.variables for bound in self.bounds if bound.is_time])
+        durations = np.array([j for bound in bounds if bound.is_time for j in bound.variables], dtype=np.intp)
         relaxed.x_lower[durations] = np.maximum(relaxed.x_lower[durations], wide[0][durations])
         relaxed.x_upper[durations] = np.minimum(relaxed.x_upper[durations], wide[1][durations])
         result = self._run(relaxed, relaxed.start(start, _BARRIER), most, barrier=_BARRIER, push=_PUSH)
@@ -243,226 +201,5 @@ class _Relaxing:
 
 def _loosened(phase: Phase) -> Phase:
     shortest, longest = phase.duration
-    shortest, longest = min(shortest / _LOOSE, _USUAL), max(longest * _LOOSE, _USUAL)
+    shortest, longest = min(shortest / _LOOSE, USUAL), max(longest * _LOOSE, USUAL)
     return replace(phase, duration=(max(shortest, SHORTEST), min(longest, LONGEST)))
-
-
-_NO = np.zeros(0, dtype=np.intp)
-
-
-def _durations(t: Transcription) -> Iterator[_Bound]:
-    """Of swing, follow-through and the phases of contact."""
-    p = t.problem
-    found: dict[str, list[int]] = {}
-    for name, group in t.layout.groups.items():
-        if name.endswith(" duration"):
-            kind = {"swing": "swing", "follow": "follow", "abort": "follow"}.get(name.split()[0], "contact")
-            found.setdefault(kind, []).append(group.offset)
-    scale = {kind: 0.01 if kind == "contact" else 0.1 for kind in found}
-    for kind, numbers in found.items():
-        field = "contact_duration" if kind == "contact" else kind
-        at = np.array(numbers, dtype=np.intp)
-
-        def told(x: Array, at: Index = at, kind: str = kind, field: str = field) -> Iterator[Cause]:
-            own = getattr(p, field)
-            low, high = own if kind == "contact" else own.duration
-            times = x[at] * scale[kind]
-            longer = times.max() > high
-            bound, value = (high, times.max()) if longer else (low, times.min())
-            if not longer and value >= bound:
-                return
-            value = _outward(value, bound)
-            both = (value, value) if low == high else (low, value) if longer else (value, high)
-            new = both if kind == "contact" else replace(own, duration=both)
-            name = {"swing": "swing", "follow": "follow-through", "contact": "each phase of contact"}[kind]
-            words = f"{name}: {_seconds(value)} for {_seconds(bound)}"
-            key = {"contact": "[collision] duration_s"}.get(kind, f"[{kind}] duration_s")
-            yield Cause(first="time", text=f"{words} ({key})", problem=_or_none(p, **{field: new}))
-
-        yield _Bound(
-            name=kind,
-            chosen=None,
-            variables=at,
-            unit=float(t.program.x_upper[at].max()),
-            told=told,
-            is_time=True,
-        )
-
-
-def _of_bodies(t: Transcription) -> Iterator[_Bound]:
-    """Pairs of bodies."""
-    kinds = KeepOut.name, SelfCollision.name
-    for term, pair in dict.fromkeys((r.term, r.component) for r in t.program.origins if r.term in kinds):
-
-        def chosen(row: Row, term: str = term, pair: str = pair) -> bool:
-            return row.term == term and row.component == pair
-
-        def told(x: Array, chosen: Chosen = chosen, term: str = term, pair: str = pair) -> Iterator[Cause]:
-            off = 1e3 * _off(t, x, chosen)
-            kind = KeepOut if term == KeepOut.name else SelfCollision
-            free = kind(enabled=False)
-            first = "the floor" if "ground" in pair.split(" and ")[1:] else term
-            words = f"{pair}: {off:.2g} mm nearer than they may be"
-            yield Cause(first=first, text=words, problem=_or_none(t.problem, terms=_with(t.problem, free)))
-
-        yield _Bound(name=f"{term}, {pair}", chosen=chosen, variables=_NO, unit=_FAR, told=told)
-
-
-def _of_terms(t: Transcription) -> Iterator[_Bound]:
-    """Numbers of terms."""
-    p = t.problem
-    terms = [p.term(type(term)) for term in (*DEFAULT_TERMS, *ON_DEMAND_TERMS)]
-    terms += [term for term in p.active_terms if not any(type(term) is type(other) for other in terms)]
-    swing = float(t.swing.T.read(t.program.x_upper)[0, 0])
-    for term in terms:
-        if isinstance(term, (KeepOut, SelfCollision, PositionLimit)):
-            continue
-
-        def chosen(row: Row, term: Term = term) -> bool:
-            return _OF_TERM.get(row.term) is type(term) or row.term.startswith(term.name)
-
-        if isinstance(term, GearLoad):
-            yield from _of_gears(t, term)
-            continue
-        variables = _torques(t) if isinstance(term, TorqueLimit) else _NO
-        if not _rows(t, chosen).size and not variables.size:
-            continue
-        unit = swing if isinstance(term, VelocityLimit) else 1.0
-
-        def told(x: Array, term: Term = term, chosen: Chosen = chosen) -> Iterator[Cause]:
-            yield from _fields(t, x, term, chosen)
-
-        yield _Bound(name=term.name, chosen=chosen, variables=variables, unit=unit, told=told)
-
-
-def _of_gears(t: Transcription, term: GearLoad) -> Iterator[_Bound]:
-    most, names = np.asarray(term.most(t.robot), dtype=float), t.robot.joint_names
-    for k, joint in enumerate(names):
-
-        def chosen(row: Row, joint: str = joint) -> bool:
-            return row.term == term.name and row.component == joint
-
-        if not _rows(t, chosen).size:
-            continue
-
-        def told(x: Array, k: int = k, joint: str = joint, chosen: Chosen = chosen) -> Iterator[Cause]:
-            off = _off(t, x, chosen)
-            value = _outward(float(most[k]) + off, float(most[k]))
-            limits = {n: float(m) for n, m in zip(names, most, strict=True) if np.isfinite(m)}
-            bounded = replace(term, limit=limits | {joint: value})
-            words = f"gear of {joint}: {value:.3g} for {most[k]:.3g} of its torque limit"
-            at = _or_none(t.problem, terms=_with(t.problem, bounded))
-            yield Cause(first="gears", text=f"{words} ([terms.gear_load] limit)", problem=at)
-
-        yield _Bound(name=f"gear of {joint}", chosen=chosen, variables=_NO, unit=float(most[k]), told=told)
-
-
-def _fields(t: Transcription, x: Array, term: Term, chosen: Chosen) -> Iterator[Cause]:
-    """The numbers of a term any one of which would do, with their values."""
-    first = {TorqueLimit: "torque", VelocityLimit: "speed"}.get(type(term), term.name)
-    section = snake_case(type(term).__name__)
-    allowed = {field.name: about for field, about in abouts(type(term))}
-    rows = _rows(t, chosen).tolist()
-    off = row_violations(t.program, t.program.constraints(x))
-    worst = max(rows, key=lambda i: off[i], default=None)
-    where = ""
-    if worst is not None and off[worst] > _MET:
-        row, _ = t.program.describe_violation(worst, x, float(off[worst]))
-        where = f"; {row.partition(', ')[2]}"
-    for field in fields(term):
-        old = getattr(term, field.name)
-        if isinstance(old, bool) or not isinstance(old, float) or not np.isfinite(old):
-            continue
-
-        def off_at(value: float, name: str = field.name) -> float:
-            p = changed(t.problem, terms=_with(t.problem, replace(term, **{name: value})))
-            return _off(program_for(t.with_apart({}), p, None), x, chosen, torques=type(term) is TorqueLimit)
-
-        needed = _where_met(off_at, old)
-        if needed is None:
-            continue
-        value = _outward(needed, old)
-        unit = allowed[field.name].unit if field.name in allowed else ""
-        words = f"{term.name}: {value:.3g} for {old:.3g}{' ' + unit if unit else ''}"
-        new = None
-        with contextlib.suppress(InputError):
-            new = changed(t.problem, terms=_with(t.problem, replace(term, **{field.name: value})))
-        yield Cause(first=first, text=f"{words} ([terms.{section}] {field.name}{where})", problem=new)
-
-
-def _where_met(off: Callable[[float], float], old: float) -> float | None:
-    """The value of a number, next to the old one, at which nothing is off; None if it changes nothing, or may
-    not have such values.
-    """
-    step = 0.05 * max(abs(old), 0.01)
-    try:
-        before = off(old)
-        value = old + step
-        after = None
-        with contextlib.suppress(InputError):
-            after = off(value)
-        if after is None or after > before - 1e-9:
-            value = old - step
-            after = off(value)
-        if before <= _MET or after > before - 1e-9:
-            return None
-        points = [(old, before), (value, after)]
-        for _ in range(_PROBES):
-            (a, fa), (b, fb) = points[-2:]
-            if fb <= _MET:
-                return b
-            if fb >= fa:
-                return None
-            new = b + 1.001 * fb * (b - a) / (fa - fb)
-            points.append((new, off(new)))
-    except InputError:
-        return None
-    return None
-
-
-def _off(t: Transcription, x: Array, chosen: Chosen, *, torques: bool = False) -> float:
-    rows = _rows(t, chosen)
-    off = row_violations(t.program, t.program.constraints(x))[rows].max(initial=0.0)
-    if torques:
-        j = _torques(t)
-        beyond = np.maximum(t.program.x_lower[j] - x[j], x[j] - t.program.x_upper[j])
-        off = max(off, beyond.max(initial=0.0))
-    return float(off)
-
-
-def _rows(t: Transcription, chosen: Chosen) -> Index:
-    """Numbers of the rows that are chosen, of those that are bounds."""
-    found = np.array([i for i, row in enumerate(t.program.origins) if chosen(row)], dtype=np.intp)
-    return found[t.program.g_lower[found] < t.program.g_upper[found]]
-
-
-def _torques(t: Transcription) -> Index:
-    """Variables that are torques with the limit as their bounds."""
-    found = [
-        np.arange(group.offset, group.offset + group.count * group.size)
-        for name, group in t.layout.groups.items()
-        if name.startswith(("torque, ", "torque in collision, ")) or name == "feed-forward at contact"
-    ]
-    return np.concatenate([_NO, *found])
-
-
-def _with(problem: ImpactProblem, term: Term) -> tuple[Term, ...]:
-    return (*(other for other in problem.terms if type(other) is not type(term)), term)
-
-
-def _or_none(problem: ImpactProblem, **new: object) -> ImpactProblem | None:
-    with contextlib.suppress(InputError):
-        return changed(problem, **new)
-    return None
-
-
-def _outward(value: float, bound: float) -> float:
-    """With some room, in three digits, away from the bound."""
-    up = value > bound
-    value += _ROOM * (value - bound) + (1 if up else -1) * 1e-3 * abs(value)
-    size = 10.0 ** (np.floor(np.log10(max(abs(value), 1e-12))) - 2)
-    return float(f"{(np.ceil if up else np.floor)(value / size) * size:.3g}")
-
-
-def _seconds(value: float) -> str:
-    return f"{value:.3g} s"

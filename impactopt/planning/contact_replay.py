@@ -30,7 +30,7 @@ __all__ = ["AGREED", "ContactReplay", "ModelError", "PlannedContact", "checked"]
 Array = NDArray[np.float64]
 AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is not solved; is none
 _STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
-_LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that goes on, or comes back, is seen
+_LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
 _SAMPLED = 1e-3  # [s] of a coasting reference
 _WORTH = 1e-3  # of the planned contact's duration: a gap that is told
 
@@ -134,7 +134,8 @@ class PlannedContact:
                 self.reference,
                 scene_of(problem),
                 step=min(_STEP, duration / _STEPS),
-                until=_LONGER * duration,
+                # a strike has no motion that takes the striker away
+                until=duration * (_LONGER if isinstance(planned, Plan) else 1.0),
                 longest=_LONGEST * duration,
             )
         except InputError:  # legs that do not reach

@@ -178,7 +178,7 @@ def _planned(
         statement=statement_of(t),
         window=window_caution(t, result) if result.status.usable else "",
         causes=tuple(cause for cause in causes if cause.problem is not None),
-        **planned_by(t, result, refining.contact(t, result.x) if result.status.usable else None),
+        **planned_by(t, result, refining.known_contact(t, result.x)),
         **fields,
     )
     return with_soles_kept(solution) if refine else solution

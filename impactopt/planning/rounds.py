@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.errors import InputError
-from impactopt.planning.contact_replay import REFUTED, ContactReplay, PlannedContact, checked
+from impactopt.planning.contact_replay import AGREED, REFUTED, ContactReplay, PlannedContact, checked
 from impactopt.planning.keeping_apart import Margins, rows_near
 from impactopt.planning.models import planned_contact
 from impactopt.planning.multistart import Budget, carried, one_after_the_other, touching, with_effort_of
@@ -35,7 +35,7 @@ from impactopt.transcription.transcription import Transcription, block_functions
 Array = NDArray[np.float64]
 _LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
 _BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
-_BARRIER_DEEP = 1e-3  # and breaks by far
+_BARRIER_DEEP = 1e-3  # and breaks by far, or a finer contact does
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 _NODE_ROUNDS, _DEEP_ROUNDS = 3, 7  # at most: with a finer mesh, from the start again
 _ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
@@ -118,8 +118,16 @@ class Refining:
         """
         if t.problem.gains:
             return None
+        known = self.known_contact(t, x)
+        if known is None:
+            known = planned_contact(t, x, t.decode(x))
+            self._contact = t, x, known
+        return known
+
+    def known_contact(self, t: Transcription, x: Array) -> PlannedContact | None:
+        """The same if it was the last one that was asked for."""
         if self._contact is None or self._contact[0] is not t or self._contact[1] is not x:
-            self._contact = t, x, planned_contact(t, x, t.decode(x))
+            return None
         return self._contact[2]
 
     def replay(self, t: Transcription, x: Array) -> ContactReplay | None:
@@ -307,11 +315,13 @@ class Refining:
         starts = (first_iterate(finer) if missed else carried(finer, t, old),)
         if violated is not None and finer.layout.n == len(old.x):
             starts = (*starts, old.x, x0)
+        # a contact that is far off breaks the finer program's rows by far
+        far = elements is not None and error is not None and abs(error.pct) > AGREED
         name = more_of(nodes.total - t.nodes.total, elements, len(rows) - len(t.apart_rows))
         return Round(
             program=finer,
             starts=starts,
-            barrier=None if violated is None else _BARRIER,
+            barrier=_BARRIER_DEEP if far else None if violated is None else _BARRIER,
             name=name,
             why=f"the plan is not what it says between nodes: {name}, and on from there",
         )

@@ -80,7 +80,9 @@ def with_reason(
         first, *others = would_do
         why = f"Infeasible: {first.first}. {first.text} would do, with all else as it is"
         why += "".join(f"; or {other.text}" for other in others) + "."
-        why += f" Besides, {weak}." if weak else ""
+        # what point masses say is of the contact alone, and not always of what keeps a plan from being
+        masses = (_too_stiff(t) or _too_long(t)) if "contact" in first.first else ""
+        why += "".join(f" Besides, {text}." for text in (weak, masses) if text)
     else:
         beyond = [f"{cause.first}: {cause.text}, which may not be" for cause in causes]
         found = weak or _too_stiff(t) or _too_long(t) or "".join(beyond[:1])

@@ -35,18 +35,19 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def plain_errors(interrupted: str, *, verbose: bool = False) -> Iterator[Console]:
+def plain_errors(interrupted: str, *, verbose: bool = False, keeps: bool = False) -> Iterator[Console]:
     """A console on stderr, for a command's body.
 
-    interrupted : what Ctrl-C prints, where the body does not catch it; SIGTERM, as of a time limit or a
-        scheduler, is the same.  verbose : bad input has a traceback.
+    interrupted : what Ctrl-C prints, where the body does not catch it.  verbose : bad input has a traceback.
+    keeps : the body keeps what it has on Ctrl-C, and is to do so on SIGTERM, as of a scheduler, too.
     """
     from rich.console import Console
 
     from impactopt.errors import InputError, printable
 
     console = Console(stderr=True)
-    with warnings.catch_warnings(), _terminated_as_interrupted():
+    on_sigterm = _terminated_as_interrupted() if keeps else contextlib.nullcontext()
+    with warnings.catch_warnings(), on_sigterm:
         warnings.showwarning = lambda message, *_a, **_k: console.print(
             printable(f"warning: {message}"), markup=False
         )

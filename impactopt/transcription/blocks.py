@@ -69,6 +69,7 @@ def sizes(
             "speed": 1,
             "event": int(bool(target.guards)),
             "invariant": int(bool(target.guards)),
+            "reserve": int(bool(target.guards)),
             **(dict.fromkeys(SECOND, 1) if second else {}),
         },
         "impact": {"base": base, "joints": n, "blow": 1},

@@ -27,9 +27,10 @@ TARGET_SHAPES = ("box", "ball", "none")
 class TargetBody(Described):
     """The target's shape; the hit point is the middle of its face.
 
-    All of the robot but the striking point keeps off it. By default it is a box of 18 cm for a free mass, a
-    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, or a nail of 7 cm in a block of 20 x 20 x
-    6 cm. `size` is that of the box, the board or the nail's block.
+    All of the robot but the striking point keeps off it. Without a size it is assumed, and results say so: a
+    box of 18 cm for a free mass, a wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, or a nail
+    of 7 cm in a block of 20 x 20 x 6 cm. `size` is that of the box, the board or the nail's block. With the
+    shape "none" there is nothing to keep off.
     """
 
     shape: str | None = field(

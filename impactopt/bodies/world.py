@@ -26,6 +26,12 @@ FLOOR, THICK = 10.0, 0.5  # [m] half sides of the ground
 BOX, WALL, BOARD, BLOCK = (0.18, 0.18, 0.18), (1.5, 1.5, 0.1), (0.30, 0.24, 0.02), (0.2, 0.2, 0.06)
 SUPPORT = (0.04, 0.24, 0.12)  # under either end of a board
 NAIL_LENGTH, NAIL_RADIUS = 0.07, 0.004
+# by the target's kind: in a word, and its sides; of others a box
+USUAL: dict[type[Target], tuple[str, tuple[float, ...]]] = {
+    RigidWall: ("wall", WALL),
+    Board: ("board on two supports", BOARD),
+    Nail: ("nail in a block", BLOCK),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,6 +87,25 @@ def ground_body(height: float) -> WorldBody:
     )
 
 
+def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
+    """What a target looks like where the problem gives no size: in a word, and its sides [m]."""
+    if body.shape == "ball":
+        return "ball", BOX[:1]
+    for kind, usual in USUAL.items():
+        if isinstance(target, kind):
+            return usual
+    return "box", BOX
+
+
+def told_body(body: TargetBody, target: Target) -> str:
+    """The target's body in words, with its size, and whether that was assumed."""
+    if body.shape == "none":
+        return "none: nothing keeps off it"
+    word, size = _usual(body, target)
+    sides = " x ".join(f"{100 * side:.3g}" for side in body.size or size)
+    return f"{'assumed: ' if body.size is None else ''}{word}, {sides} cm"
+
+
 def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array) -> list[WorldBody]:
     """What is hit: its face's middle is at the point, and it reaches from there along the normal."""
     rows = face_axes(normal)  # normal, across, up
@@ -98,20 +123,19 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     if body.shape == "none":
         return []
     moves = not isinstance(target, RigidWall)
-    size = body.size
+    size = body.size or _usual(body, target)[1]
     if body.shape == "ball":
-        radius = (size or BOX)[0] / 2
+        radius = size[0] / 2
         return [solid("target", np.zeros(3), radius, radius=radius, moves=moves, strikable=True)]
     if isinstance(target, Nail):
         out = max(NAIL_LENGTH - target.depth, 0.0)
-        block = box("target's block", size or BLOCK, out, strikable=True)
+        block = box("target's block", size, out, strikable=True)
         if out < 2 * NAIL_RADIUS:
             return [block]
         half = np.array([0.0, 0.0, out / 2 - NAIL_RADIUS])
         shank = solid("target", half, out / 2, radius=NAIL_RADIUS, moves=True, strikable=True)
         return [shank, block]
     if isinstance(target, Board):
-        size = size or BOARD
         across = (size[0] - SUPPORT[0]) / 2
         post = (SUPPORT[0], size[1], SUPPORT[2])
         supports = [
@@ -119,8 +143,6 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
         ]  # what held the board stays when it is broken
         main = box("target", size, moves=True, strikable=True, before=True)
         return [main, *supports, _core(box, size)]
-    usual = WALL if isinstance(target, RigidWall) else BOX
-    size = size or usual
     return [box("target", size, moves=moves, strikable=True), _core(box, size)]
 
 

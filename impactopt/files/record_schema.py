@@ -122,7 +122,9 @@ _START = {
     **dict.fromkeys(("objective?", "max_violation?"), _NUMBER),
 }
 _PROBLEM = {
-    **dict.fromkeys(("name?", "robot?", "striker?", "target?", "law?", "hash?", "collision?"), _TEXT),
+    **dict.fromkeys(
+        ("name?", "robot?", "striker?", "target?", "target_body?", "law?", "hash?", "collision?"), _TEXT
+    ),
     **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),
     **dict.fromkeys(("scenarios?", "objectives?", "off?", "gains?"), ([_TEXT],)),
 }

@@ -196,8 +196,8 @@ class Solution(Solved):
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
 
         engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
-        ``validate``).  options : of the engine, such as ``step`` [s], or ``missing=True``: there is no
-            target.
+        ``validate``).  options : of the engine, such as ``step`` [s], or of "pinocchio"
+            ``missing=True``: there is no target.
 
         Raises
         ------
@@ -345,8 +345,7 @@ class Solution(Solved):
 
     def sole_margins(self) -> dict[str, Any]:
         """Margins of each sole by itself, as of `Plan.sole_margins`."""
-        missed = self.missed_trajectory if self.plan.abort is not None else None
-        return self.plan.sole_margins(self.trajectory, self.collision, missed)
+        return self.plan.sole_margins(self.trajectory, self.collision, self._missed)
 
     @cached_property
     def loads(self) -> DriveLoads:

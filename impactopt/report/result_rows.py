@@ -116,10 +116,10 @@ def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
         for phase in dict.fromkeys(name for found in own for name in found):
             wanted, half = "", -np.inf
             if phase in asked:
-                wanted, half = f" ({asked[phase]:g} asked)", 1e3 * least_kept(1e-3 * asked[phase])
-            label, values = f"CoP margin, {sole} sole, {phase}{wanted} [mm]", [f.get(phase) for f in own]
-            yield number_row(label, values, 1, least=np.where(free, 0.0, half) - EDGE)
-        label = f"least force, {sole} sole{f' ({force:g} asked)' if force else ''} [N]"
+                wanted, half = f" (of {asked[phase]:g})", 1e3 * least_kept(1e-3 * asked[phase])
+            label = f"{sole} CoP margin [mm], {phase}{wanted}"
+            yield number_row(label, [f.get(phase) for f in own], 1, least=np.where(free, 0.0, half) - EDGE)
+        label = f"{sole} least force [N]{f' (of {force:g})' if force else ''}"
         values = [min(source.get(sole, {}).values(), default=None) for source in forces]
         yield number_row(label, values, 0, least=np.where(free, 0.0, SHARE * force) - EDGE)
 

@@ -180,7 +180,8 @@ def _held_at(c: Compiled, equality: int, joint: int) -> Any:
 
 def _body(c: Compiled, equality: int, i: int) -> int:
     """Of a thing that a loop holds."""
-    is_site = c.mj.eq_objtype[equality] == c.mujoco.mjtObj.mjOBJ_SITE
+    kinds = c.numbers("eq_objtype")  # MuJoCo 3.2 has bodies only
+    is_site = bool(kinds.size) and kinds[equality] == int(c.mujoco.mjtObj.mjOBJ_SITE)
     return int(c.mj.site_bodyid[i]) if is_site else max(i, 0)
 
 

@@ -227,7 +227,7 @@ class Robot:
         limit = build.per_joint("torque_limit", torque_limit, joints, build.effort_limit(model)[base:])
         speed = build.per_joint("velocity_limit", velocity_limit, joints, build.velocity_limit(model)[base:])
         lower, upper = build.position_limit(model, joints, position_limit)
-        damping = build.per_joint("kd", kd, joints, np.minimum(150.0, 1.5 * limit))
+        damping = build.per_joint("kd", kd, joints, 1.5 * np.minimum(100.0, limit))
         for sole in soles:
             if sole.parent is not None:
                 build.add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from os import PathLike
+from pathlib import Path
 from typing import Any
 from xml.dom import expatbuilder
 from xml.parsers.expat import ExpatError
@@ -43,11 +44,16 @@ def read_urdf(
     """
     urdf = existing(path, "URDF")
     joints = (pin.JointModelFreeFlyer(),) if floating else ()
+    root = _parsed(urdf)
+    if any(tag.tagName.startswith("xacro:") for tag in root.getElementsByTagName("*")):
+        raise InputError(
+            f"URDF {urdf} is written in xacro, which makes a URDF of it: run `xacro {Path(urdf).name} > "
+            "robot.urdf`, and give that"
+        )
     try:
         model = pin.buildModelFromUrdf(urdf, *joints)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
-    root = _parsed(urdf)
     _check_links(root, urdf, moments=not repaired)
     if srdf is not None:
         file = existing(srdf, "SRDF")
@@ -111,12 +117,16 @@ def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
 
 
 def _weightless(root: Any) -> Iterator[str]:
+    """Links with mass on which Gazebo's gravity does not act."""
+    heavy = {link.getAttribute("name") for link in _children(root, "link") if _children(link, "inertial")}
+    names = []
     for gazebo in _children(root, "gazebo"):
         off = [_text(tag) in ("false", "0") for tag in _children(gazebo, "gravity")]
         off += [_text(tag) in ("true", "1") for tag in _children(gazebo, "turnGravityOff")]
-        if any(off):
-            name = gazebo.getAttribute("reference")
-            yield f"link {name!r} is without gravity in Gazebo; here it has its weight"
+        if any(off) and gazebo.getAttribute("reference") in heavy:
+            names.append(gazebo.getAttribute("reference"))
+    if names:
+        yield f"links without gravity in Gazebo have their weight here: {_listed(names)}"
 
 
 def _rotors(root: Any) -> Iterator[str]:
@@ -128,7 +138,7 @@ def _rotors(root: Any) -> Iterator[str]:
         for joint in _children(transmission, "joint")
     ]
     if names:
-        yield f"rotors' inertia in <transmission> is left out, of {', '.join(names)}; give `armature`"
+        yield f"rotors' inertia in <transmission> is left out, of {_listed(names)}; give `armature`"
 
 
 def _check_links(root: Any, urdf: str, *, moments: bool) -> None:
@@ -173,6 +183,10 @@ def _urdf_number(text: str) -> float:
         return float(text or 0.0)
     except ValueError:
         return 0.0
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _text(element: Any) -> str:

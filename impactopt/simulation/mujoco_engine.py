@@ -384,6 +384,5 @@ def simulate_mujoco(
         fall=fall,
         touched=replay.besides.touched(),
         missed=world.missing,
-        expected=float(reference.contact_start),
     )
     return simulation if fall else replace(simulation, fall=replay.not_standing(simulation))

@@ -311,5 +311,4 @@ def simulate_pinocchio(
         posture_error=posture_error(robot.model, state.q, np.asarray(world.followed.q[-1])),
         fall=None,
         missed=missing,
-        expected=float(reference.contact_start),
     )

@@ -242,7 +242,7 @@ class Simulation:
                 self.soles,
                 self.cop_margin,
                 self.sole_normal,
-                {"missed": phase == 0} if self.missed else {n: phase == k for k, n in enumerate(PHASES)},
+                {n: phase == k for k, n in enumerate(names)},
             )
             if self.grip_force.size:
                 out["grip_force_N"] = float(self.grip_force.max())

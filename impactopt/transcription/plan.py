@@ -133,6 +133,7 @@ class Plan:
     hand_speed : [m/s] along the normal, at contact.
     impulse : [N s] to the target.
     scenarios : what is predicted of other targets, in the problem's order, without those that are missing.
+    coast_wrench : (6 a sole) where a robot that has hit nothing ceases to coast; None as of `abort`.
     abort, abort_wrench : the abort motion, as `follow` and `follow_wrench`; None if the problem has none.
     """
 
@@ -151,6 +152,7 @@ class Plan:
     scenarios: tuple[PlannedScenario, ...] = ()
     abort: CubicSpline | None = None
     abort_wrench: Array | None = None
+    coast_wrench: Array | None = None
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -187,13 +189,16 @@ class Plan:
 
         time (k,) [s] : since the motion's start.
         phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
-        then rest; ``missed``: the abort motion instead.
+        then rest; ``missed``: coasting as long as it takes to notice, and the abort motion, instead.
         """
         ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
         if phase == 1:
             end, rate, _ = self.swing.sample(self.contact_start)
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
+            if missed and self.coast_wrench is not None:
+                way = (ts - self.contact_start) / (self.segment(2, missed=True)[1] - self.contact_start)
+                wrenches += way[:, None] * (self.coast_wrench - self.swing_wrench[-1])
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
         curve, start, nodes, wrench = self.segment(phase, missed=missed)
         local = np.clip(ts - start, 0.0, curve.duration)

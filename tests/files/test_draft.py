@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import pytest
 from support import urdfs
 from typer.testing import CliRunner
 
+from impactopt import Robot, Tool
 from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
+from impactopt.files.draft.robot import draft_robot
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
 from impactopt.problem.doubts import doubts, hopeless
@@ -217,6 +220,90 @@ def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     assert set(read_toml(draft.text)["robot"]["torque_limit_N_m"]) == {"shoulder"}
     (tmp_path / "arm.toml").write_text(draft.text)
     assert load_problem(tmp_path / "arm.toml").robot.torque_limit[1] == 30.0
+
+
+def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:
+    same = urdfs.arm().replace('joint name="elbow"', 'joint name="elbow_link"')
+    same = same.replace('joint name="slide_0"', 'joint name="claw_0"')
+    problem = _problem(tmp_path, same)
+    other = _problem(tmp_path, urdfs.arm())
+    assert problem.robot.joint_names == ("turn", "shoulder", "elbow_link", "wrist")
+    assert problem.start_posture == pytest.approx(other.start_posture)
+    model = problem.robot.model
+    assert model.frames[model.getFrameId("elbow_link")].type == pin.FrameType.BODY
+    tool = problem.robot.with_tool(Tool.hammer(frame="elbow_link"))  # a name of a file's is the link's
+    assert tool.model.inertias[3].mass > model.inertias[3].mass
+
+
+@pytest.mark.parametrize(
+    "base",
+    ["", '<inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>'],
+    ids=["none", "zero"],
+)
+def test_the_root_of_an_arm_needs_no_mass(tmp_path: Path, base: str) -> None:
+    text = re.sub(r'(<link name="base">)<inertial>.*?</inertial>', rf"\1{base}", urdfs.arm(), count=1)
+    assert text != urdfs.arm()
+    light, heavy = _problem(tmp_path, text), _problem(tmp_path, urdfs.arm())
+    assert not light.robot.floating
+    q = heavy.start_posture
+    assert light.start_posture == pytest.approx(q)
+    one, other = (pin.crba(r.model, r.model.createData(), q) for r in (light.robot, heavy.robot))
+    assert np.allclose(one, other, rtol=0, atol=1e-12)
+
+
+def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
+    text = re.sub(r'(<link name="trunk">)<inertial>.*?</inertial>', r"\1", urdfs.biped(), count=1)
+    with pytest.raises(InputError, match=r"root link has no mass.*stands on legs.*--bolted"):
+        _drafted(tmp_path, text)
+    assert not draft_robot(tmp_path / "robot.urdf", bolted=True).robot.floating
+    with pytest.raises(InputError, match=r"the root link 'trunk' .*mass 0 kg.*floating = false"):
+        Robot.from_urdf(tmp_path / "robot.urdf")
+
+
+def test_a_follower_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
+    text = urdfs.arm().replace('joint name="wrist"', 'joint name="hinge"')
+    follows = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/></joint>'
+    text = re.sub(r'(<joint name="elbow".*?)</joint>', rf"\1{follows}", text)
+    draft = _drafted(tmp_path, text)
+    # a quarter of the shoulder's range, -1.8 to 1.8 rad
+    assert read_toml(draft.text)["robot"]["locked_rad"]["elbow"] == pytest.approx(0.1 + 0.5 * 0.9)
+    assert any("'elbow' follows 'shoulder' by <mimic>; 'elbow' is locked" in line for line in draft.said)
+    with pytest.raises(InputError, match=r"'elbow' follows 'shoulder'.*lock one"):
+        Robot.from_urdf(tmp_path / "robot.urdf", floating=False)
+
+
+def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:
+    lost = (
+        ('"0.08 0.08 0.3"/>', '<mesh filename="cut.stl"/>'),
+        ('"0.08 0.08 0.1"/>', '<mesh filename="gone.stl"/>'),
+    )
+    text = urdfs.arm()
+    for size, mesh in lost:
+        text = text.replace(f"<box size={size}", mesh)
+    (tmp_path / "cut.stl").write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    (tmp_path / "robot.toml").write_text(_drafted(tmp_path, text).text)
+    told = " ".join(CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")]).output.split())
+    assert "2 are lost, and boxes of inertia stand for links without any: cut.stl cannot be read" in told
+    assert "git lfs pull" in told and "gone.stl is not found" in told
+
+
+def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:
+    text = re.sub('lower="-2.4" upper="2.4"', 'lower="2.4" upper="-2.4"', urdfs.arm())
+    with pytest.raises(InputError, match=r"'elbow' .*lower 2.4, upper -2.4.*URDF's <limit>"):
+        _drafted(tmp_path, text)
+
+
+def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    path, xml = tmp_path / "robot.urdf", tmp_path / "robot.xml"
+    kept = '<mujoco><compiler fusestatic="false"/></mujoco></robot>'  # its root is bolted, and a body still
+    path.write_text(urdfs.biped().replace("</robot>", kept))
+    mujoco.mj_saveLastXML(str(xml), mujoco.MjModel.from_xml_path(str(path)))
+    draft = draft_problem(xml, folder=tmp_path, mjcf=True)
+    robot = read_toml(draft.text)["robot"]
+    assert robot["floating"] is True and len(robot["soles"]) == 2
+    assert any("no free joint" in line for line in draft.said)
+    assert not draft_robot(xml, mjcf=True, bolted=True).robot.floating
 
 
 def test_robots_of_example_robot_data_go_by_name() -> None:

@@ -75,6 +75,15 @@ def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
     assert abs(report["impulse_error_pct"]) < 2
 
 
+def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
+    out, _ = run(saved, "--engine", "pinocchio", "--missing", "--json", "--step", "5e-4")
+    report = json.loads(out)
+    assert report["impulse_Ns"] == 0 and report["impulse_error_pct"] is None
+    assert report["torque_ratio_by_phase"].keys() == report["zmp_margin_by_phase_m"].keys()
+    assert report["torque_ratio_by_phase"].keys() == {"swing", "missed"}
+    assert report["torque_ratio"] < 1.05 and report["zmp_margin_m"] > 0
+
+
 def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
     out, _ = run(saved, "--payload", 30, "--missing", "--step", "1e-3", code=1)
     assert "stands at the end" in out and "! no" in out
@@ -95,7 +104,7 @@ def test_every_condition_is_an_option_with_its_default() -> None:
     ("arguments", "parts"),
     [
         (["--friction", "-1"], ["friction is -1"]),
-        (["--engine", "pinocchio", "--missing"], ["pinocchio", "take engine 'mujoco'"]),
+        (["--engine", "pinocchio", "--mass", "2"], ["pinocchio", "take engine 'mujoco'"]),
         (["--step", "0"], ["step [s]: 0"]),
         (["--animation", "punch.mp4", "--step", "1e-3", "--settle", "0"], ["punch.mp4", ".gif"]),
     ],

@@ -252,7 +252,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
     ),
     "`<gravity>`": (
         [_before("</robot>", '<gazebo reference="one"><turnGravityOff>true</turnGravityOff></gazebo>')],
-        "'one' is without gravity",
+        "without gravity .* have their weight here: one",
     ),
     "`<transmission>`": (
         [
@@ -263,6 +263,7 @@ URDF_CASES: dict[str, tuple[list[Edit], str]] = {
         ],
         "rotors' inertia .* of j1",
     ),
+    "xacro's": ([_before("</robot>", '<xacro:leg side="left"/>')], "run `xacro robot.urdf"),
     "`<safety_controller>`": ([_before("</joint>", '<safety_controller k_velocity="1"/>')], ""),
 }
 MJCF_CASES: dict[str, tuple[list[Edit], str]] = {

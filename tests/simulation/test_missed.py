@@ -14,7 +14,7 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation.touch import FollowedReference
 from impactopt.transcription.plan import Trajectory
 
-LATE = 0.03  # [s] after the planned contact that the robot notices
+LATE = 0.06  # [s] after the planned contact that the robot notices
 MOST = 0.05  # [rad/s] that the reference may jump by
 EVERY = 1e-4  # [s] at which it is looked at
 
@@ -35,7 +35,7 @@ def short() -> Solution:
     )
     solution = solve(problem)
     assert solution.result.status.usable
-    assert solution.plan.contact_end - solution.plan.contact_start < LATE / 2
+    assert solution.plan.contact_end - solution.plan.contact_start < LATE / 4
     return solution
 
 
@@ -73,15 +73,15 @@ def test_a_missed_blow_asks_for_no_more_torque_than_planned(short: Solution, eng
     assert sim.impulse == 0.0 and np.isnan(sim.contact_start)
     held = told["simulated"]["torque_ratio"]
     assert held.keys() == {"swing", "missed"}
-    assert held["missed"] == pytest.approx(told["torque_ratio"]["missed"], abs=0.03)
-    assert told["simulated"]["gear_ratio"] < 1.05
-    # a servo whose reference is where the robot is asks for nothing but the feed-forward
-    times = sim.time[sim.time >= short.plan.contact_start]
-    demand = sim.demand[-len(times) :]
-    missed = short.missed_trajectory
-    feed = np.array([np.interp(times, missed.time, u) for u in missed.torque.T])
-    limit = short.problem.robot.torque_limit
-    assert np.abs((demand - feed.T) / limit).max() < 0.1
+    assert held["missed"] == pytest.approx(told["torque_ratio"]["missed"], abs=0.01)
+    assert told["simulated"]["gear_ratio"] < told["gear_ratio"] + 0.01
+    # where the abort motion begins the robot is where its reference is
+    k = int(np.searchsorted(sim.time, short.missed_trajectory.contact_end))
+    late = float(sim.time[k] - short.missed_trajectory.contact_end)
+    begin = np.flatnonzero(short.missed_trajectory.phase == 2)[0]
+    q, v = short.missed_trajectory.q[begin], short.missed_trajectory.v[begin]
+    np.testing.assert_allclose(sim.q[k], q + late * v, atol=1e-3)
+    np.testing.assert_allclose(sim.v[k], v, atol=MOST)
 
 
 def test_it_goes_over_to_the_blow_where_it_feels_one_late(short: Solution) -> None:

@@ -129,7 +129,7 @@ def test_each_sole_between_nodes_by_its_legs_torques(biped_plan: Planned, margin
 
 
 def test_a_correction_between_nodes_is_shared_as_the_load_is(biped_plan: Planned) -> None:
-    """A sole with a tenth of the load takes less of what is lacking, and its centre of pressure stays."""
+    """A sole that bears a tenth takes less of what is lacking, and its centre of pressure stays."""
     plan = biped_plan.plan
     c = plan.coordinates
     y, legs = c.split(plan.problem.start_posture)

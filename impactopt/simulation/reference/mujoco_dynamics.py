@@ -194,7 +194,8 @@ def march(
             if fastest * step > 2 * _RESOLVED:
                 raise _NotResolved(fastest)
         torque = forces.torque(demand, phase)
-        ends = not phase.touching or time >= horizon * (1 - 1e-9)
+        # hand and target that neither approach nor part: the next step decides
+        ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end = world.state()
         world.apply(torque - forces.friction(velocity, phase), force)

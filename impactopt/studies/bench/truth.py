@@ -22,6 +22,7 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos
+from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.reference.meshes import Meshes
 from impactopt.studies.bench.planning import DEMO, solved
 from impactopt.studies.report import Report, Say, columns_table
@@ -79,6 +80,20 @@ FREE = (
 )
 
 
+MISSED = (
+    ("problem", "problem", 0),
+    ("torque planned", "missed_torque_planned", 2),
+    ("torque", "missed_torque", 2),
+    ("gear", "missed_gear", 2),
+    ("CoP mm", "missed_cop_mm", 1),
+    ("force N", "missed_force_N", 0),
+    ("slip mm", "missed_slip_mm", 1),
+    ("apart mm", "missed_clearance_mm", 1),
+    ("touches", "missed_touches", 0),
+    ("stands", "missed_standing", 0),
+)
+
+
 def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> Report:
     """Every problem file of the folder, and the variants of the demo's punch.
 
@@ -92,6 +107,9 @@ def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> R
     tables = (
         columns_table("planned, and replayed on held soles", HELD, shown),
         columns_table("replayed on free soles", FREE, shown),
+        columns_table(
+            "with the target missing, on free soles", MISSED, [r for r in shown if "missed_standing" in r]
+        ),
     )
     return Report(name="truth", numbers={"rows": rows, "controller": controller}, tables=tables)
 
@@ -129,6 +147,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     pressure and of its normal force, over what is asked of it, in the plan (its missed blow included) and in
     its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
     by sole and phase.
+    missed_... : of the replay on free soles where the target is missing.
     gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}
@@ -139,7 +158,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         out["impulse_planned_Ns"] = solution.impulse
         replay = solution.validate()
         told = solution.summary(replay)
-        held = told["simulated"]
+        held = _with_missed(told["simulated"], solution)
         out |= {
             "clearance_mm": _least(told["clearance_mm"], held["clearance_mm"]),
             "touches": len([*told["contacts_besides"], *(held["contacts_besides"] or ())]),
@@ -160,7 +179,9 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         return out
     try:
         replay = solution.validate(engine="mujoco", controller=controller)
-        free = solution.summary(replay)["simulated"]
+        free = _with_missed(
+            solution.summary(replay)["simulated"], solution, engine="mujoco", controller=controller
+        )
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}
         return out
@@ -178,7 +199,43 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         "standing": free["standing"],
         "reason": free["reason"],
     }
-    return out
+    return out | _missed(solution, controller)
+
+
+def _missed(solution: Solution, controller: str) -> dict[str, Any]:
+    """The replay on free soles where the target is missing, of a plan that has a motion for that."""
+    if solution.plan.abort is None:
+        return {}
+    try:
+        replay = solution.validate(
+            engine="mujoco", controller=controller, perturbation=Perturbation(missing=True)
+        )
+    except InputError as error:
+        return {"missed_standing": None, "missed_reason": str(error)}
+    free = solution.summary(replay)["simulated"]
+    return {
+        "missed_torque_planned": solution.margins()["torque_ratio"].get("missed"),
+        "missed_torque": max(free["torque_ratio"].values()),
+        "missed_gear": free.get("gear_ratio"),
+        "missed_cop_mm": _least_of(free.get("sole_cop_margin_mm")),
+        "missed_force_N": _least_of(free.get("sole_force_N")),
+        "missed_slip_mm": free.get("sole_slip_mm"),
+        "missed_clearance_mm": free["clearance_mm"],
+        "missed_touches": len(free["contacts_besides"] or ()),
+        "missed_standing": free["standing"],
+        "missed_reason": free["reason"],
+    }
+
+
+def _with_missed(found: dict[str, Any], solution: Solution, **options: Any) -> dict[str, Any]:
+    """A replay's numbers with those of the soles in a replay of the missed blow, if the plan has one."""
+    if solution.plan.abort is None:
+        return found
+    miss = solution.summary(solution.validate(missing=True, **options))["simulated"]
+    for key in ("sole_cop_margin_mm", "sole_force_N"):
+        for sole, phases in (miss.get(key) or {}).items():
+            found[key][sole] |= {phase: kept for phase, kept in phases.items() if phase == "missed"}
+    return found
 
 
 def _soles(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,15 +10,32 @@ from numpy.typing import NDArray
 
 from impactopt.planning.multistart import carried, one_after_the_other
 from impactopt.planning.on_demand import program_for
+from impactopt.problem.motion_style import MotionPrices
 from impactopt.solvers.program import SolverResult
+from impactopt.transcription.start import first_iterate
 from impactopt.transcription.transcription import Transcription
 
-__all__ = ["within_price"]
+__all__ = ["with_first_scale", "within_price"]
 
 Array = NDArray[np.float64]
+_USUAL, _LEAST = 1.0, 0.02  # [N s] of an initial guess for which prices are as they are; least factor
 _TRIES = 3  # reductions: with lower prices there is more to be priced, so one may not be enough
 _TOLERANCE = 0.02  # of the share: a plan that is within it is not solved again
 _BELOW = 0.9  # of the allowed share is aimed at
+
+
+def with_first_scale(t: Transcription) -> Transcription:
+    """The program with prices of the motion style that fit what its initial guess is worth.
+
+    The prices are for blows of some newton seconds. A reach as the guess has it gives a part of what the plan
+    will; where even `_USUAL` is far more than that, prices would outweigh the objective.
+    """
+    p = t.problem
+    if p.price_scale != 1.0 or p.style_prices == MotionPrices():
+        return t
+    worth = t.worth(first_iterate(t))
+    scale = float(np.clip(worth / _USUAL, _LEAST, 1.0)) if np.isfinite(worth) else 1.0
+    return t if scale == 1.0 else program_for(t, replace(p, price_scale=scale), None)
 
 
 def within_price(

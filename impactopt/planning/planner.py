@@ -17,7 +17,7 @@ from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.keeping_apart import Margins, same_bodies
 from impactopt.planning.made_again import planned_by, program_of
 from impactopt.planning.models import carried_start, climbed
-from impactopt.planning.motion_price import within_price
+from impactopt.planning.motion_price import with_first_scale, within_price
 from impactopt.planning.multistart import (
     EFFORT,
     VIOLATED,
@@ -140,7 +140,10 @@ def _planned(
     shares: Shares = ()
     apart: Mapping[ApartRow, Held] = {}
     if isinstance(start, Solution):
-        problem = with_rows(problem, rows_on_demand(start.problem))  # a neighbour is likely to need them too
+        # a neighbour is likely to need the same constraints and prices
+        problem = with_rows(problem, rows_on_demand(start.problem))
+        if problem.style == start.problem.style:
+            problem = replace(problem, price_scale=start.problem.price_scale)
         given, nodes, elements, shares = start.result, start.nodes, start.elements, start.shares
         if start.problem.keeps_apart and same_bodies(problem, start.problem):
             apart = start.apart
@@ -152,7 +155,10 @@ def _planned(
     t = Transcription(problem, problem.coordinates, functions, nodes, elements, shares)
     if isinstance(start, Solution):
         given = carried_start(t, partial(program_of, start), start, apart)
-    if not isinstance(given, str):
+    if isinstance(given, str):
+        t = with_first_scale(t)
+        problem = t.problem
+    else:
         check_array("start", given.x if isinstance(given, SolverResult) else given, (t.program.n,))
     if isinstance(given, SolverResult) and _meets_rows(t, given):
         budget = budget.near_by()  # the start may be the optimum

@@ -113,7 +113,7 @@ class ImpactProblem:
     style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending
         away from the start posture (`impactopt.problem.motion_style`); or "strongest", without.
     motion_price : largest share of the objective that prices on motion may take; those of the style are
-        reduced until they take no more.  price_scale : factor on these, as a plan has reduced them.
+        reduced until they take no more.  price_scale : factor on these; 1: a plan chooses it.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
         return_price : price of ending away from the start posture [N s per rad^2]. These three are small;
         they make the optimum unique, and bring the robot back to its start.

@@ -300,11 +300,15 @@ class Transcription(ContactProgram):
         return [*found, determined(Turn.RATE, self.u0.index(0))]
 
     # ------------------------------------------------------------------ solution
+    def worth(self, x: Array) -> float:
+        """Weighted sum of the objectives [N s], without prices, for solver variables (n,)."""
+        return sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
+
     def price_shares(self, x: Array) -> tuple[float, float]:
         """Shares of the objectives that all prices on motion take, and those of its style alone, for solver
         variables (n,).
         """
-        worth = sum((-o.weight if o.cost else o.weight) * q.evaluate(x) for o, q in self.objectives)
+        worth = self.worth(x)
         if not worth:
             return np.inf, np.inf
         return (self.program.objective(x) + worth) / abs(worth), self._style.evaluate(x) / abs(worth)

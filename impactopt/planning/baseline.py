@@ -23,17 +23,9 @@ from impactopt.kinematics.splines import quintic
 from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.wrench_cone import contact_wrench_cone
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import (
-    ContactWrenchCone,
-    Grip,
-    GroundForce,
-    PositionLimit,
-    TorqueLimit,
-    VelocityLimit,
-)
+from impactopt.problem.terms import ContactWrenchCone, Grip, PositionLimit, TorqueLimit, VelocityLimit
 from impactopt.robots.hinges import inside
 from impactopt.simulation import Simulation, scene_of, simulate_pinocchio
-from impactopt.transcription.limits import GRAVITY
 from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.reference import complete_reference
 from impactopt.transcription.start import strike_rates
@@ -166,7 +158,6 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
         return bool(np.all(np.abs(tau) <= limit))
     cone = problem.term(ContactWrenchCone)
     jac, _ = c.sole_jacobians(q)
-    weight = float(pin.computeTotalMass(c.model)) * GRAVITY
     n = 6 * len(c.legs)
     rows, bounds = [], []
     for k, leg in enumerate(c.legs):
@@ -179,13 +170,11 @@ def _wrenches_exist(problem: ImpactProblem, q: Array, v: Array, a: Array) -> boo
             bounds.append(np.tile(np.repeat([grip.force, grip.moment], 3), 2))
             continue
         facets = contact_wrench_cone(leg.sole.polygon, cone.friction, margin=cone.margin)
-        block = np.zeros((len(facets), n))
-        block[:, 6 * k : 6 * k + 6] = -facets
+        block = np.zeros((len(facets) + 1, n))
+        block[:-1, 6 * k : 6 * k + 6] = -facets
+        block[-1, 6 * k + 2] = -1.0
         rows.append(block)
-        bounds.append(np.zeros(len(facets)))
-    _, matrix, least, most = problem.term(GroundForce).bounds(c.legs)
-    rows += [-matrix, matrix[:1]]
-    bounds += [-weight * least, weight * most[:1]]
+        bounds.append(np.concatenate([np.zeros(len(facets)), [-cone.minimum_force]]))
     legs = jac[:, c.base :].T
     rows += [-legs, legs]
     bounds += [limit - tau[c.base :], limit + tau[c.base :]]

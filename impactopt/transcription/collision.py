@@ -25,7 +25,7 @@ from impactopt.transcription.guess import blow, coasted, effective_mass
 from impactopt.transcription.layout import Affine, Array, Group
 from impactopt.transcription.limits import DIRECTIONS
 from impactopt.transcription.mesh import CollocationPoint
-from impactopt.transcription.nodes import add_cone_rows, add_ground_rows
+from impactopt.transcription.nodes import add_cone_rows
 from impactopt.transcription.phases import pulls_apart, switches
 from impactopt.transcription.plan import PlannedCollision
 from impactopt.transcription.reference import total_ground_wrench
@@ -261,9 +261,8 @@ class Collision(ContactNumbers, Collocated):
         b.equal("collision dynamics", place, joints, joint, percent("of the joint's limit off"))
         self._torque_rows(place, first["collision"] + part["torque"], self.torque_fraction)
         if self.cone_margin is not None:
-            add_cone_rows(b, self.w[i], place, self.cone_margin)
-            if self.scenario is None:
-                add_ground_rows(b, self.w[i], place)
+            minimum = b.limits.cone.minimum_force if self.scenario is None else 0.0
+            add_cone_rows(b, self.w[i], place, self.cone_margin, minimum)
         self._target_rows(i, place, first["force"])
 
     def _target_rows(self, i: int, place: Place, first: int) -> None:

@@ -11,7 +11,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     Balance,
     ContactWrenchCone,
-    GroundForce,
     Incidence,
     LegExtension,
     PositionLimit,
@@ -33,7 +32,7 @@ class Limits:
 
     Attributes
     ----------
-    torque, velocity, position, cone, ground, balance, incidence, extension : the problem's terms.
+    torque, velocity, position, cone, balance, incidence, extension : the problem's terms.
     weight : of the robot [N].  units : of base rows, weight [N] and lever [m].  unbalanced : how their
         violation is told.
     wrench_scale (6 a sole) : of sole wrenches [N, N m].
@@ -46,7 +45,6 @@ class Limits:
         p, c, r = problem, coordinates, problem.robot
         self.torque, self.velocity = p.term(TorqueLimit), p.term(VelocityLimit)
         self.position, self.cone = p.term(PositionLimit), p.term(ContactWrenchCone)
-        self.ground = p.term(GroundForce)
         self.balance, self.incidence = p.term(Balance), p.term(Incidence)
         self.extension = p.term(LegExtension)
         self.weight = GRAVITY * float(sum(i.mass for i in r.model.inertias))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.kinematics.wrench_cone import contact_wrench_cone
-from impactopt.problem.terms import ContactWrenchCone, GroundForce, TorqueLimit
+from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
 from impactopt.robots.sole_margins import cop_margin, least_kept, weight_of
 from impactopt.transcription.plan import Plan, sampled
 from impactopt.transcription.planned_loads import gear_share
@@ -86,7 +86,7 @@ def _soles_outside(plan: Plan, wrenches: Array) -> NDArray[np.bool_]:
     robot, soles, cone = plan.problem.robot, plan.coordinates.soles, plan.problem.term(ContactWrenchCone)
     own, least = wrenches.reshape(len(wrenches), -1, 6)[:, : len(soles)], least_kept(cone.margin)
     outside = (cop_margin(robot, [sole.polygon for sole in soles], own) < least).any(axis=1)
-    outside |= plan.problem.term(GroundForce).shortfall(own[:, :, 2] / weight_of(robot), _SHARE) > 0
+    outside |= (own[:, :, 2] < _SHARE * cone.minimum_force).any(axis=1)
     for k, sole in enumerate(soles):
         rows = contact_wrench_cone(sole.polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
         outside |= (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)

@@ -53,14 +53,15 @@ def add_nodes(
             lower=b.limits.extension.minimum,
             measure=percent("too near to straight", of=b.limits.extension.minimum),
         )
-        add_cone_rows(b, slots[4], place, b.limits.cone.margin)
-        add_ground_rows(b, slots[4], place)
+        add_cone_rows(b, slots[4], place, b.limits.cone.margin, b.limits.cone.minimum_force)
         torques.append(at + part["torque"])
     return torques
 
 
-def add_cone_rows(b: Builder, wrench: Affine, place: Place | str, margin: float) -> None:
-    """Constraints: each sole's wrench (6 a sole) lies in its cone."""
+def add_cone_rows(
+    b: Builder, wrench: Affine, place: Place | str, margin: float, minimum_force: float
+) -> None:
+    """Rows: each sole's wrench (6 a sole) is in its cone, its normal force [N] no less than the least."""
     for k, leg in enumerate(b.coordinates.legs):
         if leg.sole is None:  # a hand: see `Grip`
             continue
@@ -76,20 +77,13 @@ def add_cone_rows(b: Builder, wrench: Affine, place: Place | str, margin: float)
             measure=[_outside_cone(row * b.limits.weight, normal, b.limits.cone.friction) for row in rows],
             whole=sole,
         )
-
-
-def add_ground_rows(b: Builder, wrench: Affine, place: Place | str) -> None:
-    """Constraints: normal forces of the soles' wrenches (6 a sole) lie in their ranges."""
-    names, matrix, lower, upper = b.limits.ground.bounds(b.coordinates.legs)
-    if names:
         b.rows.add(
-            term=b.limits.ground.name,
+            term="normal force",
             place=place,
-            components=names,
-            affine=wrench.apply(matrix / b.limits.weight),
-            lower=lower,
-            upper=upper,
-            measure=Measure("% of the weight", 100.0, "out of range"),
+            components=[sole],
+            affine=normal,
+            lower=minimum_force / b.limits.weight,
+            measure=Measure("N", b.limits.weight, "too light"),
         )
 
 

@@ -17,8 +17,8 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ContactWrenchCone, GroundForce
-from impactopt.robots.sole_margins import cop_margin, least_margins, weight_of
+from impactopt.problem.terms import ContactWrenchCone
+from impactopt.robots.sole_margins import cop_margin, least_margins
 from impactopt.transcription.reference import Completed, complete_reference
 
 Array = NDArray[np.float64]
@@ -423,5 +423,5 @@ class Plan:
                 {name: labels == name for name in parts},
             ),
             "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in asked.items() if m is not None},
-            "sole_force_asked_N": self.problem.term(GroundForce).sole * weight_of(self.problem.robot),
+            "sole_force_asked_N": cone.minimum_force,
         }

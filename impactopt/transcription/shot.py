@@ -55,19 +55,18 @@ class Shot:
         """Rows of all soles' wrenches over the weight (k, 6 a sole), and their lower bounds."""
         b, cone = self._b, self._b.limits.cone
         margin = self.scenario.cone_margin if self.scenario else cone.collision_margin
+        minimum = 0.0 if self.scenario else cone.minimum_force
         rows, least = [np.zeros((0, b.nw))], [np.zeros(0)]
         for k, leg in enumerate(b.coordinates.legs):
             if margin is None or leg.sole is None:  # a hand, which strikes by shooting refuse
                 continue
-            own = contact_wrench_cone(leg.sole.polygon, cone.friction, margin=margin)
+            own = np.vstack(
+                [contact_wrench_cone(leg.sole.polygon, cone.friction, margin=margin), np.eye(6)[2]]
+            )
             wide = np.zeros((len(own), b.nw))
             wide[:, 6 * k : 6 * k + 6] = own / b.limits.weight
             rows.append(wide)
-            least.append(np.zeros(len(own)))
-        if margin is not None and self.scenario is None:
-            _, matrix, lower, upper = b.limits.ground.bounds(b.coordinates.legs)
-            rows += [matrix / b.limits.weight, -matrix[:1] / b.limits.weight]
-            least += [lower, -upper[:1]]
+            least.append(np.append(np.zeros(len(own) - 1), minimum / b.limits.weight))
         return np.vstack(rows), np.concatenate(least)
 
     @property

@@ -82,9 +82,10 @@ class Blow:
         law, target = problem.law, problem.target
         self.law, self.target = law.parameters, target.parameters
         self.fraction, self.margin = limits.torque.collision, limits.cone.collision_margin
+        self.least = limits.cone.minimum_force
         if scenario is not None:
             self.law, self.target = scenario.numbers(law, target)
-            self.fraction, self.margin = scenario.torque, scenario.cone_margin
+            self.fraction, self.margin, self.least = scenario.torque, scenario.cone_margin, 0.0
         self.points = [point for _, point in problem.contacts]
         self.phases = len(target.phases)
         self.end = [max(i for i, s in enumerate(self.stages) if s.phase == k) for k in range(self.phases)]
@@ -226,7 +227,7 @@ class Blow:
             return np.concatenate([*found, tau[robot.base :] / r.torque_limit - servo, bounded, inside(w)])
 
         closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
-        inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, loaded=self.scenario is None)
+        inside, cone = limits.cone_rows(robot, place, self.margin or 0.0, self.least)
         if self.margin is None:
             inside, cone = (lambda w: np.zeros(0)), []
         most = self.fraction if lifted is None else 0.0

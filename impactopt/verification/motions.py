@@ -16,7 +16,6 @@ from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import (
     ContactWrenchCone,
     Grip,
-    GroundForce,
     LegExtension,
     PositionLimit,
     TorqueLimit,
@@ -41,7 +40,7 @@ class Limits:
         r = problem.robot
         self.torque, self.velocity = problem.term(TorqueLimit), problem.term(VelocityLimit)
         self.cone, self.extension = problem.term(ContactWrenchCone), problem.term(LegExtension)
-        self.grip, self.ground = problem.extra(Grip), problem.term(GroundForce)
+        self.grip = problem.extra(Grip)
         lower, upper = inside(r, problem.term(PositionLimit).margin)
         box = BASE_BOX[: robot.base]
         self.y = (
@@ -51,7 +50,7 @@ class Limits:
         self.legs = lower[robot.dependent], upper[robot.dependent]
 
     def cone_rows(
-        self, robot: RobotMotion, place: str, margin: float | None, *, loaded: bool = True
+        self, robot: RobotMotion, place: str, margin: float | None, least: float
     ) -> tuple[Callable[[Array], Array], list[Any]]:
         """Of wrenches (6 a sole): how far inside the cone they are, and what hands that hold on bear, over
         what they may; with the rows that say so.  margin : [m]; None: the cone is not asked for.
@@ -67,22 +66,16 @@ class Limits:
             if margin is None:
                 continue
             facets = contact_wrench_cone(leg.sole.polygon, self.cone.friction, margin=margin) / robot.weight
-            parts.append((k, facets))
+            normal = np.zeros((1, 6))
+            normal[0, 2] = 1 / robot.weight
+            parts.append((k, np.vstack([facets, normal])))
             name = leg.end
             components = [f"{name}, facet {i}" for i in range(len(facets))]
             rows.append((self.cone.name, place, components, 0.0, np.inf))
-        soles = [leg.end for leg, *_ in robot.soles if leg.sole is not None]
-        own = np.array([leg.sole is not None for leg, *_ in robot.soles], dtype=bool)
-        if loaded and margin is not None and soles:
-            rows.append((self.ground.name, place, ["all soles"], self.ground.least, self.ground.most))
-            if len(soles) > 1:
-                rows.append((self.ground.name, place, soles, self.ground.sole, np.inf))
+            rows.append(("normal force", place, [name], least / robot.weight, np.inf))
 
         def inside(w: Array) -> Array:
             found = [matrix @ w[6 * k : 6 * k + 6] for k, matrix in parts]
-            if loaded and margin is not None and soles:
-                normal = w[2::6][own] / robot.weight
-                found += [np.array([normal.sum()]), normal if len(soles) > 1 else np.zeros(0)]
             return np.concatenate([np.zeros(0), *found])
 
         return inside, rows
@@ -170,7 +163,7 @@ def node_piece(
     problem_limits, n = robot.robot, robot.n
     names, fraction = problem_limits.joint_names, limits.torque.fraction
     rates, fast = problem_limits.velocity_limit[robot.dependent], limits.velocity.fraction
-    inside, cone = limits.cone_rows(robot, place, limits.cone.margin)
+    inside, cone = limits.cone_rows(robot, place, limits.cone.margin, limits.cone.minimum_force)
     closure = [f"{leg.end} {d}" for leg, *_ in robot.soles for d in DIRECTIONS]
 
     def value(v: Variables) -> Array:

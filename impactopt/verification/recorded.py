@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
-from impactopt.problem.terms import ContactWrenchCone, GroundForce
+from impactopt.problem.terms import ContactWrenchCone
 from impactopt.robots.sole_margins import SHARE, cop_margin, least_kept
 from impactopt.verification.motions import Way
 from impactopt.verification.program import Program
@@ -164,8 +164,7 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
         own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
         kept = float(cop_margin(robot.robot, corners, own[None]).min())
         yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept
-        load = p.problem.term(GroundForce).shortfall(own[None, :, 2] / robot.weight, SHARE)
-        yield "ground force", float(load[0])
+        yield "normal force of a sole", (SHARE * cone.minimum_force - float(own[:, 2].min())) / robot.weight
 
 
 def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:

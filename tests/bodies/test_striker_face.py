@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from impactopt import g1, planar_arm, talos
+from impactopt import g1, talos
 from impactopt.bodies.striker_face import striker_face
 from impactopt.robots.robot import Robot
 
@@ -19,9 +19,7 @@ def moved(robot: Robot, name: str, by: np.ndarray) -> Robot:
     return dataclasses.replace(robot, strikers=strikers)
 
 
-@pytest.mark.parametrize(
-    ("make", "name"), [(talos, "right_hand"), (g1, "right_hand"), (planar_arm, "hammer")]
-)
+@pytest.mark.parametrize(("make", "name"), [(talos, "right_fingertips"), (g1, "right_hand")])
 def test_presets_strike_with_what_is_outermost(make: object, name: str) -> None:
     face = striker_face(make(), name)  # type: ignore[operator]
     assert face is not None
@@ -30,12 +28,12 @@ def test_presets_strike_with_what_is_outermost(make: object, name: str) -> None:
 
 
 def test_a_point_inside_its_link_is_as_far_behind_as_it_was_moved() -> None:
-    """The hammer's face is flat, and looks along x of the wrist."""
-    arm = planar_arm()
-    face = striker_face(moved(arm, "hammer", np.array([-0.01, 0.0, 0.0])), "hammer")
+    """The fingertips' plane looks along -z of the gripper's base."""
+    name = "right_fingertips"
+    face = striker_face(moved(talos(), name, np.array([0.0, 0.0, 0.02])), name)
     assert face is not None
-    np.testing.assert_allclose(face.normal, [1.0, 0.0, 0.0], atol=0.1)
-    assert face.ahead == pytest.approx(0.01, abs=1e-3)
+    np.testing.assert_allclose(face.normal, [0.0, 0.0, -1.0], atol=0.02)
+    assert face.ahead == pytest.approx(0.02, abs=1e-3)
 
 
 def test_the_corners_lead_in_every_direction_near_the_normal() -> None:
@@ -43,7 +41,7 @@ def test_the_corners_lead_in_every_direction_near_the_normal() -> None:
     from impactopt.bodies.robot_bodies import bodies_of
 
     robot = talos()
-    face, hit = striker_face(robot, "right_hand"), robot.striker("right_hand")
+    face, hit = striker_face(robot, "right_fingertips"), robot.striker("right_fingertips")
     assert face is not None
     frame = robot.model.frames[robot.model.getFrameId(hit.frame)]
     pieces = bodies_of(robot).of_joint[int(frame.parentJoint)]

@@ -34,7 +34,6 @@ from impactopt.problem.terms import (
     TERMS,
     ContactWrenchCone,
     Grip,
-    GroundForce,
     HitRegion,
     Term,
     TorqueLimit,
@@ -68,8 +67,8 @@ def middles(nodes: Array) -> Array:
     return (nodes[1:] + nodes[:-1]) / 2
 
 
-def with_term(plan: Plan, *terms: Any) -> Plan:
-    return dataclasses.replace(plan, problem=dataclasses.replace(plan.problem, terms=terms))
+def with_term(plan: Plan, term: Any) -> Plan:
+    return dataclasses.replace(plan, problem=dataclasses.replace(plan.problem, terms=(term,)))
 
 
 def middles_of(nodes: Array, at: Array) -> tuple[float, ...]:
@@ -114,8 +113,7 @@ def sole_wrenches(plan: Plan, phase: int) -> Array:
 @pytest.mark.parametrize("margin", [0.0, 0.02, 0.04])
 def test_each_sole_between_nodes_by_its_legs_torques(biped_plan: Planned, margin: float) -> None:
     """Also where the ZMP of both is well inside their hull."""
-    light = GroundForce(least=0.0, most=100.0, sole=0.0)
-    plan = with_term(biped_plan.plan, ContactWrenchCone(margin=margin, friction=5.0), light)
+    plan = with_term(biped_plan.plan, ContactWrenchCone(margin=margin, minimum_force=0.0, friction=5.0))
     soles, expected = plan.coordinates.soles, []
     for phase, curve, nodes in ((0, plan.swing, plan.swing_nodes), (2, plan.follow, plan.follow_nodes)):
         wrench = sole_wrenches(plan, phase)[: len(each_millisecond(curve))]

@@ -8,11 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import quad, trapezoid
-from support.small_plans import Planned
+from support.small_plans import Planned, changed
 
 from impactopt.errors import InputError
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.problem.motion_style import STYLES, MotionPrices
+from impactopt.problem.terms import GroundForce
 from impactopt.robots.presets import talos
 from impactopt.transcription.motion_measures import ground_force_share, motion_measures
 from impactopt.transcription.objective import style_prices
@@ -87,7 +88,7 @@ def test_idle_joints_are_those_of_the_other_arm_and_the_head() -> None:
 
 
 def test_an_unknown_style_is_told(arm_plan: Planned) -> None:
-    with pytest.raises(InputError, match="unknown style 'naturl' .did you mean 'natural'"):
+    with pytest.raises(InputError, match=r"unknown style 'naturl' .did you mean 'natural'"):
         replace(arm_plan.problem, style="naturl")
 
 
@@ -111,13 +112,16 @@ def test_a_robot_at_rest_presses_with_its_weight(biped_plan: Planned) -> None:
     assert low == high == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_ground_force_stays_in_its_range_at_the_nodes(biped_plan: Planned) -> None:
-    """Of all soles and of each, as planned."""
-    p = biped_plan.problem
-    t, x = biped_plan.transcription, biped_plan.result.x
-    ground = next(term for term in p.active_terms if term.name == "ground force")
-    weight = 9.81 * sum(body.mass for body in p.robot.model.inertias)
+def test_constraints_of_the_ground_force_are_normal_forces_over_the_weight(biped_plan: Planned) -> None:
+    """Of all soles and of each, at every place where the soles have wrenches."""
+    t = changed(biped_plan.transcription, terms=(GroundForce(least=0.4, most=1.6, sole=0.1),))
+    x = np.random.default_rng(0).standard_normal(t.program.n)
+    rows = [k for k, origin in enumerate(t.program.origins) if origin.term == "ground force"]
+    weight = 9.81 * sum(body.mass for body in t.robot.model.inertias)
+    expected = []
     for _, wrench in t.wrenches():
         normal = wrench.evaluate(x)[2::6] / weight
-        assert ground.least - 1e-4 <= normal.sum() <= ground.most + 1e-4
-        assert len(normal) == 1 or normal.min() >= ground.sole - 1e-4
+        expected += [normal.sum(), *(normal if len(normal) > 1 else [])]
+    np.testing.assert_allclose(t.program.constraints(x)[rows], expected, rtol=1e-12)
+    lower, upper = t.program.g_lower[rows], t.program.g_upper[rows]
+    assert set(lower) == {0.4, 0.1} and set(upper) == {1.6, np.inf}

@@ -159,6 +159,7 @@ def _data(
             "contact_wrench_cone": {
                 "margin_m": margin,
                 "collision_margin_m": margin,
+                "minimum_force_N": float(f"{50 * part:.2g}"),
             },
             "balance": {"angular_momentum_N_m_s": float(f"{min(10.0, 10 * part):.2g}")},
         }

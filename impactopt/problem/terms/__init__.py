@@ -37,13 +37,11 @@ DEFAULT_TERMS: tuple[Term, ...] = (
     VelocityLimit(),
     PositionLimit(),
     ContactWrenchCone(),
-    GroundForce(),
     Balance(),
     Incidence(),
     LegExtension(),
     SelfCollision(),
     KeepOut(),
-    FirstTouch(),
 )
 ON_DEMAND_TERMS: tuple[Term, ...] = (GearLoad(), Slide())
 # all that problem files know, in their order
@@ -62,6 +60,8 @@ TERMS: tuple[type[Term], ...] = (
     TargetSpeed,
     Slide,
     Grip,
+    GroundForce,
+    FirstTouch,
 )
 
 __all__ = [

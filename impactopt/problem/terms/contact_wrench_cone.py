@@ -36,3 +36,6 @@ class ContactWrenchCone(Term):
             none="anywhere",
         ),
     )
+    minimum_force: float = field(
+        default=50.0, metadata=about("least normal force of each sole", unit="N", least=0)
+    )

@@ -42,7 +42,6 @@ class FirstTouch(Term):
         default=0.6,
         metadata=about("largest angle between the link's face and the normal", unit="rad", above=0),
     )
-    enabled: bool = field(default=True, metadata=about("whether it holds"))
 
     def __post_init__(self) -> None:
         self.check_angle()

@@ -186,7 +186,7 @@ CALLS: dict[str, Callable[[], Call]] = {
     "TorqueLimit": _of("TorqueLimit", fraction=0.8, collision=0.8),
     "VelocityLimit": _of("VelocityLimit", fraction=0.8),
     "PositionLimit": _of("PositionLimit", margin=0.02),
-    "ContactWrenchCone": _of("ContactWrenchCone", friction=0.6, margin=0.02),
+    "ContactWrenchCone": _of("ContactWrenchCone", friction=0.6, margin=0.02, minimum_force=50.0),
     "Balance": _of("Balance", capture_margin=0.02, vertical_speed=0.2, angular_momentum=10.0),
     "Incidence": _of("Incidence", speed=0.05),
     "LegExtension": _of("LegExtension", minimum=0.35),

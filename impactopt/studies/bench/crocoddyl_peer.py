@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from impactopt.contact import FreeMass
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
-from impactopt.problem.terms import ContactWrenchCone, GroundForce, PositionLimit, TorqueLimit, VelocityLimit
+from impactopt.problem.terms import ContactWrenchCone, PositionLimit, TorqueLimit, VelocityLimit
 from impactopt.robots.hinges import inside
-from impactopt.transcription.limits import GRAVITY
 from impactopt.transcription.plan import Trajectory
 
 __all__ = ["CrocoddylPlan", "crocoddyl_plan"]
@@ -120,7 +119,7 @@ def _task(problem: ImpactProblem) -> dict[str, Any]:
         "upper": np.concatenate([free, upper, free, rates]),
         "torque": p.term(TorqueLimit).fraction * robot.torque_limit,
         "friction": cone.friction,
-        "least": p.term(GroundForce).sole * GRAVITY * sum(body.mass for body in bodies),
+        "least": cone.minimum_force,
         "box": 2 * (half - cone.margin),
         "swing": float(np.mean(p.swing.duration)),
         "follow": float(np.mean(p.follow.duration)),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.fit import Planes
 from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
+from impactopt.bodies.separation import Shapes
 from impactopt.bodies.world import WorldBody
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
@@ -167,6 +168,11 @@ class Bodies:
                     self.touching.append((self.links.name(j), body.name))
                     continue
                 self.world_pairs.append((j, w))
+
+    @cached_property
+    def shapes(self) -> Shapes:
+        """Of all pairs that are not to touch, for smooth distances."""
+        return Shapes(self)
 
     # ------------------------------------------------------------------ by spheres and planes
     @cached_property

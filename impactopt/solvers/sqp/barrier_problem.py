@@ -77,10 +77,15 @@ class BarrierProblem:
         z: Vector,
         *,
         warm: bool,
+        on_path: bool = False,
         determined: Sequence[Determined],
     ):
-        """point : moved inside its bounds.  y (m,), z (n,) : multipliers to start from, if it is ``warm``."""
+        """point : moved inside its bounds.  y (m,), z (n,) : multipliers to start from, if it is ``warm``.
+
+        on_path : whether they are those of an iterate at the first barrier.
+        """
         self.program, self.options, self.warm = program, options, warm
+        self._at_once = warm and not on_path and options.barrier_warm < _HIGH
         self.sigma = 1.0
         self.mu = options.barrier_warm if warm else options.barrier
         self.elastic: Elastic | None = None
@@ -180,7 +185,7 @@ class BarrierProblem:
         """Let mu fall as far as the iterate is good enough for; whether it has."""
         tolerance, hard, before = self.options.complementarity_tolerance, self.elastic is None, self.mu
         close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
-        if hard and self.warm and self.options.barrier_warm < _HIGH:
+        if hard and self._at_once:
             close = _CLOSE_WARM
         while self.mu > _FINE * tolerance and self.error(self.mu, residual) <= close * self.mu:
             self.mu = max(_FINEST * tolerance, min(_FASTER * self.mu, self.mu**power))

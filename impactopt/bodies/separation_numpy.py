@@ -104,6 +104,13 @@ class _Pairs:
         for _ in range(_STEPS):
             step2, gain = self._step(at)
             size = np.linalg.norm(step2, axis=1)
+            # no maximum, as bodies are in each other: along the way that it curves up
+            curved, axes = np.linalg.eigh(at.bend)
+            saddle = going & (size < 1e-9) & (curved[:, 0] < -1e-9)
+            up = axes[saddle, :, 0]
+            slope2 = np.einsum("mki,mi->mk", at.tangents[saddle], at.slope[saddle])
+            step2[saddle] = 0.1 * up * np.where((up * slope2).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+            size[saddle], gain[saddle] = 0.1, 0.0
             going &= size >= 1e-11
             if not going.any():
                 break
@@ -122,7 +129,8 @@ class _Pairs:
                     mine[n[fine]] = its[fine]
                 waiting[n[fine]] = False
                 part[n[~fine]] *= 0.4
-            going &= ~waiting & (part * size >= 1e-7)
+            low = np.linalg.eigvalsh(at.bend)[:, 0]
+            going &= ~waiting & ((part * size >= 1e-7) | (low < -1e-9))
         return u, at
 
     @staticmethod

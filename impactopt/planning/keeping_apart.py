@@ -218,9 +218,12 @@ class Watch:
         spot, pair = self._shapes.may_meet(one, two, self._margins.wanted)
         if not len(spot):
             return False
-        half = self._shapes_at(self._placed(x + 0.5 * length * step), self._ways.copy())
+        these = np.zeros(len(self._shapes), dtype=bool)
+        these[pair] = True
+        half = self._placed(x + 0.5 * length * step)
+        found = self._shapes.look(half, ENTERS, self._ways.copy(), these)
         deep = np.where(self._has[spot, pair], -THROUGH, 0.0)
-        return bool((half[1].gaps[spot, pair] < deep).any()) or self._too_near(one[1], half[1])
+        return bool((found.gaps[spot, pair] < deep).any())
 
 
 def solved_apart(

@@ -295,6 +295,21 @@ def add_apart_rows(
         b.rows.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
 
 
+def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
+    """A matrix (n, n) with room, as zeros, for all that coordinates and legs of any place depend on together."""
+    n = matrix.shape[0]
+    parts = [sp.coo_array(matrix)]
+    for _, slots in spots:
+        columns = np.unique(stack(slots).cols)
+        row, column = (a.ravel() for a in np.meshgrid(columns, columns))
+        parts.append(sp.coo_array((np.zeros(len(row)), (row, column)), shape=(n, n)))
+    row, column, values = (
+        np.concatenate([get(p) for p in parts])
+        for get in (lambda p: p.coords[0], lambda p: p.coords[1], lambda p: p.data)
+    )
+    return sp.csc_array(sp.coo_array((values, (row, column)), shape=(n, n)))
+
+
 def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
     """Blocks of these rows with the world's bodies where this problem has them; none is turned."""
     of_name = {block.name: block for block in blocks}

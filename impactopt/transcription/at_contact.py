@@ -15,7 +15,7 @@ from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
-from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, move_apart
+from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -218,6 +218,8 @@ class ContactProgram(ABC):
     def program(self) -> StructuredProgram:
         """All of it, for a solver."""
         objective, quadratic, linear = self._worth
+        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
+            quadratic = coupled(quadratic, self._body_spots())
         return StructuredProgram(
             self.layout,
             self.blocks,
@@ -235,8 +237,12 @@ class ContactProgram(ABC):
         other = copy.copy(self)
         other.__dict__.pop("program", None)
         other.builder, other.apart_rows = self._bare.copy(), dict(rows)
-        add_apart_rows(other.builder, [*self.swing_spots(), *self.follow_spots()], other.apart_rows)
+        add_apart_rows(other.builder, self._body_spots(), other.apart_rows)
         return other
+
+    def _body_spots(self) -> list[tuple[Place, list[Affine]]]:
+        """Places with coordinates and legs, where bodies are kept apart."""
+        return [*self.swing_spots(), *self.follow_spots()]
 
     def move_to(self, problem: ImpactProblem, *, anew: bool = True) -> None:
         """Take the numbers of a problem with another point, law or target, and leave the rest as it is built.

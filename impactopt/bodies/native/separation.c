@@ -105,6 +105,19 @@ static void inverse(const double *bend, double floor, double *out) {
     out[0] = c / d; out[1] = -b / d; out[2] = a / d;
 }
 
+/* Where a stationary direction is no maximum, as bodies are in each other: a step along the way that it curves up.
+ * Returns whether there is one. */
+static int off_saddle(const Side *at, double *step) {
+    double mean = 0.5 * (at->bend[0] + at->bend[2]), diff = 0.5 * (at->bend[0] - at->bend[2]);
+    double radius = sqrt(diff * diff + at->bend[1] * at->bend[1]), low = mean - radius;
+    if (low > -1e-9) return 0;
+    double a = at->bend[1], b = low - at->bend[0];
+    if (fabs(a) + fabs(b) < 1e-14) { a = 1.0; b = 0.0; }
+    double length = sqrt(a * a + b * b), way = a * at->slope[0] + b * at->slope[1] < 0.0 ? -0.1 : 0.1;
+    step[0] = way * a / length; step[1] = way * b / length;
+    return 1;
+}
+
 /* The largest separation near direction u (3), which moves there: Newton's method on the sphere. */
 static void separate(const double *R, const double *t, int64_t n1, const double *p1, int64_t n2, const double *p2,
                     double *u, double sharp, double *far, Side *at) {
@@ -115,6 +128,7 @@ static void separate(const double *R, const double *t, int64_t n1, const double 
         step[0] = inv[0] * at->slope[0] + inv[1] * at->slope[1];
         step[1] = inv[1] * at->slope[0] + inv[2] * at->slope[1];
         double size = sqrt(step[0] * step[0] + step[1] * step[1]), gain = step[0] * at->slope[0] + step[1] * at->slope[1];
+        if (size < 1e-9 && off_saddle(at, step)) { size = 0.1; gain = 0.0; }
         if (size < 1e-11) break;
         double part = size > 0.5 ? 0.5 / size : 1.0;
         Side found;
@@ -129,7 +143,7 @@ static void separate(const double *R, const double *t, int64_t n1, const double 
         if (!moved) break;
         for (int i = 0; i < 3; ++i) u[i] = next[i];
         *at = found;
-        if (part * size < 1e-7) break;
+        if (part * size < 1e-7 && !off_saddle(at, step)) break;
     }
 }
 

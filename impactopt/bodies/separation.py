@@ -185,8 +185,8 @@ class Separations:
     """
 
     def __init__(self, shapes: Shapes, joints: int, pairs: Index, numbers: Array, ways: Array) -> None:
-        """pairs (count,) : numbers of pairs.  numbers (count, 13 joints + 13) : n + 1 placements, which joints
-        turn, and the reach [m].  ways (count, 3) : directions to begin at.
+        """pairs (count,) : numbers of pairs.  numbers (count, 13 joints + 13) : n + 1 placements, which
+        joints turn, and the reach [m].  ways (count, 3) : directions to begin at.
         """
         self._shapes, self._pairs, self.joints, self.count = shapes, pairs, joints, len(pairs)
         self.numbers, self.ways = np.ascontiguousarray(numbers), np.ascontiguousarray(ways, dtype=float)

@@ -25,8 +25,8 @@ def _sharp() -> float:
 
 
 class _Support(NamedTuple):
-    """Of m bodies in directions: rounded supports (m,), mean (m, 3) and covariance (m, 3, 3) of the points that
-    carry them.
+    """Of m bodies in directions: rounded supports (m,), mean (m, 3) and covariance (m, 3, 3) of the points
+    that carry them.
     """
 
     height: Array
@@ -154,7 +154,9 @@ def _inverse(bend: Array) -> Array:
 
 # ---------------------------------------------------------------- chains
 def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Rotation (m, 3, 3) and translation (m, 3) of the end; axes and origins (m, n, 3) of joints; which turn."""
+    """Rotation (m, 3, 3) and translation (m, 3) of the end; axes and origins (m, n, 3) of joints; which of
+    them turn (m, n).
+    """
     m = len(z)
     places = numbers[:, : 12 * (n + 1)].reshape(m, n + 1, 12)
     turns = numbers[:, 12 * (n + 1) : 13 * n + 12] > 0.5

@@ -1,4 +1,4 @@
-"""Constraints that keep a program's bodies apart: how far, and which it has, as they enter while it is solved.
+"""Constraints that keep a program's bodies apart: how far, and which it has, as they enter on the way.
 
 A program begins with those of bodies that are near at its start. Others enter at the iterate at which their
 bodies come near, before these can touch: the solver leaves the program there, gets the one with them, and
@@ -144,10 +144,13 @@ class Watch:
         self._entered, self.left, self.barrier = 0, False, 0.0
         self._go_to(x)
 
-    def rows(self) -> Rows:
-        """Constraints for all that is near at the last iterate and has none; it has them from now on."""
-        _, found = self._shapes_at(self._at, self._ways, NEAR)
-        new = (found.gap < self._near[found.pair]) & ~self._has[found.spot, found.pair]
+    def rows(self, within: float = NEAR) -> Rows:
+        """Constraints for all that is near at the last iterate and has none; it has them from now on.
+
+        within [m] : how near; links with few joints between them by a part of it.
+        """
+        _, found = self._shapes_at(self._at, self._ways, within)
+        new = (found.gap < within / NEAR * self._near[found.pair]) & ~self._has[found.spot, found.pair]
         out = Rows()
         for k, n in zip(found.spot[new].tolist(), found.pair[new].tolist(), strict=True):
             (joint, other), number = self._shapes.pairs[n].tolist(), int(self._shapes.number[n])

@@ -84,7 +84,7 @@ def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: floa
 
 
 def deepest(t: ContactProgram, x: Array, margins: Margins) -> tuple[float, list[Pair]]:
-    """How deep [m] bodies are in each other at the places of a program, < 0 if they are not; and which are."""
+    """How deep [m] bodies are in each other at a program's places, < 0 if they are not; and which pairs."""
     touching = list(_near(margins, spots_of(t, x).at, 1.0))
     return max((-apart for _, _, apart in touching), default=-np.inf), [pair for _, pair, _ in touching]
 

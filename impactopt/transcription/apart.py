@@ -46,7 +46,7 @@ class Chain:
     base: bool = False
 
     def numbers(self, before: Any = None) -> Array:
-        """The chain's part of a constraint's parameters; ``before``: a placement in front of all (pin.SE3)."""
+        """The chain's part of a constraint's parameters; ``before``: a placement in front (pin.SE3)."""
         if before is None:
             return self._numbers
         out = self._numbers.copy()
@@ -59,7 +59,8 @@ class Chain:
         return np.concatenate([*map(_placement, self.places), self.turns])
 
     def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Array, Array, Array]:
-        """z of a constraint's function, sums of coordinates: slots, coordinates (y, then legs), factors, (k,) each.
+        """z of a constraint's function, sums of coordinates: slots, coordinates (y, then legs) and factors,
+        (k,) each.
 
         rotation : axes, as columns, of the box that the chain ends at.
         """
@@ -222,8 +223,8 @@ class SeparationBlock(Block):
 class ApartRow(NamedTuple):
     """What one constraint keeps apart at one place: its name.
 
-    place : of the program.  joint : of the link.  other : joint of the other link; or -1 - the index of a body
-    of the world.  number : of the two pieces among those of these two bodies.
+    place : of the program.  joint : of the link.  other : joint of the other link; or -1 - the index of a
+    body of the world.  number : of the two pieces among those of these two bodies.
     """
 
     place: str
@@ -235,8 +236,8 @@ class ApartRow(NamedTuple):
 class Held(NamedTuple):
     """How a constraint keeps them apart.
 
-    way (3) : direction from the other to the one in the other's frame, near which they are apart.  reach [m] :
-    how far.  travel [m] : of the target, if the other moves with it.
+    way (3) : direction from the other to the one in the other's frame, near which they are apart.
+    reach [m] : how far.  travel [m] : of the target, if the other moves with it.
     """
 
     way: tuple[float, ...]
@@ -296,7 +297,7 @@ def add_apart_rows(
 
 
 def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
-    """A matrix (n, n) with room, as zeros, for all that coordinates and legs of any place depend on together."""
+    """A matrix (n, n) with room, as zeros, for what the coordinates and legs of any place couple."""
     n = matrix.shape[0]
     parts = [sp.coo_array(matrix)]
     for _, slots in spots:

@@ -69,7 +69,7 @@ class _Hulls:
 
 
 def _distances(one: _Hulls, two: _Hulls, turn: Array, shift: Array, u: Array) -> tuple[Array, Array]:
-    """Of pairs whose first is so turned (m, 3, 3) and shifted (m, 3) in the second's frame; and directions."""
+    """Of pairs whose first is so turned (m, 3, 3) and shifted (m, 3) as the second sees it; directions."""
 
     def separation(u: Array) -> tuple[Array, Array, Array]:
         a, b = one.support(-np.einsum("mji,mj->mi", turn, u)), two.support(u)

@@ -119,7 +119,7 @@ def test_bodies_that_are_apart_are_so_by_their_distance_less_what_is_rounded(see
 
 @pytest.mark.parametrize("deep", [-0.02, 0.0, 1e-4, 0.005, 0.02])
 def test_sides_that_are_parallel_are_so_far_apart_as_they_are_and_bend_smoothly(deep: float) -> None:
-    """Two boxes, one above the other: 4 corners each carry the side; curvature is that of turning over them."""
+    """Two boxes, one above the other: 4 corners each carry the side, which may turn over them."""
     one, two = box(0.1, 0.08, 0.05), box(0.3, 0.3, 0.1)
     of = Two(one, two).pair(np.eye(3), np.array([0.0, 0.0, 0.075 + deep]))
     z = np.zeros(N + 3)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
 from impactopt.bodies.separation import Looked, Placed
-from impactopt.planning.multistart import Budget, carried, one_after_the_other
+from impactopt.planning.multistart import Budget, one_after_the_other
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
@@ -265,7 +265,8 @@ def _with_more(t: Program, watch: Watch, start: Array | SolverResult) -> tuple[P
         return t, start
     new = t.with_apart({**t.apart_rows, **rows})
     if isinstance(start, SolverResult):
-        start = carried(new, t, start) if len(start.multipliers) == t.program.m else start
-        if len(start.multipliers) != new.program.m:
-            start = replace(start, multipliers=np.zeros(new.program.m))
+        own = len(start.multipliers) - len(t.apart_rows)
+        known = dict(zip(t.apart_rows, start.multipliers[own:].tolist(), strict=True))
+        more = [known.get(name, 0.0) for name in new.apart_rows]
+        start = replace(start, multipliers=np.append(start.multipliers[:own], more))
     return new, start

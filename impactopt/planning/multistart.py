@@ -28,7 +28,7 @@ EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
 # into its bounds, of a start that is to stay where it is, and of an iterate that a solve goes on from
-_PUSH, _PUSH_ON_PATH = 1e-6, 1e-4
+_PUSH, _PUSH_ON_PATH = 1e-6, 1e-5
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
 
 

@@ -247,10 +247,13 @@ class Held(NamedTuple):
 
 def add_apart_rows(
     b: Builder, spots: Sequence[tuple[Place, list[Affine]]], rows: Mapping[ApartRow, Held]
-) -> None:
-    """Blocks and rows for these.  spots : places of a program, with coordinates and legs."""
+) -> list[ApartRow]:
+    """Blocks and rows for these, and their names in the order of the program's rows.
+
+    spots : places of a program, with coordinates and legs.
+    """
     if not rows:
-        return
+        return []
     bodies, shapes = b.problem.bodies, b.problem.bodies.shapes
     spot_of = {place.name: k for k, (place, _) in enumerate(spots)}
     width = b.ny + b.nl
@@ -272,6 +275,7 @@ def add_apart_rows(
             before = pin.SE3(body.rotation, body.place + shift).inverse()
         n = shapes.index[row.joint, row.other, row.number]
         group = groups.setdefault(len(chain.columns), _Group())
+        group.names.append(row)
         group.pairs.append(n)
         group.ways.append(held.way)
         group.patterns.append(pattern)
@@ -294,6 +298,7 @@ def add_apart_rows(
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
         first = b.append(SeparationBlock.of_separations(f"apart{length}", of, lift))
         b.rows.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
+    return [name for group in groups.values() for name in group.names]
 
 
 def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
@@ -343,6 +348,7 @@ class _Group:
     spot.
     """
 
+    names: list[ApartRow] = field(default_factory=list)
     pairs: list[int] = field(default_factory=list)
     ways: list[tuple[float, ...]] = field(default_factory=list)
     origins: list[Row] = field(default_factory=list)

@@ -54,7 +54,7 @@ class ContactProgram(ABC):
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
     angular_momentum : after contact, a group of three, if an objective asks for it.
     objectives : the problem's that it knows, with their quantities.
-    apart_rows : rows between bodies.
+    apart_rows : constraints between bodies, in the order of their rows, which are the last.
     """
 
     def __init__(self, builder: Builder, hit: Hit) -> None:
@@ -236,8 +236,9 @@ class ContactProgram(ABC):
         """The same program with just these rows between bodies."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
-        other.builder, other.apart_rows = self._bare.copy(), dict(rows)
-        add_apart_rows(other.builder, self._body_spots(), other.apart_rows)
+        other.builder = self._bare.copy()
+        order = add_apart_rows(other.builder, self._body_spots(), rows)
+        other.apart_rows = {name: rows[name] for name in order}
         return other
 
     def _body_spots(self) -> list[tuple[Place, list[Affine]]]:

@@ -21,6 +21,7 @@ from impactopt.planning.multistart import Budget, one_after_the_other
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.solvers.program import SolverResult
+from impactopt.solvers.sqp.run import Path
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.layout import stack
@@ -119,7 +120,7 @@ class Watch:
     Attributes
     ----------
     left : whether the last iterate that it was asked about lacks constraints.
-    barrier : there.
+    path : where the solver was left there.
     """
 
     def __init__(self, t: ContactProgram, margins: Margins, x: Array) -> None:
@@ -141,7 +142,8 @@ class Watch:
         self._enters = np.where(close, ENTERS_BETWEEN, ENTERS)
         self._x: Array | None = None
         self._next: tuple[Array, Array, tuple[Placed, Looked]] | None = None
-        self._entered, self.left, self.barrier = 0, False, 0.0
+        self._entered, self.left = 0, False
+        self.path: Path | None = None
         self._go_to(x)
 
     def rows(self, within: float = NEAR) -> Rows:
@@ -162,9 +164,12 @@ class Watch:
         self.left = False
         return out
 
-    def lacks(self, x: Array, barrier: float) -> bool:
+    def leave(self, path: Path) -> None:
+        self.path = path
+
+    def lacks(self, x: Array) -> bool:
         self._go_to(x)
-        self.left, self.barrier = False, barrier
+        self.left, self.path = False, None
         if self._entered < _TIMES and self._bare(self._found[1], self._enters).any():
             self._entered += 1
             self.left = True
@@ -248,12 +253,12 @@ def solved_apart(
     t, start = _with_more(t, watch, start)
     result = budget.run(t.program, start, barrier, most, watch=watch)
     # other solvers do not ask on the way
-    while watch.left or (not budget.interior and result.status.usable and watch.lacks(result.x, 0.0)):
-        on_path, last = watch.left and budget.interior, result
+    while watch.left or (not budget.interior and result.status.usable and watch.lacks(result.x)):
+        last, before, path = result, t, watch.path
         t, start = _with_more(t, watch, last)
-        new = budget.run(
-            t.program, start, watch.barrier if on_path else None, most, watch=watch, on_path=on_path
-        )
+        if path is not None:
+            path = replace(path, rows=_of_names(path.rows, before, t, np.nan))
+        new = budget.run(t.program, start, None, most, watch=watch, path=path)
         result = one_after_the_other(last, new)
     return t, result
 
@@ -265,8 +270,12 @@ def _with_more(t: Program, watch: Watch, start: Array | SolverResult) -> tuple[P
         return t, start
     new = t.with_apart({**t.apart_rows, **rows})
     if isinstance(start, SolverResult):
-        own = len(start.multipliers) - len(t.apart_rows)
-        known = dict(zip(t.apart_rows, start.multipliers[own:].tolist(), strict=True))
-        more = [known.get(name, 0.0) for name in new.apart_rows]
-        start = replace(start, multipliers=np.append(start.multipliers[:own], more))
+        start = replace(start, multipliers=_of_names(start.multipliers, t, new, 0.0))
     return new, start
+
+
+def _of_names(numbers: Array, old: ContactProgram, new: ContactProgram, other: float) -> Array:
+    """A program's rows' numbers (m,) for one with more constraints between bodies, whose are ``other``."""
+    own = len(numbers) - len(old.apart_rows)
+    known = dict(zip(old.apart_rows, numbers[own:].tolist(), strict=True))
+    return np.append(numbers[:own], [known.get(name, other) for name in new.apart_rows])

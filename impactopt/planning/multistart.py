@@ -14,7 +14,7 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
-from impactopt.solvers.sqp.run import Watch
+from impactopt.solvers.sqp.run import Path, Watch
 from impactopt.transcription.start import carried_over
 
 if TYPE_CHECKING:
@@ -27,8 +27,7 @@ SOLVERS = ("sqp", "ipopt")
 EFFORT = ("iterations", "seconds", "seconds_functions", "seconds_qp")
 VIOLATED = 1e-4  # rows beyond this are named, and an iterate without any is a solution, if not an optimum
 NAMED = 20  # at most
-# into its bounds, of a start that is to stay where it is, and of an iterate that a solve goes on from
-_PUSH, _PUSH_ON_PATH = 1e-6, 1e-5
+_PUSH = 1e-6  # into its bounds, of a start that is to stay where it is
 SPEEDS, NOISE = (0.5, 3.0), (0.05, 0.5)  # [m/s], [rad] that the starts beside the plain one are drawn from
 
 
@@ -132,14 +131,14 @@ class Budget:
         most: int | None = None,
         watch: Watch | None = None,
         *,
-        on_path: bool = False,
+        path: Path | None = None,
     ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
 
         start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
         barrier : the first of "sqp" from a result, where that is not as near as it looks.
         most : iterations of "sqp", if the options do not say how many.
-        watch, on_path : as of `solve_sqp`, of the interior-point method.
+        watch, path : as of `solve_sqp`, of the interior-point method.
         """
         left, y, z = self.left, None, None
         if isinstance(start, SolverResult):
@@ -153,8 +152,6 @@ class Budget:
             settings.setdefault("max_iterations", most)
         if barrier is not None and z is not None:
             settings.setdefault("barrier_warm", barrier)
-        if on_path:
-            settings |= {"barrier_warm": barrier, "push": _PUSH_ON_PATH}
         if left is not None:
             settings["time_limit"] = max(left, 1e-9)
         return solve_sqp(
@@ -165,7 +162,7 @@ class Budget:
             multipliers=y,
             bound_multipliers=z,
             watch=watch if self.interior else None,
-            on_path=on_path,
+            path=path,
         )
 
 

@@ -359,7 +359,7 @@ def test_constraints_enter_before_bodies_can_touch(free: Solution, barred: Solut
     part = watch.limit(x, step, 1.0)
     assert 0 < part < 1
     there = x + part * step
-    assert watch.lacks(there, 1e-2) and watch.barrier == 1e-2
+    assert watch.lacks(there)
     assert deepest(t, there, margins)[0] <= 0 < deepest(t, free.result.x, margins)[0]
     rows = watch.rows()
-    assert bar in {row.other for row in rows} and not watch.lacks(there, 1e-2)
+    assert bar in {row.other for row in rows} and not watch.lacks(there)

@@ -36,7 +36,7 @@ class InteriorRun(Run):
         super().__init__(task)
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
         self._search, self._phase = LineSearch(task.watch), ElasticPhase(self.options)
-        self._watch, self._on_path = task.watch, task.on_path
+        self._watch, self._path = task.watch, task.path
 
     def iterate(self) -> Status:
         self.point = self.program.point(self.point.x)
@@ -82,10 +82,10 @@ class InteriorRun(Run):
             self.y,
             self.z,
             warm=self._warm,
-            on_path=self._on_path,
+            path=self._path,
             determined=self._determined,
         )
-        self.point = self._problem.point
+        self.point, self._path = self._problem.point, None
         self._phase.begin()
         self._search.forget()
 
@@ -135,7 +135,10 @@ class InteriorRun(Run):
         """Whether the program lacks constraints at the iterate."""
         if self._watch is None or self._problem.elastic is not None:
             return False
-        return self._watch.lacks(self.point.x, self._problem.mu)
+        if not self._watch.lacks(self.point.x):
+            return False
+        self._watch.leave(self._problem.path())
+        return True
 
     def _advance(self, residual: Vector) -> str | Status:
         """Move to the next point; what to note about it, or why there is none."""

@@ -12,13 +12,27 @@ from impactopt.solvers.sqp.point import TimedProgram
 from impactopt.solvers.sqp.report import Report
 
 
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Where a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds (n,), what has
+    none its own value. NaN: of a row that is new.
+    """
+
+    barrier: float
+    rows: Vector
+    bounds: Vector
+
+
 class Watch(Protocol):
     """One who knows more of a program than it says: constraints that it will need, once iterates come near
     to what they forbid.
     """
 
-    def lacks(self, x: Vector, barrier: float) -> bool:
-        """Whether an iterate (n,) at a barrier asks for constraints that the program has not."""
+    def lacks(self, x: Vector) -> bool:
+        """Whether an iterate (n,) asks for constraints that the program has not."""
+
+    def leave(self, path: Path) -> None:
+        """Where the solve is left for that."""
 
     def limit(self, x: Vector, step: Vector, most: float) -> float:
         """The part of a step (n,) from an iterate (n,), ``most`` at most, that may be taken."""
@@ -28,7 +42,7 @@ class Watch(Protocol):
 class Task:
     """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
 
-    watch, on_path : as of `solve_sqp`.
+    watch, path : as of `solve_sqp`.
     """
 
     program: NonlinearProgram
@@ -38,7 +52,7 @@ class Task:
     y: Vector
     z: Vector
     watch: Watch | None = None
-    on_path: bool = False
+    path: Path | None = None
 
 
 class Run(ABC):

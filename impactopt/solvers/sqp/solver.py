@@ -10,7 +10,7 @@ from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, 
 from impactopt.solvers.sqp.interior import InteriorRun
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.reduced import ReducedRun
-from impactopt.solvers.sqp.run import Run, Task, Watch
+from impactopt.solvers.sqp.run import Path, Run, Task, Watch
 from impactopt.solvers.sqp.sl1qp import Sl1QPRun
 from impactopt.solvers.threads import threads
 
@@ -24,7 +24,7 @@ def solve_sqp(
     multipliers: npt.ArrayLike | None = None,
     bound_multipliers: npt.ArrayLike | None = None,
     watch: Watch | None = None,
-    on_path: bool = False,
+    path: Path | None = None,
 ) -> SolverResult:
     """Solve a nonlinear program by sequential quadratic programming.
 
@@ -37,8 +37,7 @@ def solve_sqp(
     multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
     watch : of the interior-point method; asked at every iterate whether the program lacks constraints there,
         which ends the solve with the status `ACCEPTABLE`, and before every step how far it may go.
-    on_path : whether the multipliers are those of an iterate at the barrier ``barrier_warm``, as of a solve
-        that was left: then it goes on as that would have.
+    path : where a solve was left that x0 and the multipliers are of: it goes on as that would have.
 
     Returns
     -------
@@ -65,7 +64,7 @@ def solve_sqp(
         y=y,
         z=z,
         watch=watch,
-        on_path=on_path,
+        path=path,
     )
     interior = options.qp_solver == "interior"
     determined = getattr(program, "determined", ())

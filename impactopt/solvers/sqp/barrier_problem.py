@@ -112,7 +112,8 @@ class BarrierProblem:
         self._unequal, self._level = np.flatnonzero(lower < upper), lower[c.equal]
         push = options.push if path is None else _PUSH
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
-        self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu)
+        kept = path is not None
+        self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu, kept=kept)
         x = x.copy()
         x[c.free] = self.x.values
         self.point = point = point if np.array_equal(x, point.x) else p.point(x)
@@ -133,6 +134,7 @@ class BarrierProblem:
             push=push,
             multipliers=self.y[rows],
             mu=self.mu,
+            kept=kept,
         )
         if not warm:
             for values in (self.x, self.s):

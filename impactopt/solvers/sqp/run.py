@@ -14,8 +14,8 @@ from impactopt.solvers.sqp.report import Report
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Where a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds (n,), what has
-    none its own value. NaN: of a row that is new.
+    """Where a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds (n,), what
+    has none its own value. NaN: of a row that is new.
     """
 
     barrier: float

@@ -17,6 +17,7 @@ __all__ = [
     "InputError",
     "Mistakes",
     "NoCompilerWarning",
+    "NotSolvedWarning",
     "check_array",
     "did_you_mean",
     "missing_package",
@@ -71,6 +72,10 @@ class NoCompilerWarning(UserWarning):
 
 class CacheWarning(UserWarning):
     """The on-disk cache of compiled functions cannot be used."""
+
+
+class NotSolvedWarning(UserWarning):
+    """A result that is no solution: its numbers are those of the best iterate, which is no plan."""
 
 
 def did_you_mean(name: str, options: Iterable[str]) -> str:

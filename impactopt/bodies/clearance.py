@@ -16,7 +16,7 @@ from impactopt.bodies.fit import Planes
 from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
 from impactopt.bodies.separation import Shapes
-from impactopt.bodies.world import WorldBody
+from impactopt.bodies.world import BEHIND, WorldBody
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
 
@@ -24,7 +24,6 @@ __all__ = ["Bodies", "Near", "Places", "Survey", "Touch"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-GROUND = 0  # its place in the world
 MISSED = 3  # phase in which there is no target
 FAR = 1.0  # [m] no clearance beyond this is asked for
 _REQUEST = coal.DistanceRequest()
@@ -155,16 +154,17 @@ class Bodies:
         for w, body in enumerate(world):
             for j in self.links.joints:
                 rooted = j in standing or (not robot.floating and robot.model.parents[j] == 0)
-                on_ground = body.name == "ground" and rooted
+                on_ground = body.ground and rooted
                 mine = j in striking
-                if on_ground or (mine and body.strikable) or (body.core and not mine):
+                core = mine and not self._strikes_from_inside(j)
+                if on_ground or (mine and body.strikable) or (body.core and not core):
                     continue
-                if strict and w and self.exact(at, 0, (j, -1 - w)) < 0:
+                if strict and not body.ground and self.exact(at, 0, (j, -1 - w)) < 0:
                     raise InputError(
                         f"at the start the link {self.links.name(j)!r} is in the body {body.name!r}: start "
                         "from another posture, or move the body or make it smaller"
                     )
-                if not w and self.exact(at, 0, (j, -1)) <= 0:
+                if body.ground and self.exact(at, 0, (j, -1 - w)) <= 0:
                     self.touching.append((self.links.name(j), body.name))
                     continue
                 self.world_pairs.append((j, w))
@@ -173,6 +173,20 @@ class Bodies:
     def shapes(self) -> Shapes:
         """Of all pairs that are not to touch, for smooth distances."""
         return Shapes(self)
+
+    def _strikes_from_inside(self, joint: int) -> bool:
+        """Whether a link's body surrounds its strikers by more than a target's core is behind the face.
+
+        Such a body, as a box of inertia about a point mass, meets the core however it strikes.
+        """
+        frames, depths = self.robot.model.frames, []
+        for striker in self.robot.strikers.values():
+            frame = frames[self.robot.model.getFrameId(striker.model_frame)]
+            if frame.parentJoint == joint:
+                depths.append(
+                    max(piece.depth(frame.placement.translation) for piece in self.links.of_joint[joint])
+                )
+        return bool(depths) and min(depths) > BEHIND
 
     # ------------------------------------------------------------------ by spheres and planes
     @cached_property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.solids import Solid
 
-__all__ = ["find_mesh", "read_mesh"]
+__all__ = ["find_mesh", "lack_of", "read_mesh"]
 
 Array = NDArray[np.float64]
+_POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 def find_mesh(name: str, urdf: Path) -> Path:
@@ -52,15 +54,53 @@ def _package_folders() -> Iterator[Path]:
         yield from (share, share / "example-robot-data" / "robots")
 
 
+def lack_of(name: str, urdf: Path) -> str:
+    """Why a URDF's mesh is no body, as of `find_mesh`; "" if it is one."""
+    try:
+        path = find_mesh(name, urdf)
+        return _lack(path, path.stat().st_mtime_ns)
+    except (OSError, ValueError):
+        return "is not found"
+
+
+@cache
+def _lack(path: Path, _changed: int) -> str:
+    try:
+        read_mesh(path, np.ones(3))
+    except (ValueError, RuntimeError, OSError) as error:
+        return f"cannot be read: {error}"
+    return ""
+
+
 def read_mesh(path: Path, scale: Array) -> Solid:
-    """The triangles of a mesh file: STL, or another kind that coal reads, such as Collada and OBJ."""
+    """The triangles of a mesh file: STL, or another kind that coal reads, such as Collada and OBJ.
+
+    Raises
+    ------
+    ValueError, RuntimeError, OSError : it cannot be read, or there are no triangles in it.
+    """
+    solid = _read(path, scale)
+    if not len(solid.triangles):
+        raise ValueError("there are no triangles in it")
+    if not np.isfinite(solid.vertices).all():
+        raise ValueError("it has corners that are nowhere")
+    return solid
+
+
+def _read(path: Path, scale: Array) -> Solid:
     data = path.read_bytes()
+    if data.startswith(_POINTER):
+        raise ValueError("it is a pointer to large-file storage; get the file itself by `git lfs pull`")
     count = int.from_bytes(data[80:84], "little")
     if path.suffix.lower() == ".stl" and len(data) == 84 + 50 * count:  # binary; coal takes seconds for it
         facets = np.frombuffer(data, offset=84, dtype=[("at", "<f4", (4, 3)), ("attribute", "<u2")])
         vertices = facets["at"][:, 1:].reshape(-1, 3).astype(float)
         return Solid(vertices=scale * vertices, triangles=np.arange(3 * count).reshape(-1, 3))
-    mesh = coal.MeshLoader().load(str(path), scale)
+    try:
+        mesh = coal.MeshLoader().load(str(path), scale)
+    except (ValueError, RuntimeError) as error:  # the reader's own words come after the file's name
+        said = str(error).partition(str(path))[2].strip().splitlines()
+        raise ValueError(said[0].rstrip(".") if said else "no reader of meshes takes it") from error
     corners = [mesh.tri_indices(k) for k in range(mesh.num_tris)]
     return Solid(
         vertices=np.array(mesh.vertices()), triangles=np.array([[t[0], t[1], t[2]] for t in corners])

@@ -48,6 +48,14 @@ class Piece:
         """The hull as coal has it."""
         return convex(self.vertices, self.triangles)
 
+    def depth(self, point: Array) -> float:
+        """Distance [m] of a point (3,) inside the hull to its surface; < 0 outside."""
+        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
+        out = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(out, axis=1)
+        flat = lengths <= 1e-12  # [m2] a facet without area has no normal
+        return float(np.min((((a - point) * out).sum(axis=1) / np.where(flat, 1.0, lengths))[~flat]))
+
 
 def convex(vertices: Array, triangles: NDArray[np.intp]) -> Any:
     """A coal.Convex of a hull."""

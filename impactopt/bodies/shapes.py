@@ -27,9 +27,10 @@ TARGET_SHAPES = ("box", "ball", "none")
 class TargetBody(Described):
     """The target's shape; the hit point is the middle of its face.
 
-    All of the robot but the striking point keeps off it. By default it is a box of 18 cm for a free mass, a
-    wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, or a nail of 7 cm in a block of 20 x 20 x
-    6 cm. `size` is that of the box, the board or the nail's block.
+    All of the robot but the striking point keeps off it. Without a size it is assumed, and results say so: a
+    box of 18 cm for a free mass, a wall of 1.5 x 1.5 m, a board of 30 x 24 x 2 cm on two supports, or a nail
+    of 7 cm in a block of 20 x 20 x 6 cm. `size` is that of the box, the board or the nail's block. With the
+    shape "none" there is nothing to keep off.
     """
 
     shape: str | None = field(
@@ -132,6 +133,22 @@ class Obstacle(Described):
         about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
         about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
         return np.asarray(about_z @ about_y @ about_x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground(Described):
+    """The floor below a robot on a fixed base, which nothing of the robot may touch.
+
+    Left out: there is none. A robot on soles stands on the ground z = 0.
+    """
+
+    height: float = field(
+        default=0.0, metadata=about("height of the floor, in the frame of the robot's root link", unit="m")
+    )
+
+    def __post_init__(self) -> None:
+        height = check_array("Ground.height [m]", self.height, (), most=FARTHEST)
+        object.__setattr__(self, "height", float(height))
 
 
 def face_axes(normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.solids import Solid, box
 from impactopt.bodies.world import WorldBody
 
@@ -59,8 +58,8 @@ def surroundings_of(world: Sequence[WorldBody]) -> list[Part]:
     far as the blow has moved the middle, so that it bends a little, and opens when it is broken.
     """
     parts: list[Part] = []
-    for n, body in enumerate(world):
-        if n == GROUND or body.core:
+    for body in world:
+        if body.ground or body.core:
             continue
         supports = [b for b in world if b.of_target and not (b.moves or b.core)] if body.before else []
         if supports:

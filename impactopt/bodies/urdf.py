@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impactopt.bodies.meshes import find_mesh, read_mesh
+from impactopt.bodies.meshes import find_mesh, lack_of, read_mesh
 from impactopt.bodies.solids import Solid, box, cylinder, sphere
 from impactopt.errors import FARTHEST
 
@@ -63,19 +63,18 @@ def shapes_of(model: Any, root: ElementTree.Element, urdf: Path, kind: str) -> I
                 yield LinkShape(link=name, joint=int(frame.parentJoint), solid=moved, element=element)
 
 
-def lost_meshes(model: Any, root: ElementTree.Element, urdf: Path) -> dict[int, list[str]]:
-    """By the joint that moves their link, the names of meshes that are nowhere."""
-    lost: dict[int, list[str]] = {}
+def lost_meshes(model: Any, root: ElementTree.Element, urdf: Path) -> dict[int, dict[str, str]]:
+    """By the joint that moves their link, the names of meshes that are nowhere or unreadable, and why."""
+    lost: dict[int, dict[str, str]] = {}
     for link in root.findall("link"):
         name = link.get("name", "")
         if not model.existFrame(name, pin.FrameType.BODY):
             continue
         frame = model.frames[model.getFrameId(name, pin.FrameType.BODY)]
         for mesh in link.iterfind("*/geometry/mesh"):
-            try:
-                find_mesh(mesh.get("filename", ""), urdf)
-            except (OSError, ValueError):
-                lost.setdefault(int(frame.parentJoint), []).append(mesh.get("filename", ""))
+            file = mesh.get("filename", "")
+            if lack := lack_of(file, urdf):
+                lost.setdefault(int(frame.parentJoint), {})[file] = lack
     return lost
 
 

@@ -16,7 +16,7 @@ from impactopt.bodies.solids import Solid, capsule
 from impactopt.bodies.solids import box as cuboid
 from impactopt.contact.targets import Board, Nail, RigidWall, Target
 
-__all__ = ["BEHIND", "WorldBody", "ground", "obstacle_bodies", "target_bodies"]
+__all__ = ["BEHIND", "WorldBody", "ground_body", "obstacle_bodies", "target_bodies"]
 
 Array = NDArray[np.float64]
 BEHIND = 0.08  # [m] behind its face a target is its core, which the striker has not to reach before contact
@@ -26,6 +26,12 @@ FLOOR, THICK = 10.0, 0.5  # [m] half sides of the ground
 BOX, WALL, BOARD, BLOCK = (0.18, 0.18, 0.18), (1.5, 1.5, 0.1), (0.30, 0.24, 0.02), (0.2, 0.2, 0.06)
 SUPPORT = (0.04, 0.24, 0.12)  # under either end of a board
 NAIL_LENGTH, NAIL_RADIUS = 0.07, 0.004
+# by the target's kind: in a word, and its sides; of others a box
+USUAL: dict[type[Target], tuple[str, tuple[float, ...]]] = {
+    RigidWall: ("wall", WALL),
+    Board: ("board on two supports", BOARD),
+    Nail: ("nail in a block", BLOCK),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,7 +41,7 @@ class WorldBody:
     half zero: a sphere; only its last number not zero: a capsule along its z axis.
     of_target : it comes and goes with the target.  moves : with it, along the normal.
     strikable : the link that strikes may touch it.  before : it is there until contact only.
-    core : of the target, which the striker is to reach from its face.
+    core : of the target, which the striker is to reach from its face.  ground : it is the floor.
     """
 
     name: str
@@ -48,6 +54,7 @@ class WorldBody:
     strikable: bool = False
     before: bool = False
     core: bool = False
+    ground: bool = False
 
     @cached_property
     def planes(self) -> Planes:
@@ -69,14 +76,34 @@ class WorldBody:
         return own.moved(self.rotation, self.place)
 
 
-def ground() -> WorldBody:
-    """The half-space below z = 0, as a large box."""
+def ground_body(height: float) -> WorldBody:
+    """The half-space below a height [m], as a large box."""
     return WorldBody(
         name="ground",
         half=np.array([FLOOR, FLOOR, THICK]),
-        place=np.array([0.0, 0.0, -THICK]),
+        place=np.array([0.0, 0.0, height - THICK]),
         rotation=np.eye(3),
+        ground=True,
     )
+
+
+def _usual(body: TargetBody, target: Target) -> tuple[str, tuple[float, ...]]:
+    """What a target looks like where the problem gives no size: in a word, and its sides [m]."""
+    if body.shape == "ball":
+        return "ball", BOX[:1]
+    for kind, usual in USUAL.items():
+        if isinstance(target, kind):
+            return usual
+    return "box", BOX
+
+
+def told_body(body: TargetBody, target: Target) -> str:
+    """The target's body in words, with its size, and whether that was assumed."""
+    if body.shape == "none":
+        return "none: nothing keeps off it"
+    word, size = _usual(body, target)
+    sides = " x ".join(f"{100 * side:.3g}" for side in body.size or size)
+    return f"{'assumed: ' if body.size is None else ''}{word}, {sides} cm"
 
 
 def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array) -> list[WorldBody]:
@@ -96,20 +123,19 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
     if body.shape == "none":
         return []
     moves = not isinstance(target, RigidWall)
-    size = body.size
+    size = body.size or _usual(body, target)[1]
     if body.shape == "ball":
-        radius = (size or BOX)[0] / 2
+        radius = size[0] / 2
         return [solid("target", np.zeros(3), radius, radius=radius, moves=moves, strikable=True)]
     if isinstance(target, Nail):
         out = max(NAIL_LENGTH - target.depth, 0.0)
-        block = box("target's block", size or BLOCK, out, strikable=True)
+        block = box("target's block", size, out, strikable=True)
         if out < 2 * NAIL_RADIUS:
             return [block]
         half = np.array([0.0, 0.0, out / 2 - NAIL_RADIUS])
         shank = solid("target", half, out / 2, radius=NAIL_RADIUS, moves=True, strikable=True)
         return [shank, block]
     if isinstance(target, Board):
-        size = size or BOARD
         across = (size[0] - SUPPORT[0]) / 2
         post = (SUPPORT[0], size[1], SUPPORT[2])
         supports = [
@@ -117,8 +143,6 @@ def target_bodies(body: TargetBody, target: Target, point: Array, normal: Array)
         ]  # what held the board stays when it is broken
         main = box("target", size, moves=True, strikable=True, before=True)
         return [main, *supports, _core(box, size)]
-    usual = WALL if isinstance(target, RigidWall) else BOX
-    size = size or usual
     return [box("target", size, moves=moves, strikable=True), _core(box, size)]
 
 

@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main", "program"]
 
-WORTH_REPLAYING = 1e-2  # a plan whose rows are off by more is no motion
-
 app = typer.Typer(
     name="impactopt",
     help="Impact motions of humanoid robots: planned by the impulse they deliver, checked in full dynamics.",
@@ -136,10 +134,11 @@ def solve(
 ) -> None:
     """Plan the motion that a problem asks for, replay it in full dynamics, write numbers and pictures.
 
-    Ctrl-C stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if there is a
-    good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
+    Ctrl-C, or SIGTERM, stops the solver; its best iterate is kept. What is not solved goes to DIR/failed if
+    there is a good result in DIR. Exit code: 0 solved, 1 not solved, 2 bad input.
     """
-    with plain_errors("interrupted before there was a plan to keep", verbose=verbose) as console:
+    said = "interrupted before there was a plan to keep"
+    with plain_errors(said, verbose=verbose, keeps=True) as console:
         from impactopt.files.output import make_directory
         from impactopt.files.problem_file import parse_settings, read_problem_file
         from impactopt.files.solved import SolvedFolder
@@ -165,8 +164,8 @@ def solve(
                 kept.keep(solution, read)
                 progress.say(f"started from {near}" if near else f"no plan in {store} is near enough")
             progress.say(f"after {solution.result.iterations} iterations: {solution.status.message}")
-            if solution.rattle is not None:
-                progress.say(str(solution.rattle))
+            if solution.caution:
+                progress.say(solution.caution)
             record = _record(solution, read, validate, progress)
             record.summary["command"] = command_line(context)
             if baseline:
@@ -251,11 +250,15 @@ def _record(solution: Solution, read: ProblemFile, validate: bool, progress: Sol
     from impactopt.errors import InputError
     from impactopt.files.output import record_of
     from impactopt.files.replay import has_mujoco
+    from impactopt.planning.multistart import VIOLATED
+    from impactopt.solvers.program import Status
 
     done, violation = {}, solution.result.max_violation
     engines = {"pinocchio": "in full dynamics", "mujoco": "on free soles"}
-    if validate and not violation <= WORTH_REPLAYING:
-        progress.say(f"no replay: rows of the plan are off by up to {violation:.2g}")
+    if validate and solution.status is Status.INTERRUPTED:
+        progress.say("no replay of what was interrupted; `impactopt validate` does it")
+    elif validate and not violation <= VIOLATED:
+        progress.say(f"no replay: what meets its constraints only to {violation:.2g} is no plan")
     elif validate:
         for engine, how in engines.items():
             if engine == "mujoco" and not has_mujoco():

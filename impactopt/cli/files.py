@@ -12,6 +12,7 @@ from impactopt.cli.options import ProblemPath, Settings, Verbose, complete_probl
 from impactopt.report.plain_errors import BAD_INPUT, plain_errors
 
 if TYPE_CHECKING:
+    from impactopt.problem.problem import ImpactProblem
     from impactopt.robots.robot import Robot
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -28,13 +29,15 @@ def check(
     with plain_errors("interrupted", verbose=verbose):
         from impactopt.errors import InputError, Mistakes, printable
         from impactopt.files.problem_file import parse_settings, read_problem_file
-        from impactopt.problem.doubts import doubts, hopeless
+        from impactopt.problem.doubts import hopeless, too_weak
+        from impactopt.problem.plausibility import doubts
 
         try:
             problem = read_problem_file(file, parse_settings(settings or ())).build()
             found = Mistakes()
             found.found += hopeless(problem)
             found.raise_if_any(str(file))
+            doubtful = [text for text in (too_weak(problem), *doubts(problem.robot)) if text]
         except InputError as error:
             if not as_json:
                 raise
@@ -44,31 +47,54 @@ def check(
             raise typer.Exit(BAD_INPUT) from None
         if as_json:
             told = {"sound": True, "file": str(file), "hash": problem.hash, "problem": problem.describe()}
-            typer.echo(json.dumps(told | {"doubts": doubts(problem.robot)}, indent=2))
+            typer.echo(json.dumps(told | {"doubts": doubtful}, indent=2))
             return
         typer.echo(printable(f"{file} is sound:"))
         plain = {"target": _with_units(problem.target), "law": _with_units(problem.law)}
         for name, value in (problem.describe() | plain).items():
-            for text in value if name == "inertias" else [_in_words(value)]:
+            for text in value if name in ("inertias", "notes") else [_in_words(value)]:
                 typer.echo(printable(f"  {name:<10} {text}"))
         if lost := _lost_meshes(problem.robot):
             typer.echo(printable(f"  {'meshes':<10} {lost}"))
-        for doubt in doubts(problem.robot):
+        if strength := _strength(problem):
+            typer.echo(printable(f"  {'strength':<10} {strength}"))
+        for doubt in doubtful:
             typer.echo(printable(f"  {'doubt':<10} {doubt}"))
 
 
+def _strength(problem: ImpactProblem) -> str:
+    """What share of the hardest blow nearby this one is, by estimates; "" where that is not known."""
+    from impactopt.problem.strength import best_share
+
+    found = best_share(problem)
+    if found is None:
+        return ""
+    share, best = found
+    where = f"point_m = {best.point.round(2).tolist()}, normal = {best.normal.tolist()}"
+    return f"{100 * share:.0f} % of the hardest blow nearby, by a rough estimate; that one: {where}"
+
+
 def _lost_meshes(robot: Robot) -> str:
-    """Which meshes of a robot are nowhere, and what that means; "" if all are there."""
+    """Which meshes of a robot are nowhere or unreadable, and what that means; "" if all are there."""
     from impactopt.bodies.urdf import lost_meshes, urdf_root
 
     root = None if robot.urdf is None else urdf_root(Path(robot.urdf))
     found = {} if root is None or robot.urdf is None else lost_meshes(robot.model, root, Path(robot.urdf))
-    names = sorted({name for several in found.values() for name in several})
-    if not names:
+    lacks = dict(sorted(pair for several in found.values() for pair in several.items()))
+    if not lacks:
         return ""
+    kinds = {lack: [name for name, other in lacks.items() if other == lack] for lack in lacks.values()}
+    each = (
+        f"{names[0]}{f' and {len(names) - 1} more' * (len(names) > 1)} {lack}"
+        for lack, names in kinds.items()
+    )
+    where = (
+        "; put them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
+        if "is not found" in kinds
+        else ""
+    )
     return (
-        f"{len(names)} are not found, such as {names[0]}: boxes of inertia stand for links without any; put "
-        "them into a folder above the URDF, or name the folder of their package in ROS_PACKAGE_PATH"
+        f"{len(lacks)} are lost, and boxes of inertia stand for links without any: {'; '.join(each)}{where}"
     )
 
 
@@ -108,6 +134,9 @@ def new(
     reference: Annotated[
         bool, typer.Option("--reference", help="Print all sections and keys instead, as Markdown.")
     ] = False,
+    bolted: Annotated[
+        bool, typer.Option("--bolted", help="Draft it bolted to the ground, even if it has legs.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Print a problem file to start from, with a comment to each key; without a name, list the problems.
@@ -119,12 +148,14 @@ def new(
     with plain_errors("interrupted"):
         if sum(x is not None for x in (name, urdf, mjcf)) + reference > 1:
             raise typer.BadParameter("give one of NAME, --urdf, --mjcf and --reference")
+        if bolted and urdf is None and mjcf is None:
+            raise typer.BadParameter("it is for a draft: give --urdf or --mjcf", param_hint="--bolted")
         if reference:
             from impactopt.files.problem_file.reference import reference as page
 
             _give(page(), out)
         elif urdf is not None or mjcf is not None:
-            _draft(str(mjcf if urdf is None else urdf), urdf is None, out)
+            _draft(str(mjcf if urdf is None else urdf), urdf is None, bolted, out)
         elif name is not None:
             from impactopt.files.problem_file.template import problem_template
 
@@ -135,14 +166,14 @@ def new(
             problems(as_json)
 
 
-def _draft(given: str, mjcf: bool, out: Path | None) -> None:
+def _draft(given: str, mjcf: bool, bolted: bool, out: Path | None) -> None:
     from impactopt.errors import printable
     from impactopt.files.draft.description import find_description
     from impactopt.files.draft.drafting import draft_problem
 
     path = Path(given) if mjcf else find_description(given)
     folder = Path() if out is None else out.parent
-    draft = draft_problem(path, folder=folder, mjcf=mjcf)
+    draft = draft_problem(path, folder=folder, mjcf=mjcf, bolted=bolted)
     _give(draft.text, out)
     for line in draft.said:
         typer.echo(printable(line), err=True)

@@ -80,8 +80,8 @@ def strike(
                 **chosen,
             )
             progress.say(f"best of {len(solution.attempts)} starts: {solution.status.message}")
-            if solution.rattle is not None:
-                progress.say(str(solution.rattle))
+            if solution.caution:
+                progress.say(solution.caution)
         record = record_of_strike(solution, problem=read.text, problem_path=read.path)
         record.summary["command"] = command_line(context)
         written = [] if directory is None else keep_record(record, directory)

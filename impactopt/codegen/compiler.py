@@ -43,14 +43,15 @@ class Compiler:
         """Text that differs whenever a library made here could differ or not run."""
         return "\0".join([ca.__version__, *self.command, self.version, *_FLAGS, platform.machine(), _cpu()])
 
-    def run(self, source: Path, library: Path, level: str) -> None:
-        """Compile `source` into the shared `library` at an optimization level such as "-O1", or flags.
+    def run(self, source: Path, library: Path, level: str, *more: Path) -> None:
+        """Compile `source`, and `more`, into the shared `library` at an optimization level such as "-O1", or
+        flags.
 
         Raises
         ------
         CompileError : with the compiler's first error.
         """
-        _compile(self, source, library, level, _LONGEST)
+        _compile(self, source, library, level, _LONGEST, *more)
 
 
 def find_compiler() -> Compiler | None:
@@ -110,10 +111,13 @@ def _trouble(compiler: Compiler) -> str:
         return str(error)
 
 
-def _compile(compiler: Compiler, source: Path, library: Path, level: str, patience: float) -> None:
+def _compile(
+    compiler: Compiler, source: Path, library: Path, level: str, patience: float, *more: Path
+) -> None:
     """As `Compiler.run`, in no more than `patience` [s]."""
     program = shlex.join(compiler.command)
-    command = [*compiler.command, *level.split(), *_FLAGS, str(source), "-o", str(library), "-lm"]
+    sources = [str(path) for path in (source, *more)]
+    command = [*compiler.command, *level.split(), *_FLAGS, *sources, "-o", str(library), "-lm"]
     try:
         code, said = _run(command, patience)
     except subprocess.TimeoutExpired:

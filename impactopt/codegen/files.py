@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import secrets
 import stat
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["is_plain_file", "open_own", "read_plain", "write_atomically"]
+__all__ = ["is_plain_file", "open_own", "read_archive", "read_plain", "write_atomically"]
 
 _NONBLOCK = getattr(os, "O_NONBLOCK", 0)  # a pipe without a writer, or a reader, would wait for one
 
@@ -73,9 +75,36 @@ def read_plain(path: str | os.PathLike[str], most: int) -> bytes:
     except ValueError:  # of a null byte
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), os.fspath(path)) from None
     with os.fdopen(handle, "rb") as file:
-        content = file.read(most + 1)
+        # not at once: `read` takes memory for as much as it is asked for
+        content = file.read(min(os.fstat(handle).st_size, most) + 1)
+        content += file.read(most + 1 - len(content)) if len(content) <= most and file.peek(1) else b""
     if len(content) > most:
         raise OSError(errno.EFBIG, f"larger than {most / 2**20:g} MiB", os.fspath(path))
+    return content
+
+
+def read_archive(path: str | os.PathLike[str], most: int, arrays: int) -> io.BytesIO:
+    """The content of an npz file, known to be small before NumPy unpacks it.
+
+    most : bytes of the file, and of all that is in it unpacked.  arrays : at most so many, each with a name
+    of its own.
+
+    Raises
+    ------
+    OSError : as of `read_plain`.
+    ValueError : it is larger when it is unpacked, or has more arrays, or two of the same name.
+    zipfile.BadZipFile : it is no archive.
+    """
+    # from memory: np.load leaves a damaged file open
+    content = io.BytesIO(read_plain(path, most))
+    with zipfile.ZipFile(content) as archive:
+        entries = archive.infolist()
+    names = {entry.filename for entry in entries}
+    if len(entries) > arrays or len(names) < len(entries):
+        raise ValueError(f"{len(entries)} arrays, or two of the same name")
+    if sum(entry.file_size for entry in entries) > most:
+        raise ValueError(f"larger than {most / 2**20:g} MiB when it is unpacked")
+    content.seek(0)
     return content
 
 

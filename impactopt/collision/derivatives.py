@@ -15,7 +15,7 @@ quaternions, and cosines and sines, unit ones first, so that it does not change 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.codegen.library import NativeCode
 from impactopt.collision.native import native_differences, native_gradient, native_jacobian
 from impactopt.collision.native.sizes import directions, shapes_out
 from impactopt.collision.native.source import least_size
@@ -32,7 +33,7 @@ from impactopt.collision.stepped import SteppedModel
 from impactopt.errors import InputError
 from impactopt.robots.rigid_body import RigidBody
 
-__all__ = ["differentiable"]
+__all__ = ["CollisionFunction", "Part", "differentiable", "in_order", "native_part", "with_jacobian"]
 
 Array = NDArray[np.float64]
 Compile = Callable[[str, tuple[Any, ...], Callable[[], Any]], Any]
@@ -46,12 +47,26 @@ _OF_TANGENTS = 1e-9
 
 
 @dataclass(frozen=True)
-class _Part:
+class Part:
     """A compiled function of derivatives, and what it gives: (output, input) pairs."""
 
     name: str
     outputs: tuple[str, ...]
     by: tuple[str, ...]
+
+
+class CollisionFunction(ca.Function):
+    """A ca.Function that says how it is taken to another process, where CasADi would say so too late."""
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise InputError(
+            "a collision's function cannot be saved, pickled or turned into C by itself: its derivatives are "
+            "compiled when they are first needed. The model's `export` makes a library with all of them, and "
+            "its C; ca.external loads it in any process"
+        )
+
+    save = serialize = generate = export_code = generate_dependencies = _refuse
+    __getstate__ = __reduce__ = __deepcopy__ = _refuse
 
 
 def differentiable(
@@ -61,7 +76,7 @@ def differentiable(
     by: tuple[str, ...] | None,
     every: int,
     compiled: Compile,
-) -> Any:
+) -> CollisionFunction:
     """ca.Function of q, v[, feedforward] and the settings in `parameters`, with derivatives.
 
     Parameters
@@ -72,9 +87,37 @@ def differentiable(
     every : keep every so many steps of the histories.
     compiled : (name, what, build) -> the compiled function of these, as `SymbolicModel._compiled`.
     """
-    outputs = tuple(whole.name_out())
+
+    def late(part: Part) -> tuple[Any, Mapping[str, Any]]:
+        function = _late(model, whole, part, every, compiled)
+        return function, function.sizes
+
+    value, jacobian = with_jacobian(model, whole, parameters, by, late)
+    own = {"custom_jacobian": jacobian, "jac_penalty": 0, "never_inline": True}
+    own |= {"enable_forward": False, "enable_reverse": False}
+    moving = value.name_in() if by is None else by
+    own |= {"is_diff_in": [name in moving for name in value.name_in()]}
+    inputs = [ca.MX.sym(name, *value.size_in(name)) for name in value.name_in()]
+    found = value.call(inputs, True, False)
+    return CollisionFunction(ca.Function(whole.name(), inputs, found, value.name_in(), value.name_out(), own))
+
+
+def with_jacobian(
+    model: SteppedModel,
+    whole: Any,
+    parameters: tuple[str, ...],
+    by: tuple[str, ...] | None,
+    derivatives: Callable[[Part], tuple[Any, Mapping[str, Any]]],
+    name: str = "",
+) -> tuple[Any, Any]:
+    """(ca.Function of q, v[, feedforward] and the parameters; its Jacobian's blocks, in CasADi's own form).
+
+    derivatives : of a part, the function that gives it, and what its inputs are divided by, by name.
+    name : of the first; the other's has jac_ before it.
+    """
+    name, outputs = name or whole.name(), tuple(whole.name_out())
     inputs = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
-    kept = {name: x for name, x in inputs.items() if name not in model.settings or name in parameters}
+    kept = in_order(inputs, model.settings, parameters)
     moving = tuple(kept) if by is None else by
     if unknown := [name for name in moving if name not in kept]:
         raise InputError(f"by {unknown[0]!r}: no input of this function; it has {', '.join(kept)}")
@@ -84,12 +127,11 @@ def differentiable(
 
     blocks: dict[tuple[str, str], Any] = {}
     for part in _parts(model, outputs, moving):
-        function = _late(model, whole, part, every, compiled)
-        found = function.call(
-            [ca.rdivide(values[name], ca.DM(size)) for name, size in function.sizes.items()]
-        )
-        pairs = product(part.outputs, part.by)
-        blocks |= {pair: block for pair, block in zip(pairs, found, strict=True) if pair[1] in moving}
+        function, sizes = derivatives(part)
+        found = function.call([ca.rdivide(values[name], ca.DM(size)) for name, size in sizes.items()])
+        named = dict(zip(function.name_out(), found, strict=True))
+        pairs = [pair for pair in product(part.outputs, part.by) if pair[1] in moving]
+        blocks |= {(output, given): named[f"{output}_by_{given}"] for output, given in pairs}
     to_q = to_tangent(inputs["q"])
     jacobians: dict[str, Any] = {}
     for output, given in product(outputs, kept):
@@ -98,18 +140,21 @@ def differentiable(
         jacobians[f"jac_{output}_{given}"] = ca.mtimes(block, to_q) if is_q else block
     results = {f"out_{name}": ca.MX.sym(f"out_{name}", whole.sparsity_out(name)) for name in outputs}
     given = {**kept, **results}
-    jacobian = ca.Function(
-        f"jac_{whole.name()}", [*given.values()], [*jacobians.values()], [*given], [*jacobians]
-    )
-    own = {"custom_jacobian": jacobian, "jac_penalty": 0, "never_inline": True}
-    own |= {"enable_forward": False, "enable_reverse": False}
-    own |= {"is_diff_in": [name in moving for name in kept]}
-    return ca.Function(
-        whole.name(), [*kept.values()], whole.call([*values.values()]), [*kept], [*outputs], own
-    )
+    jacobian = ca.Function(f"jac_{name}", [*given.values()], [*jacobians.values()], [*given], [*jacobians])
+    value = ca.Function(name, [*kept.values()], whole.call([*values.values()]), [*kept], [*outputs])
+    return value, jacobian
 
 
-def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> list[_Part]:
+def in_order(
+    inputs: Mapping[str, Any], settings: Mapping[str, Any], parameters: Sequence[str]
+) -> dict[str, Any]:
+    """Those of the inputs that are no settings, and then the parameters in the order they are named in."""
+    return {name: x for name, x in inputs.items() if name not in settings} | {
+        name: inputs[name] for name in parameters
+    }
+
+
+def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> list[Part]:
     """What gives which derivatives by these inputs; of `separated` they are zero."""
     outputs = tuple(name for name in outputs if name != "separated")
     refrozen, name = model.n_freezes > 0, ""
@@ -125,12 +170,9 @@ def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...
         name, by = "collision_jacobian", tuple(x for x in _TANGENTS if x in inputs)
     else:
         carried = by = ()
-    rest = tuple(x for x in inputs if x not in by)
-    parts = [
-        _Part(name, carried, by),
-        _Part("collision_differences", carried, rest),
-        _Part("collision_differences", tuple(x for x in outputs if x not in carried), inputs),
-    ]
+    others = tuple(x for x in outputs if x not in carried)
+    rest = inputs if others else tuple(x for x in inputs if x not in by)
+    parts = [Part("collision_differences", outputs if rest else others, rest), Part(name, carried, by)]
     return [part for part in parts if part.outputs and part.by]
 
 
@@ -140,7 +182,7 @@ def _parts(model: SteppedModel, outputs: tuple[str, ...], inputs: tuple[str, ...
 _KEPT: dict[Any, _Late] = {}
 
 
-def _late(model: SteppedModel, whole: Any, part: _Part, every: int, compiled: Compile) -> _Late:
+def _late(model: SteppedModel, whole: Any, part: Part, every: int, compiled: Compile) -> _Late:
     key: Any = (model._recipe, part, every)
     try:
         found = _KEPT.get(key)
@@ -158,7 +200,7 @@ class _Late(ca.Callback):
     which second derivatives come, suit all of them.
     """
 
-    def __init__(self, model: SteppedModel, whole: Any, part: _Part, every: int, compiled: Compile) -> None:
+    def __init__(self, model: SteppedModel, whole: Any, part: Part, every: int, compiled: Compile) -> None:
         ca.Callback.__init__(self)
         self._in = [(name, whole.size_in(name)) for name in whole.name_in()]
         seeds, shapes = directions(model), shapes_out(model, part.outputs, every)
@@ -221,18 +263,22 @@ class _Late(ca.Callback):
         return 0
 
 
-def _compiled(model: SteppedModel, part: _Part, every: int, compiled: Compile) -> Any:
+def _compiled(model: SteppedModel, part: Part, every: int, compiled: Compile) -> Any:
+    return compiled(part.name, *native_part(model, part, every))
+
+
+def native_part(
+    model: SteppedModel, part: Part, every: int
+) -> tuple[tuple[Any, ...], Callable[[], NativeCode]]:
+    """(what a part's code depends on besides the model, what makes it)."""
     if part.name == "collision_gradient":
-        return compiled(part.name, part.outputs, lambda: native_gradient(model, *part.outputs))
+        return part.outputs, lambda: native_gradient(model, *part.outputs)
     if part.name == "collision_jacobian":
         tight = replace(model, tolerance=min(model.tolerance, _OF_TANGENTS))
         what = (*part.outputs, every, tight.tolerance)
-        return compiled(part.name, what, lambda: native_jacobian(tight, part.outputs, every=every))
-    return compiled(
-        part.name,
-        (part.outputs, part.by, every),
-        lambda: native_differences(model, part.outputs, part.by, every=every),
-    )
+        return what, lambda: native_jacobian(tight, part.outputs, every=every)
+    what = (part.outputs, part.by, every)
+    return what, lambda: native_differences(model, part.outputs, part.by, every=every)
 
 
 def _size(model: SteppedModel, name: str) -> Array:

@@ -126,7 +126,7 @@ def _left_out(collision: SteppedModel, outputs: tuple[str, ...]) -> dict[str, st
         }
     wanted = {*outputs}
     if not held_by.soles(robot):
-        out["wrenches and ZMP"] = "the base is fixed"
+        out["wrenches and ZMP"] = "nothing holds the robot" if robot.floating else "the base is fixed"
     elif not wanted & {*OF_SOLES}:
         out["wrenches and ZMP"] = "not asked for"
     elif not wanted & {"ground_wrench", "zmp"}:

@@ -161,15 +161,17 @@ class _Run:
             joint_rate = self.velocity + u
             sign = np.clip(joint_rate / self.model.transition, -1.0, 1.0)
             net = torque - (self.viscous * joint_rate + self.coulomb * sign)
-        return _Instant(
-            u=u,
-            demand=demand,
-            free=torque == demand,
-            net=net,
-            rate=rate,
-            compressing=rate > 0.0,
-            contact=rate > 0.0 or self.law.left(depth, rate) > 0.0,
-        )
+        compressing = rate > 0.0 or (rate == 0.0 and self._closing(y, depth, net))
+        contact = compressing or self.law.left(depth, rate) > 0.0
+        return _Instant(u, demand, torque == demand, net, rate, compressing, contact)
+
+    def _closing(self, y: Array, depth: float, net: Array) -> bool:
+        """Whether hand and target, which neither approach nor part, are about to approach."""
+        slope, parts, z = np.zeros(y.size), self.parts, y[self.parts["target"]]
+        slope[parts["torque"]], slope[parts["time"]] = net, 1.0
+        force = slope[parts["impulse"]] = max(self.law.force(depth, 0.0, False)[0], 0.0)
+        gained = self.law.velocity(z + 1e-9 * self.law.rates(z, force)) - self.law.velocity(z)
+        return bool(self.rows.speeds[-1] @ slope > gained / 1e-9)
 
     def mobility(self, y: Array, now: _Instant) -> tuple[float, float, float, float]:
         """(of hand and target together [1/kg]; force and its slopes)."""
@@ -287,8 +289,10 @@ class _Run:
         if self.slides:
             falling += _levels(speeds, self.velocity, np.full(self.model.n, self.model.transition))
         for b in self.switch_terms(s).T @ _HULL:
-            side = b[0] if b[0] != 0.0 else b[1]
-            falling.append(-b if side < 0.0 else b)
+            if b[0] != 0.0:
+                falling.append(-b if b[0] < 0.0 else b)
+            elif b.any():  # a tie: the target goes by the piece of zero, which may not be the next
+                places.append(0.0)
         places += [first_negative(b) for b in falling]
         return min((place for place in places if place is not None and place < end), default=None)
 

@@ -86,7 +86,7 @@ class _StrikingGraphs:
         rb = self.rb
         bias = ca.Function("bias", [rb.q, rb.v], [rb.rnea(rb.v, None), self._held])
         b, J_c = bias(state[: self.nq], state[self.nq :])
-        of_base, of_joints = b[: self.base], b[self.base :]
+        of_base, of_joints = b[: self.base, :], b[self.base :, :]
         if not self.held:
             return ca.Function("holding", [state, none], [_column(of_joints)])
         J_b, J_j = J_c[:, : self.base], J_c[:, self.base :]

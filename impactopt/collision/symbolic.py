@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -14,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.codegen.cache import cached
 from impactopt.collision.batch import Batch
 from impactopt.collision.checks import breaks, check_course, check_finite, left_out_by_breaking
-from impactopt.collision.derivatives import differentiable
+from impactopt.collision.derivatives import differentiable, in_order
 from impactopt.collision.describe import Description, describe
+from impactopt.collision.export import export
 from impactopt.collision.freezing import FREEZE_ERROR, freeze_error
 from impactopt.collision.graph import collision_graph, target_start
 from impactopt.collision.native import native_collision, native_gradient, native_jacobian
@@ -64,9 +66,11 @@ class SymbolicModel(SteppedModel):
         """The collision as a compiled ca.Function of what it needs, to the outputs asked for.
 
         Inputs: q (nq), v (nv), Pinocchio's; feedforward (n) [N m] with effects.feedforward; then the settings
-        that `parameters` name (any of `settings`); the others are fixed. What no output needs is left out.
+        that `parameters` name (any of `settings`), in their order; the others are fixed. What no output needs
+        is left out.
         If an input is NaN, or what holds the robot cannot be told apart at q, all outputs are NaN,
-        `separated` too.
+        `separated` too. So are they if the contact has not ended at the horizon, unless `separated` or
+        `duration` are among them, which tell it: then they are what happened so far.
 
         CasADi can differentiate it with respect to all inputs (jacobian, forward, reverse), and twice by
         differences. The code for this is compiled when it is first evaluated. A single scalar output has an
@@ -80,16 +84,45 @@ class SymbolicModel(SteppedModel):
         ----------
         outputs : names out of `impactopt.collision.OUTPUTS`, which says what they are; histories have a
             column an instant, and repeat the last one after separation.
-        parameters : settings that are inputs.
+        parameters : settings that are inputs, in this order.
         by : inputs to differentiate with respect to; None: all. Derivatives by others are zero, and cost
             nothing.
         every : histories keep each so many-th instant, and the last.
+
+        The function cannot be saved or pickled; `export` makes a library of it.
         """
         self._check_outputs(outputs, every)
         self._check_parameters(parameters)
         return differentiable(
             self, self._collision(tuple(outputs), every), parameters, by, every, self._compiled
         )
+
+    def export(
+        self,
+        folder: Path | str,
+        outputs: tuple[str, ...] = ("impulse",),
+        *,
+        parameters: tuple[str, ...] = (),
+        by: tuple[str, ...] | None = None,
+        every: int = 1,
+        name: str = "blow",
+    ) -> Path:
+        """A library with what `function` gives, and its first derivatives, for other processes; its path.
+
+        ``ca.external("blow", str(path))`` loads it anywhere, without this package. Beside the library the
+        folder has its C, `<name>.c`, `<name>.h` and `<name>_collision*.c`, for CPUs of another kind:
+        ``cc -O3 -fPIC -shared blow*.c -o blow.so -lm``. Parameters are as of `function`. All derivatives are
+        compiled at once, from seconds for an arm to a minute for a humanoid.
+
+        Raises
+        ------
+        InputError : as of `function`; a name that is none in C, or taken; no compiler; a folder that cannot
+            be written.
+        """
+        self._check_outputs(outputs, every)
+        self._check_parameters(parameters)
+        whole = self._collision(tuple(outputs), every)
+        return export(self, whole, parameters, by, every, self._compiled, Path(folder), name)
 
     def _collision(self, outputs: tuple[str, ...], every: int = 1) -> Any:
         """With all settings as inputs, in C written by hand where there is a compiler."""
@@ -221,7 +254,7 @@ class SymbolicModel(SteppedModel):
     def _with_parameters(self, whole: Any, parameters: tuple[str, ...]) -> Any:
         self._check_parameters(parameters)
         inputs = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
-        kept = {name: x for name, x in inputs.items() if name not in self.settings or name in parameters}
+        kept = in_order(inputs, self.settings, parameters)
         values = [kept.get(name, self.settings.get(name)) for name in inputs]
         return ca.Function(
             whole.name(), list(kept.values()), whole.call(values), list(kept), whole.name_out()

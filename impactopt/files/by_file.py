@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from impactopt.errors import InputError
+from impactopt.errors import InputError, NotSolvedWarning
 from impactopt.files.problem_file import read_problem_file
 from impactopt.planning import nail_driving, planner, strike
+from impactopt.planning.solution import Solved
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["drive_nail", "optimize_strike", "solve"]
@@ -25,6 +27,10 @@ _ABOUT = """
         comes with the package (`impactopt problems`), whose [solver] section then holds where nothing else is
         given.
     report : where it is None, its lines go to the logger "impactopt", with level INFO.
+
+    Warns
+    -----
+    NotSolvedWarning : the result is no solution; it is of the best iterate.
 """
 
 
@@ -34,7 +40,7 @@ def _or_file(run: Callable[..., R]) -> Callable[..., R]:
         if options.get("report") is None:
             options["report"] = _log.info
         if isinstance(problem, ImpactProblem):
-            return run(problem, *args, **options)
+            return _told(run(problem, *args, **options))
         if not isinstance(problem, (str, os.PathLike)):
             raise InputError(
                 f"problem: a {type(problem).__name__} is none; give an ImpactProblem, the path of a problem "
@@ -42,10 +48,22 @@ def _or_file(run: Callable[..., R]) -> Callable[..., R]:
             )
         read = read_problem_file(problem)
         chosen = read.solver.arguments(options.get("solver"), options.get("time_limit"))
-        return run(read.build(), *args, **(chosen | {k: v for k, v in options.items() if v is not None}))
+        given = {k: v for k, v in options.items() if v is not None}
+        return _told(run(read.build(), *args, **(chosen | given)))
 
     of_either.__doc__ = (run.__doc__ or "").rstrip() + _ABOUT
     return of_either
+
+
+def _told(found: R) -> R:
+    """A warning with a result that is no solution: its numbers look like those of one."""
+    if isinstance(found, Solved) and not found.status.usable:
+        warnings.warn(
+            f"not solved, so its numbers are those of no plan: {found.result.message}",
+            NotSolvedWarning,
+            stacklevel=3,
+        )
+    return found
 
 
 solve = _or_file(planner.solve)

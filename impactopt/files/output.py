@@ -8,7 +8,6 @@ old ones, what was made of those goes first: whenever a process ends, all files 
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import tokenize
@@ -22,7 +21,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.codegen.files import read_plain, write_atomically
+from impactopt.codegen.files import read_archive, write_atomically
 from impactopt.errors import InputError
 from impactopt.files.problem_file.changes import change_data
 from impactopt.files.problem_file.describing import comment_at
@@ -308,18 +307,6 @@ def write_file(
         raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _check_archive(content: IO[bytes]) -> None:
-    """ValueError for an archive that is larger unpacked than any of ours, or has two arrays of one name."""
-    with zipfile.ZipFile(content) as archive:
-        entries = archive.infolist()
-    names = {entry.filename for entry in entries}
-    if len(entries) > MOST_ARRAYS or len(names) < len(entries):
-        raise ValueError(f"{len(entries)} arrays, or two of the same name")
-    if sum(entry.file_size for entry in entries) > LARGEST:
-        raise ValueError(f"larger than {LARGEST / 2**20:g} MiB when it is unpacked")
-    content.seek(0)
-
-
 def load_record(directory: str | os.PathLike[str]) -> Record:
     """The record that `save_record` left in a directory; its `solution.npz` can be named too.
 
@@ -331,10 +318,7 @@ def load_record(directory: str | os.PathLike[str]) -> Record:
     path = path if path.name == NUMBERS and not os.path.isdir(path) else path / NUMBERS
     mend = "solve again with `impactopt solve`"
     try:
-        # from memory: np.load leaves a damaged file open
-        content = io.BytesIO(read_plain(path, LARGEST))
-        _check_archive(content)
-        with np.load(content, allow_pickle=False) as file:
+        with np.load(read_archive(path, LARGEST, MOST_ARRAYS), allow_pickle=False) as file:
             version = int(file["format"])
             if version > FORMAT:
                 raise InputError(f"{path} is of a newer impactopt (format {version}); update impactopt")

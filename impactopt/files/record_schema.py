@@ -23,6 +23,7 @@ _REFERENCE = {
     **_MOTION,
     **dict.fromkeys(("v", "a"), "k nv"),
     **{"phase": "k", "torque": "k n", "ground": "k 6", "contact_start": "", "contact_end": "", "end": ""},
+    "sole_wrench": "? k w",
 }
 _HISTORIES = {
     **dict.fromkeys(("force", "target_speed", "hand_speed"), "k"),
@@ -82,7 +83,7 @@ _BODIES: dict[str, _Kinds] = {
 }
 _REPLAYS_NUMBERS = (
     *("impulse_error_pct?", "step_error_pct?", "saturated_ms?", "final_posture_error_rad?"),
-    *("min_normal_force_N?", "sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
+    *("sole_slip_mm?", "sole_lift_mm?", "sole_lift_collision_mm?"),
 )
 _LOADS: dict[str, _Kinds] = {
     **dict.fromkeys(("gear_ratio?", "motor_ratio?", "power_W?", "velocity_jump_rad_s?"), _NUMBER),
@@ -93,6 +94,11 @@ _LOADS: dict[str, _Kinds] = {
     "motor_cut_joint?": (str, type(None)),
     "motor_cuts?": ([_CUT],),
 }
+_SOLES: dict[str, _Kinds] = {
+    **dict.fromkeys(("sole_cop_margin_mm?", "sole_force_N?"), ({"*": _PHASES}, type(None))),
+    "sole_cop_margin_asked_mm?": _PHASES,
+    "sole_force_asked_N?": _NUMBER,
+}
 _ANY_REPLAY: dict[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
@@ -100,7 +106,7 @@ _ANY_REPLAY: dict[str, _Kinds] = {
     **dict.fromkeys(_REPLAYS_NUMBERS, _NUMBER),
     **dict.fromkeys(("engine?", "reason?", "error?"), _TEXT),
     "standing?": _YES,
-    "sole_cop_margin_m?": (*_PHASES, type(None)),
+    **_SOLES,
 }
 _SIMULATED = {**_ANY_REPLAY, "torque_ratio?": _PHASES, "zmp_margin_m?": _PHASES}
 _REPLAYED = {
@@ -116,7 +122,9 @@ _START = {
     **dict.fromkeys(("objective?", "max_violation?"), _NUMBER),
 }
 _PROBLEM = {
-    **dict.fromkeys(("name?", "robot?", "striker?", "target?", "law?", "hash?", "collision?"), _TEXT),
+    **dict.fromkeys(
+        ("name?", "robot?", "striker?", "target?", "target_body?", "law?", "hash?", "collision?"), _TEXT
+    ),
     **dict.fromkeys(("point_m?", "normal?"), ([(int, float)],)),
     **dict.fromkeys(("scenarios?", "objectives?", "off?", "gains?"), ([_TEXT],)),
 }
@@ -140,6 +148,7 @@ _KEYS: Mapping[str, _Kinds] = {
 _OTHERS: Mapping[str, _Kinds] = {
     **_BLOW,
     **_BODIES,
+    **_SOLES,
     **_LOADS,
     **dict.fromkeys(("objectives?", "posture_rad?", "velocity_rad_s?"), _NUMBERS),
     **dict.fromkeys(("torque_ratio?", "zmp_margin_m?"), _PHASES),
@@ -147,6 +156,7 @@ _OTHERS: Mapping[str, _Kinds] = {
         (
             "duration_s?",
             "collision_error_pct?",
+            "contact_replay_pct?",
             "nodes_added?",
             "motion_price_pct?",
             "capture_margin_m?",

@@ -99,7 +99,8 @@ def load_planned(
 
 
 def _trajectory(record: Record, prefix: str) -> Trajectory:
-    given = {f.name: record.arrays[f"{prefix}_{f.name}"] for f in dataclasses.fields(Trajectory)}
+    named = {f.name: f"{prefix}_{f.name}" for f in dataclasses.fields(Trajectory)}
+    given = {name: record.arrays[key] for name, key in named.items() if key in record.arrays}
     fields: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in given.items()}
     return Trajectory(**fields)
 
@@ -170,8 +171,9 @@ def replay(
 ) -> Replay:
     """Follow the plan's reference in an engine; "mujoco" lets the robot slip, lift its soles and fall.
 
-    perturbation : where the world differs from what was planned ("mujoco" only).  controller : "servo",
-        or "wbc" ("mujoco" only).  options : of the engine, such as ``step`` [s].
+    perturbation : where the world differs from what was planned ("mujoco"; with "pinocchio" the target may
+        be missing, no more).  controller : "servo", or "wbc" ("mujoco" only).  options : of the engine, such
+        as ``step`` [s].
 
     Raises
     ------
@@ -179,10 +181,11 @@ def replay(
         leave more than 1 % of its impulse uncertain.
     """
     world = perturbation if perturbation is not None else Perturbation()
-    if world != Perturbation():
+    if engine == "pinocchio" and world == Perturbation(missing=True):
+        options["missing"] = True
+    elif world != Perturbation():
         options["perturbation"] = world
-    if engine == "mujoco" and planned.missed is not None:
-        options["missed"] = planned.missed
+    options["missed"] = planned.missed
     options["controller"] = controller_of(controller, planned.controller)
     problem = planned.problem
     simulation = simulate(problem, planned.reference, engine=engine, **options)

@@ -16,6 +16,9 @@ __all__ = ["Blow", "find_blows", "noise_of"]
 Array = NDArray[np.float64]
 _LEAST, _SMALL = 0.1, 0.2  # of the largest force: what counts as contact, and as a blow of its own
 _SAMPLES = 8  # in contact, at least
+# a top is flat where so many samples in a row are within these shares of the noise and of the peak; unless it
+# is quantized: the top of a parabola falls by 3 steps over half its length beyond either end
+_FLAT, _ALIKE, _EQUAL, _STEPS = 4, 0.1, 1e-6, 6.0
 _BEFORE, _AFTER = 0.5, 0.25  # of the contact's duration: what is looked at before the touch and after the end
 # beyond these, units are doubted
 _LONGEST, _FASTEST, _LIGHTEST, _HEAVIEST = 1.0, 50.0, 1e-3, 1e4  # s, m/s, kg, kg
@@ -25,14 +28,16 @@ _LONGEST, _FASTEST, _LIGHTEST, _HEAVIEST = 1.0, 50.0, 1e-3, 1e4  # s, m/s, kg, k
 class Blow:
     """One contact: samples (k,) of time [s], force [N] and motion, and what is plain to see of it.
 
-    motion : speed [m/s], or travel [m].  travels : which of them.  touch : index of the first sample in
-    contact.  duration [s], speed [m/s] at contact, mass [kg]: first estimates.  model_mass [kg]: by the
-    robot's model, at the touch; nan where it is not known.
+    motion : speed [m/s], or travel [m].  travels : which of them.  clipped (k,) : samples whose force was
+    beyond the sensor's range.  touch : index of the first sample in contact.  duration [s], speed [m/s] at
+    contact, mass [kg]: first estimates.  model_mass [kg]: by the robot's model, at the touch; nan where it
+    is not known.
     """
 
     time: Array
     force: Array
     motion: Array
+    clipped: NDArray[np.bool_]
     travels: bool
     touch: int
     duration: float
@@ -44,6 +49,19 @@ class Blow:
     def peak(self) -> float:
         """[N]"""
         return float(self.force.max())
+
+
+def _clipped(force: Array) -> NDArray[np.bool_]:
+    """Samples (k,) of a log at which its force is cut off: at its largest, if that has a flat top."""
+    top = float(force.max())
+    at_top = force >= top - max(_ALIKE * noise_of(force), _EQUAL * top)
+    step = float(np.diff(np.unique(force)).min(initial=np.inf))
+    for begin, end in np.flatnonzero(np.diff(np.concatenate([[0], at_top, [0]]))).reshape(-1, 2):
+        beyond = (end - begin) // 2
+        sides = [force[k] for k in (begin - 1 - beyond, end + beyond) if 0 <= k < len(force)]
+        if end - begin >= _FLAT and top - max(sides, default=-np.inf) > _STEPS * step:
+            return at_top
+    return np.zeros(len(force), dtype=bool)
 
 
 def noise_of(values: Array) -> float:
@@ -75,7 +93,8 @@ def find_blows(log: ImpactLog) -> tuple[Blow, ...]:
         raise InputError(f"{name}: no contact: {FORCE} is at most {peak:.4g} N, which its noise is too")
     spans = _spans(log.force, max(_LEAST * peak, 4.5 * noise))
     spans = [span for span in spans if log.force[slice(*span)].max() > _SMALL * peak]
-    return tuple(_blow(log, span, spans, noise) for span in spans)
+    clipped = _clipped(log.force)
+    return tuple(_blow(log, span, spans, noise, clipped) for span in spans)
 
 
 def _spans(force: Array, least: float) -> list[tuple[int, int]]:
@@ -92,7 +111,13 @@ def _spans(force: Array, least: float) -> list[tuple[int, int]]:
     return spans
 
 
-def _blow(log: ImpactLog, span: tuple[int, int], spans: list[tuple[int, int]], noise: float) -> Blow:
+def _blow(
+    log: ImpactLog,
+    span: tuple[int, int],
+    spans: list[tuple[int, int]],
+    noise: float,
+    clipped: NDArray[np.bool_],
+) -> Blow:
     (begin, end), t, f, name = span, log.time, log.force, log.name
     quiet = max(2 * noise, 1e-3 * float(f[begin:end].max()))
     before = max((e for _, e in spans if e <= begin), default=0)
@@ -143,6 +168,7 @@ def _blow(log: ImpactLog, span: tuple[int, int], spans: list[tuple[int, int]], n
         time=t[low:high],
         force=f[low:high],
         motion=motion[low:high],
+        clipped=clipped[low:high],
         travels=log.speed is None,
         touch=begin - low,
         duration=duration,

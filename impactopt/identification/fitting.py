@@ -100,13 +100,17 @@ class _Fit:
             motion = begin + speed * t - course.carried_at(t) / mass
         else:
             motion = speed - course.impulse_at(t) / mass
-        return np.concatenate([course.force_at(t) / self.weights.force, motion / self.weights.motion])
+        force = np.where(blow.clipped, 0.0, course.force_at(t))
+        return np.concatenate([force / self.weights.force, motion / self.weights.motion])
 
     def _speed(self, k: int, z: Array) -> float:
         return float(z[self.of_blow(k)][0] * self.blows[k].speed)
 
     def measured(self) -> Array:
-        both = [(b.force / self.weights.force, b.motion / self.weights.motion) for b in self.blows]
+        both = [
+            (np.where(b.clipped, 0.0, b.force) / self.weights.force, b.motion / self.weights.motion)
+            for b in self.blows
+        ]
         return np.concatenate([part for pair in both for part in pair])
 
     def residuals(self, z: Array) -> Array:
@@ -166,7 +170,7 @@ class _Fit:
         blow, speed = self.blows[k], self._speed(k, z)
         t = blow.time - self._touch(k, z)
         out = np.zeros((2 * len(t), self.own - 1))
-        out[: len(t), 0] = -course.slope_at(t) / self.weights.force
+        out[: len(t), 0] = np.where(blow.clipped, 0.0, -course.slope_at(t) / self.weights.force)
         moves = -speed + course.impulse_at(t) / mass if blow.travels else course.force_at(t) / mass
         out[len(t) :, 0] = moves / self.weights.motion
         out[:, 0] *= blow.duration
@@ -251,11 +255,11 @@ def _alone(fit: _Fit) -> tuple[Array, tuple[float, float]]:
 
 # ---------------------------------------------------------------- what is told
 def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
-    """What is left of force [N] and motion [m/s] or [m], all blows."""
+    """What is left of force [N], but of clipped samples, and of motion [m/s] or [m], all blows."""
     force, motion, begin = [], [], 0
     for blow in fit.blows:
         n = len(blow.time)
-        force.append(residuals[begin : begin + n] * fit.weights.force)
+        force.append(residuals[begin : begin + n][~blow.clipped] * fit.weights.force)
         motion.append(residuals[begin + n : begin + 2 * n] * fit.weights.motion)
         begin += 2 * n
     return np.concatenate(force), np.concatenate(motion)
@@ -263,7 +267,7 @@ def _parts(fit: _Fit, residuals: Array) -> tuple[Array, Array]:
 
 def _correlation(fit: _Fit, force: Array) -> float:
     """Of what is left of the force at neighbouring samples."""
-    ends = np.cumsum([len(blow.time) for blow in fit.blows])[:-1]
+    ends = np.cumsum([np.sum(~blow.clipped) for blow in fit.blows])[:-1]
     together = sum(float(r[1:] @ r[:-1]) for r in np.split(force, ends))
     return together / max(float(force @ force), 1e-300)
 
@@ -274,7 +278,8 @@ def _rms(x: Array) -> float:
 
 def _weights_left(fit: _Fit, z: Array) -> _Weights:
     force, motion = _parts(fit, fit.residuals(z))
-    spread = np.sqrt(2 * len(force) / max(2 * len(force) - len(z), 1))
+    n = len(force) + len(motion)
+    spread = np.sqrt(n / max(n - len(z), 1))
     least = [_first_weights(blow) for blow in fit.blows]
     clean = _CLEAN * max(blow.peak for blow in fit.blows)
     return _Weights(
@@ -286,8 +291,8 @@ def _weights_left(fit: _Fit, z: Array) -> _Weights:
 def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
     residuals, jacobian = fit.residuals(z), fit.jacobian(z)
     force, motion = _parts(fit, residuals)
-    n, p = len(force), len(z)
-    spread = _standard_errors(jacobian) * float(student.ppf(0.5 + level / 2, max(2 * n - p, 1)))
+    n, m, p = len(force), len(motion), len(z)
+    spread = _standard_errors(jacobian) * float(student.ppf(0.5 + level / 2, max(n + m - p, 1)))
     estimates = {}
     for each, at, off in zip(fit.free, z, spread, strict=False):
         low, high = (float(each.number(np.asarray(at + side * off))) for side in (-1, 1))
@@ -301,6 +306,7 @@ def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
     numbers = {name: each.value for name, each in estimates.items() if name != MASS}
     peak = max(blow.peak for blow in fit.blows)
     floor = (_CLEAN * peak, fit.weights.motion * 1e-6)
+    left = 2 * n * np.log(max(_rms(force), floor[0])) + 2 * m * np.log(max(_rms(motion), floor[1]))
     return LawFit(
         law=type(law)(**{**law.parameters, **numbers}),
         estimates=estimates,
@@ -311,7 +317,7 @@ def _told(law: ContactLaw, fit: _Fit, z: Array, level: float) -> LawFit:
         force_left_pct=100 * _rms(force) / peak,
         motion_left=_rms(motion),
         correlation=_correlation(fit, force),
-        aic=2 * n * (np.log(max(_rms(force), floor[0])) + np.log(max(_rms(motion), floor[1]))) + 2 * p,
+        aic=left + 2 * p,
     )
 
 

@@ -35,8 +35,9 @@ def identify(
     For each law, the collision of the hand, as a mass, with the target is fitted to force and motion of all
     blows together by least squares: `VirtualMass` with unknown numbers, an unknown mass, and for each blow an
     unknown speed and instant of touch. Intervals are those of the linearized fit with white noise, whose size
-    on force and motion follows from what is left. The hand's drives do not act in the model: that is right
-    for short blows. Exponents are held at their values.
+    on force and motion follows from what is left. Samples on flat tops, where the sensor's range has cut
+    the force off, are left out. The hand's drives do not act in the model: that is right for short blows.
+    Exponents are held at their values.
 
     Parameters
     ----------
@@ -67,6 +68,8 @@ def identify(
         log=measured.name,
         fits=tuple(sorted(fits, key=lambda fit: fit.aic)),
         samples=sum(len(blow.time) for blow in blows),
+        clipped=tuple(int(blow.clipped.sum()) for blow in blows),
+        top=max(blow.peak for blow in blows),
         level=level,
         target_mass=float(target_mass),
         model_mass=tuple(blow.model_mass for blow in blows),

@@ -125,8 +125,8 @@ class Identification:
     """Contact laws fitted to a log: `fits`, the best first.
 
     log : its name.  samples : that were fitted.  level : of the intervals.  target_mass [kg] : infinite for
-    one that stays.  model_mass : [kg]
-    of each blow, by the robot's model; nan where it is not known.
+    one that stays.  clipped : of each blow, samples of force that were cut off at the log's largest, `top`
+    [N], and are not fitted.  model_mass : [kg] of each blow, by the robot's model; nan where it is not known.
     """
 
     log: str
@@ -134,6 +134,8 @@ class Identification:
     samples: int
     level: float
     target_mass: float
+    clipped: tuple[int, ...]
+    top: float
     model_mass: tuple[float, ...] = field(default=())
 
     @property
@@ -158,6 +160,12 @@ class Identification:
     def cautions(self) -> tuple[str, ...]:
         """What not to believe, in words."""
         best, out = self.best, []
+        if any(self.clipped):
+            out.append(
+                f"the force is cut off at {self.top:.4g} N: {sum(self.clipped)} samples of "
+                f"{sum(count > 0 for count in self.clipped)} of {len(self.clipped)} blows are left out; "
+                "peak and impulse of the log are too small: log again with a sensor of a larger range"
+            )
         near = [each.name for each in self.fits[1:] if each.aic - best.aic < _TIE]
         if near:
             out.append(f"the log cannot tell {best.name} from {', '.join(near)}; blows at other speeds may")
@@ -187,6 +195,7 @@ class Identification:
             "best": self.best.name,
             "blows": len(self.best.speeds),
             "samples": self.samples,
+            "clipped": list(self.clipped),
             "level": self.level,
             "target_mass_kg": self.target_mass if np.isfinite(self.target_mass) else None,
             "model_mass_kg": [x for x in self.model_mass if np.isfinite(x)],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot, Sole, Striker
 
-__all__ = ["BothSoles", "FixedBase", "OneSole", "Stance", "usual_stance"]
+__all__ = ["BothSoles", "FixedBase", "Free", "OneSole", "Stance", "usual_stance"]
 
 
 class Stance(ABC):
@@ -129,6 +129,18 @@ class FixedBase(Stance):
                 f"robot {robot.name!r} has a free-flyer: stand it on BothSoles() or OneSole(name), "
                 "or build it with floating=False"
             )
+        return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free(Stance):
+    """Nothing holds the robot: it floats freely, as a space robot or one in flight does.
+
+    Its base is moved by the joints' reaction and by the blow. Models of a collision have it; plans do not.
+    """
+
+    def soles(self, robot: Robot) -> tuple[Sole, ...]:
+        _check_floating(robot)
         return ()
 
 

@@ -19,7 +19,7 @@ from impactopt.kinematics.support import margin, support_polygon
 from impactopt.live.drawing import Drawing
 from impactopt.live.motion import Moment
 from impactopt.live.newest import Newest
-from impactopt.live.serving import LOCAL, LivePage, address_of, served
+from impactopt.live.serving import LOCAL, LivePage, served
 from impactopt.problem.problem import ImpactProblem
 
 __all__ = ["Blow", "LiveBlow"]
@@ -67,9 +67,8 @@ class LiveBlow(LivePage):
         self._polygon = support_polygon(problem.robot, c)
         names = ("robot", "striker", "normal", "law", "target", "stance")
         self._model = SDC(**{name: getattr(problem, name) for name in names}, freezes=_FREEZES)
-        self._server = served(host, port)
-        self.address = address_of(self._server, host)
-        self._drawing = Drawing(self._server, problem.robot)
+        self._server, self.address = served(host, port)
+        self._drawing = Drawing(self._server, problem.robot, problem.ground_height)
         self._drawing.normal = problem.normal
         self._drawing.polygon(self._polygon)
         model = problem.robot.model

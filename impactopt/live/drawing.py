@@ -31,13 +31,14 @@ LEVEL = 1e-3  # a normal that is less so has no side
 class Drawing:
     """A robot on a server's scene, and what it hits.
 
-    server : a `viser.ViserServer`.
+    server : a `viser.ViserServer`.  floor : its height [m]; None: there is none.
     """
 
-    def __init__(self, server: Any, robot: Robot) -> None:
+    def __init__(self, server: Any, robot: Robot, floor: float | None) -> None:
         self.scene, self.camera = server.scene, server.initial_camera
         self.scene.set_up_direction("+z")
-        self.scene.add_grid("/ground", width=4.0, height=4.0, cell_size=0.25)
+        if floor is not None:
+            self.scene.add_grid("/ground", width=4.0, height=4.0, cell_size=0.25, position=(0.0, 0.0, floor))
         self.joints: dict[int, Any] = {}
         for k, body in enumerate(bodies_drawn(robot)):
             name = f"/robot/{body.joint}"

@@ -14,7 +14,7 @@ from impactopt.live.drawing import Drawing
 from impactopt.live.motion import moment_of
 from impactopt.live.newest import Newest
 from impactopt.live.replanning import Answer, Replanning
-from impactopt.live.serving import LOCAL, LivePage, address_of, served
+from impactopt.live.serving import LOCAL, LivePage, served
 from impactopt.live.telling import told_failure, told_plan
 from impactopt.live.wishes import Wish, numbers_of, wish_of
 from impactopt.planning.solution import Solution
@@ -50,10 +50,9 @@ class LiveLook(LivePage):
         self.first, self.wish = first, wish_of(first.problem)
         replanning = Replanning(first)
         self.answer = replanning(self.wish, lambda: False)
-        self._server = served(host, port)
-        self.address = address_of(self._server, host)
+        self._server, self.address = served(host, port)
         self._drawn, self._asking = threading.RLock(), threading.RLock()
-        self._drawing = Drawing(self._server, first.problem.robot)
+        self._drawing = Drawing(self._server, first.problem.robot, first.problem.ground_height)
         self._controls()
         track, problem = self._track, first.problem
         middle = float(track.places[0, 1:, 1].mean())

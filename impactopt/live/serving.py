@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
+import http
 import io
+import secrets
 import socket
+from collections.abc import Iterator
 from typing import Any, TypeVar
+from urllib.parse import urlsplit
 
 from impactopt.errors import InputError, missing_package
 from impactopt.live.newest import Newest
 
-__all__ = ["LOCAL", "LivePage", "address_of", "served"]
+__all__ = ["LOCAL", "LivePage", "served"]
 
 LOCAL = "127.0.0.1"
-
-
-def address_of(server: Any, host: str) -> str:
-    """Of its page."""
-    return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
 Page = TypeVar("Page", bound="LivePage")
@@ -51,12 +51,15 @@ def _family(host: str) -> socket.AddressFamily:
     return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
-def served(host: str, port: int) -> Any:
-    """A `viser.ViserServer` there; port 0: one that is free.
+def served(host: str, port: int) -> tuple[Any, str]:
+    """A `viser.ViserServer` there, and the address of its page; port 0: one that is free.
+
+    The address ends in a random token. Without it, and from a page of another origin in the same browser,
+    every request is refused: the page is for those alone who were given its address.
 
     Raises
     ------
-    InputError : viser is missing; host or port cannot be had.
+    InputError : viser is missing, or lets no request be checked; host or port cannot be had.
     """
     try:
         import viser
@@ -70,5 +73,46 @@ def served(host: str, port: int) -> Any:
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
         mend = "give another --port, or none" if taken else "give another host or port"
         raise InputError(f"cannot serve a page at {host}:{port}: {error}; {mend}") from error
-    with contextlib.redirect_stdout(io.StringIO()):  # it has a banner
-        return viser.ViserServer(host=host, port=port, label="impactopt", verbose=False)
+    token = secrets.token_hex(16)
+    with _guarded(token) as guards, contextlib.redirect_stdout(io.StringIO()):  # it has a banner
+        server = viser.ViserServer(host=host, port=port, label="impactopt", verbose=False)
+        if not guards:
+            server.stop()
+            raise InputError(f"viser {viser.__version__} lets no request be checked; install viser 1.1")
+    return server, f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/{token}"
+
+
+@contextlib.contextmanager
+def _guarded(token: str) -> Iterator[list[bool]]:
+    """A context in which websockets' servers check requests before they answer: viser has no such option.
+
+    Yields a list with an item for each server that was made.
+    """
+    import websockets.asyncio.server as library
+
+    usual, made = library.serve, list[bool]()
+
+    def serve(*args: Any, process_request: Any, **more: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            if not _allowed(request, token):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "open the address that was printed\n")
+            path = request.path.replace(f"/{token}", "", 1) or "/"
+            return process_request(connection, dataclasses.replace(request, path=path))
+
+        made.append(True)
+        return usual(*args, process_request=checked, **more)
+
+    library.serve = serve  # type: ignore[assignment,misc]
+    try:
+        yield made
+    finally:
+        library.serve = usual  # type: ignore[misc]
+
+
+def _allowed(request: Any, token: str) -> bool:
+    """Whether a request knows the token, and comes from no page of another origin."""
+    first = request.path.partition("?")[0].lstrip("/").partition("/")[0]
+    if not secrets.compare_digest(first.encode(), token.encode()):
+        return False
+    origins, hosts = request.headers.get_all("Origin"), request.headers.get_all("Host")
+    return all([urlsplit(origin).netloc] == hosts for origin in origins)

@@ -134,7 +134,7 @@ def _holds(problem: ImpactProblem, there: float, speed: float, nodes: int = 25) 
         y, yd, ydd = _profile(duration, ends, np.linspace(0, duration, nodes)[1:])
         wrench = np.tile(static_wrenches(c, ends[0], legs0), (len(y), 1))
         try:
-            q, v, a, _, _ = complete_reference(problem, y, yd, ydd, wrench, legs0)
+            q, v, a, *_ = complete_reference(problem, y, yd, ydd, wrench, legs0)
         except InputError:  # a leg too short for the base's way
             return False
         joints, rates = q[:, -r.n :], v[:, -r.n :]
@@ -205,7 +205,8 @@ def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory
         )
         legs = c.split(parts[-1][2][-1])[1]
         start += duration
-    time, phases, q, v, a, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(7))
+    columns = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    time, phases, q, v, a, torque, ground, wrench = columns
     hit = float(parts[0][0][-1])
     return Trajectory(
         time=time,
@@ -215,6 +216,7 @@ def _reference(problem: ImpactProblem, there: float, speed: float) -> Trajectory
         a=a,
         torque=torque,
         ground=ground,
+        sole_wrench=wrench,
         contact_start=hit,
         contact_end=hit,
         end=start,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from impactopt.planning.models import model_error
+from impactopt.planning.contact_replay import PlannedContact
+from impactopt.planning.models import planned_contact
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import MoreNodes
-from impactopt.transcription.rattle import held_blow
 from impactopt.transcription.transcription import Transcription, block_functions
 
 __all__ = ["planned_by", "program_of", "program_on"]
@@ -35,15 +35,21 @@ def program_of(solution: Solution) -> Transcription:
     return program_on(s.problem, s.nodes, s.elements, s.shares)
 
 
-def planned_by(t: Transcription, result: SolverResult) -> dict[str, Any]:
-    """Fields of the `Solution` that follow from a program and its result alone."""
-    usable = result.status.usable
+def planned_by(
+    t: Transcription, result: SolverResult, contact: PlannedContact | None = None
+) -> dict[str, Any]:
+    """Fields of the `Solution` that follow from a program and its result alone.
+
+    contact : the planned one, if it is known.
+    """
+    plan = t.decode(result.x) if contact is None else contact.planned
+    if result.status.usable and contact is None:
+        contact = planned_contact(t, result.x, plan)
     return {
-        "plan": t.decode(result.x),
+        "plan": plan,
         "nodes": t.nodes,
         "elements": t.hit.elements if t.hit.guarded else (),
         "shares": t.hit.shares,
         "apart": t.apart_rows,
-        "model_error": model_error(t, result.x) if usable else None,
-        "held_blow": held_blow(t, result.x) if usable else None,
+        "contact": contact,
     }

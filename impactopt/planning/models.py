@@ -18,9 +18,10 @@ from impactopt.collision.frozen_models import frozen_model
 from impactopt.errors import InputError
 from impactopt.kinematics.held import holding_torque
 from impactopt.planning.chosen_gains import with_factors_of
+from impactopt.planning.contact_replay import ModelError, PlannedContact
 from impactopt.planning.multistart import carried
 from impactopt.planning.on_demand import rows_on_demand
-from impactopt.planning.solution import ModelError, Solved
+from impactopt.planning.solution import Solved
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import VelocityLimit
 from impactopt.simulation.cases import errors_against
@@ -28,6 +29,8 @@ from impactopt.simulation.reference.coasting import coasting_reference
 from impactopt.solvers.program import SolverResult
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.guess import fastest
+from impactopt.transcription.plan import Plan
+from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.start import strike_rates
 
 Array = NDArray[np.float64]
@@ -53,6 +56,14 @@ def model_error(t: ContactProgram, x: Array, problem: ImpactProblem | None = Non
     q, v, _ = c.complete_motion(y, t.u0.read(x)[0], np.zeros(c.ny), legs)
     torque = t.feedforward.read(x)[0] * problem.robot.torque_limit
     return _error(problem, q, v, torque, max(sum(t.expected.durations(x)), 1e-2))
+
+
+def planned_contact(
+    t: ContactProgram, x: Array, planned: Plan | PlannedStrike, problem: ImpactProblem | None = None
+) -> PlannedContact:
+    """The contact that a program plans at solver variables (n,); ``problem``: as of `model_error`."""
+    error = model_error(t, x, problem)
+    return PlannedContact(problem=problem or t.problem, planned=planned, model_error=error)
 
 
 def _error(problem: ImpactProblem, q: Array, v: Array, torque: Array, duration: float) -> ModelError | None:

@@ -11,8 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.stopping import Stop
 from impactopt.solvers.ipopt import solve_ipopt
-from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Violation, worst_rows
+from impactopt.solvers.program import (
+    Callback,
+    IterationRecord,
+    NonlinearProgram,
+    SolverResult,
+    Status,
+    Violation,
+    worst_rows,
+)
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
 from impactopt.solvers.sqp.run import Path, Watch
 from impactopt.transcription.start import carried_over
@@ -65,6 +74,8 @@ class Attempt:
 class Budget:
     """A solver with its options, and the time [s] that is left for all that it is given; None: any.
 
+    stop : what Ctrl-C asks.
+
     Raises
     ------
     InputError : an unknown solver; a time that is none; options that the SQP does not have (IPOPT is asked
@@ -76,6 +87,7 @@ class Budget:
     time_limit: float | None
     callback: Callback | None
     since: float = field(default_factory=time.perf_counter)
+    stop: Stop = field(default_factory=Stop)
 
     def __post_init__(self) -> None:
         if self.solver not in SOLVERS:
@@ -100,7 +112,8 @@ class Budget:
             SQPOptions(**self.options)
 
     def started(self) -> Budget:
-        """The same with all its time, which begins now."""
+        """The same with all its time, which begins now; from here on an iterate is kept if it is stopped."""
+        self.stop.armed = True
         return replace(self, since=time.perf_counter())
 
     def near_by(self) -> Budget:
@@ -118,10 +131,17 @@ class Budget:
 
     @property
     def left(self) -> float | None:
-        """[s]"""
+        """[s]; none where it has been stopped."""
+        if self.stop.asked:
+            return 0.0
         if self.time_limit is None:
             return None
         return max(self.time_limit - (time.perf_counter() - self.since), 0.0)
+
+    def _told(self, record: IterationRecord) -> bool:
+        """Whether the solver is to stop after an iteration."""
+        asked = self.callback is not None and self.callback(record) is True
+        return asked or self.stop.asked
 
     def run(
         self,
@@ -140,13 +160,13 @@ class Budget:
         most : iterations of "sqp", if the options do not say how many.
         watch, path : as of `solve_sqp`, of the interior-point method.
         """
-        left, y, z = self.left, None, None
+        left, y, z = None if self.stop.asked else self.left, None, None
         if isinstance(start, SolverResult):
             x0, y, z = start.x, start.multipliers, start.bound_multipliers
         else:
             x0 = start
         if self.solver == "ipopt":
-            return solve_ipopt(program, x0, options=self.options, callback=self.callback, time_limit=left)
+            return solve_ipopt(program, x0, options=self.options, callback=self._told, time_limit=left)
         settings = dict(self.options or {})
         if most is not None:
             settings.setdefault("max_iterations", most)
@@ -158,7 +178,7 @@ class Budget:
             program,
             x0,
             options=SQPOptions(**settings),
-            callback=self.callback,
+            callback=self._told,
             multipliers=y,
             bound_multipliers=z,
             watch=watch if self.interior else None,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
+from impactopt.planning.causes import Cause, search
 from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.keeping_apart import Margins, same_bodies
 from impactopt.planning.made_again import planned_by, program_of
@@ -24,6 +25,7 @@ from impactopt.planning.multistart import (
     attempt_of,
     check_starts,
     drawn,
+    one_after_the_other,
     solve_from,
     violations_of,
 )
@@ -31,10 +33,13 @@ from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_ro
 from impactopt.planning.rounds import Refining
 from impactopt.planning.side_by_side import best_side_by_side, check_workers
 from impactopt.planning.solution import Solution
+from impactopt.planning.stopping import stopping
 from impactopt.planning.strike import clear_strike
-from impactopt.planning.verdict import with_reason
+from impactopt.planning.verdict import lacks_rows, with_reason, with_soles_kept
+from impactopt.planning.window import window_caution
+from impactopt.problem.doubts import hopeless
 from impactopt.problem.problem import ImpactProblem
-from impactopt.solvers.program import Callback, SolverResult, max_violation
+from impactopt.solvers.program import Callback, SolverResult, Status, max_violation
 from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import Elements, Shares
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
@@ -98,21 +103,23 @@ def solve(
         raise InputError(
             f"unknown start {start!r}{near}: give 'reach', 'strike', solver variables (n,) or a Solution"
         )
-    if problem.collision == "auto":
-        common: dict[str, Any] = {"solver": solver, "options": options, "refine": refine}
-        common |= {"workers": workers, "report": report, "callback": callback}
+    with stopping() as stop:
+        budget = replace(budget, stop=stop)
+        if problem.collision == "auto":
+            common: dict[str, Any] = {"solver": solver, "options": options, "refine": refine}
+            common |= {"workers": workers, "report": report, "callback": callback}
 
-        def run(chosen: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
-            if other is not None:
-                return solve(chosen, start=other, time_limit=left, **common)
-            return solve(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
+            def run(chosen: ImpactProblem, other: Solution | None, left: float | None) -> Solution:
+                if other is not None:
+                    return solve(chosen, start=other, time_limit=left, **common)
+                return solve(chosen, start=start, starts=starts, seed=seed, time_limit=left, **common)
 
-        return climbed(problem, run, time_limit=time_limit, report=report)
-    if workers > 1 and starts > 1:
-        block_functions(roomy(problem), problem.coordinates, report)  # compiled here, not by each
-        run_one = partial(_planned, problem, start, 0, seed, refine)
-        return best_side_by_side(run_one, budget, starts=starts, workers=workers, report=report)
-    return _planned(problem, start, _MORE, seed, refine, budget, range(starts), report)
+            return climbed(problem, run, time_limit=time_limit, report=report)
+        if workers > 1 and starts > 1:
+            block_functions(roomy(problem), problem.coordinates, report)  # compiled here, not by each
+            run_one = partial(_planned, problem, start, 0, seed, refine)
+            return best_side_by_side(run_one, budget, starts=starts, workers=workers, report=report)
+        return _planned(problem, start, _MORE, seed, refine, budget, range(starts), report)
 
 
 def _planned(
@@ -159,14 +166,62 @@ def _planned(
     t, fields = solve_from(t, of_start, budget, began, each)
     if margins is None and refine and fields["result"].status.usable:
         t, fields = _on(refining, t, fields)
+    known = hopeless(problem) if lacks_rows(t, fields["result"]) else []
+    causes: tuple[Cause, ...] = ()
+    if not known:
+        t, fields, causes = _explained(t, fields, budget, each, report)
     t, fields = settled(t, fields, budget, report)
-    result = fields["result"] = with_reason(t, fields["result"])
-    return Solution(
+    explained = with_reason(t, fields["result"], causes, known=known)
+    result = fields["result"] = refining.checked(t, explained)
+    solution = Solution(
         contact_error=refining.error(t, result.x) if result.status.usable else None,
         statement=statement_of(t),
-        **planned_by(t, result),
+        window=window_caution(t, result) if result.status.usable else "",
+        causes=tuple(cause for cause in causes if cause.problem is not None),
+        **planned_by(t, result, refining.known_contact(t, result.x)),
         **fields,
     )
+    return with_soles_kept(solution) if refine else solution
+
+
+def _explained(
+    t: Transcription,
+    fields: dict[str, Any],
+    budget: Budget,
+    work: Callable[[Transcription, Array], tuple[Transcription, SolverResult]],
+    report: Callable[[str], None] | None,
+) -> tuple[Transcription, dict[str, Any], tuple[Cause, ...]]:
+    """Where there is no solution: the bounds that keep it from being; or a solution from a point that meets
+    them all, if there is such a point.
+
+    A limit that the caller has set is an answer, and stays one.
+    """
+    old: SolverResult = fields["result"]
+    limited = old.status is Status.ITERATION_LIMIT and "max_iterations" in (budget.options or {})
+    if limited or not lacks_rows(t, old) or budget.left == 0:
+        return t, fields, ()
+    if report is not None:
+        report("no motion meets all bounds: which one would have to move?")
+    found = search(t, old, budget)
+    if found.met is None or budget.left == 0:
+        return t, fields, found.causes
+    if report is not None:
+        report("there is a motion that meets all bounds: on from there")
+    new, result = work(*found.met)
+    if not result.status.usable:
+        return t, fields, ()
+    attempts = [replace(a, kept=False) for a in fields["attempts"]]
+    attempts.append(replace(attempt_of(new, "a motion within all bounds", result), kept=True))
+    rows = new.program.constraints(result.x)
+    fields = fields | {
+        "problem": new.problem,
+        "result": one_after_the_other(old, result),
+        "solve_seconds": fields["solve_seconds"] + result.seconds,
+        "violations": violations_of(new, result.x, rows),
+        "objectives": new.achieved(result.x),
+        "attempts": tuple(attempts),
+    }
+    return new, fields, ()
 
 
 def _meets_rows(t: Transcription, start: SolverResult) -> bool:

@@ -10,13 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError
+from impactopt.planning.contact_replay import AGREED, REFUTED, ContactReplay, PlannedContact, checked
 from impactopt.planning.keeping_apart import Margins, solved_apart
+from impactopt.planning.models import planned_contact
 from impactopt.planning.multistart import Budget, carried, one_after_the_other, touching, with_effort_of
 from impactopt.planning.too_near import Violated, bodies_too_near
 from impactopt.planning.verdict import second_look
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
-from impactopt.transcription.contact_error import ContactError, contact_error, refined_elements
+from impactopt.transcription.contact_error import (
+    ASKED,
+    ContactError,
+    all_halved,
+    contact_error,
+    refined_elements,
+)
 from impactopt.transcription.mesh import Elements, contact_elements
 from impactopt.transcription.mesh_refinement import nodes_to_add
 from impactopt.transcription.start import carried_over, first_iterate
@@ -24,6 +32,7 @@ from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 _BARRIER = 1e-4  # where constraints between bodies are new, which the solution before breaks
+_BARRIER_DEEP = 1e-3  # of a finer contact, where the one before is far off
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
 _NODE_ROUNDS = 3  # with a finer mesh, at most
 _ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
@@ -86,6 +95,7 @@ class Refining:
         self.budget, self.margins, self.given_rows, self.report = budget, margins, rows, report
         self.mesh = mesh
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
+        self._contact: tuple[Transcription, Array, PlannedContact] | None = None
         self._near: tuple[Transcription, Array, Violated | None] | None = None
         self._refined = 0  # rounds with a finer mesh
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
@@ -97,9 +107,40 @@ class Refining:
             self._known = t, x, contact_error(t, x)
         return self._known[2]
 
+    def contact(self, t: Transcription, x: Array) -> PlannedContact | None:
+        """Of a program at its solution, with what comes of it in full dynamics; the last one that was asked
+        for is known. None while gains are open, as the robot is another one then.
+        """
+        if t.problem.gains:
+            return None
+        known = self.known_contact(t, x)
+        if known is None:
+            known = planned_contact(t, x, t.decode(x))
+            self._contact = t, x, known
+        return known
+
+    def known_contact(self, t: Transcription, x: Array) -> PlannedContact | None:
+        """The same if it was the last one that was asked for."""
+        if self._contact is None or self._contact[0] is not t or self._contact[1] is not x:
+            return None
+        return self._contact[2]
+
+    def replay(self, t: Transcription, x: Array) -> ContactReplay | None:
+        """What comes of it."""
+        contact = self.contact(t, x)
+        return None if contact is None else contact.replay
+
+    def checked(self, t: Transcription, result: SolverResult) -> SolverResult:
+        """A result that is solved only if its contact is, followed in full dynamics, what it says."""
+        if not result.status.usable:
+            return result
+        found = checked(result, self.replay(t, result.x))
+        self.blocked |= not found.status.usable
+        return found
+
     def learn(self, other: Refining) -> None:
         """Take over what another has found of the last program that it had."""
-        self.blocked, self._known = other.blocked, other._known
+        self.blocked, self._known, self._contact = other.blocked, other._known, other._contact
 
     def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The program with its first rows between bodies, and its result."""
@@ -197,20 +238,18 @@ class Refining:
         """A result that could not be mended is a solution only if nothing touches anything; else the last one
         is that was, if any.
         """
-        if self.margins is None or not result.status.usable:
-            return t, result
-        if self._is_apart(result):
-            return t, result
+        if self.margins is None or not result.status.usable or self._is_apart(result):
+            return t, self.checked(t, result)
         with contextlib.suppress(InputError):
             left = bodies_too_near(t, result.x, self.margins, share=1.0)
             if left is not None and left.depth > 0:
                 if self._apart is not None:
                     before, clean = self._apart
-                    return before, with_effort_of(clean, result)
+                    return before, self.checked(before, with_effort_of(clean, result))
                 self.blocked = True
                 names = (" and ".join(self.margins.bodies.names(pair)) for pair in left.pairs)
                 return t, touching(result, left.depth, names, "solution")
-        return t, result
+        return t, self.checked(t, result)
 
     def _next(self, t: Transcription, old: SolverResult, x0: Array) -> Round | None:
         """What is to be solved next; None if the solution is right."""
@@ -232,8 +271,17 @@ class Refining:
             if shares != t.hit.shares:
                 elements = contact_elements(t.problem, shares)
             self._refined += nodes != needed or elements is not None
+        false = False
         if violated is None and nodes == t.nodes and elements is None:
-            return None
+            if self._refined >= _NODE_ROUNDS:
+                return None
+            replay = self.replay(t, old.x)
+            if replay is None or replay.off <= ASKED or replay.partings:
+                return None
+            false, elements = replay.off > REFUTED, all_halved(t.hit.elements)
+            if elements is None:
+                return None
+            self._refined += 1
         rows = {**t.apart_rows, **(violated.rows if violated is not None else {})}
         finer = t
         if nodes != t.nodes or elements is not None:
@@ -243,18 +291,20 @@ class Refining:
         if self.margins is not None:
             finer = finer.with_apart(rows)
         # an optimum whose contact was missed is none of the finer program, nor near one
-        missed = error is not None and error.missed
+        missed = false or (error is not None and error.missed)
         starts: tuple[Array | SolverResult, ...]
         starts = (first_iterate(finer) if missed else carried(finer, t, old),)
         if violated is not None and finer.layout.n == len(old.x):
             starts = (*starts, old.x, x0)
+        # a contact that is far off breaks the finer program's rows by far
+        far = elements is not None and error is not None and abs(error.pct) > AGREED
         name = more_of(
             nodes.total - t.nodes.total, elements, len(violated.rows) if violated is not None else 0
         )
         return Round(
             program=finer,
             starts=starts,
-            barrier=None if violated is None else _BARRIER,
+            barrier=_BARRIER_DEEP if far else None if violated is None else _BARRIER,
             name=name,
             why=f"the plan is not what it says between nodes: {name}, and on from there",
         )

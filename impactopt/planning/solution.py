@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from impactopt import __version__
 from impactopt.bodies.clearance import MISSED, Places
+from impactopt.planning.causes import Cause
 from impactopt.planning.chosen_gains import ChosenGains
+from impactopt.planning.contact_replay import AGREED, ContactReplay, ModelError, PlannedContact
 from impactopt.planning.gears import gear_caution
 from impactopt.planning.multistart import Attempt
 from impactopt.planning.on_demand import rows_on_demand
@@ -30,25 +32,8 @@ from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes
 from impactopt.transcription.plan import Plan, PlannedCollision, Trajectory
 from impactopt.transcription.planned_loads import motion_loads
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.rattle import HeldBlow, Rattle
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelError:
-    """How far a model of the collision is from full dynamics, at a plan's state at contact.
-
-    impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
-    has no ZMP.
-    """
-
-    impulse_pct: float
-    zmp_mm: float | None
-
-    def __str__(self) -> str:
-        zmp = "" if self.zmp_mm is None else f", ZMP off by {self.zmp_mm:.2g} mm"
-        return f"impulse {self.impulse_pct:+.2g} %{zmp}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -61,13 +46,12 @@ class Solved:
     violations : rows that are not met, worst first.
     objectives : value of each of the problem's objectives, by name, in its own unit.
     attempts : result of each start.
-    model_error : estimated error of the model of the collision; None where nothing is frozen in it.
     apart : rows of the program between bodies.
     elements, shares : lengths of the collocation elements of the contact's phases, as fractions of them, if
         they are finer than the problem asks for; and the share of each phase in the contact's time, where
         something is frozen during contact. Else ().
     gains : what is chosen of the gains that the problem left open; `problem` has the robot with these.
-    held_blow : the blow of a plan in which a nail and a striker stay together; None if they need not.
+    contact : the planned contact, and what comes of it in full dynamics; None where no usable plan was found.
     """
 
     problem: ImpactProblem
@@ -78,8 +62,7 @@ class Solved:
     violations: tuple[Violation, ...]
     objectives: Mapping[str, float] = field(default_factory=dict)
     attempts: tuple[Attempt, ...] = ()
-    held_blow: HeldBlow | None = None
-    model_error: ModelError | None = None
+    contact: PlannedContact | None = None
     apart: Mapping[Any, Any] = field(default_factory=dict)
     elements: Elements = ()
     shares: Shares = ()
@@ -94,9 +77,22 @@ class Solved:
         )
 
     @property
-    def rattle(self) -> Rattle | None:
-        """Error of a plan in which a nail and a striker that rattle stay together; None if they do not."""
-        return None if self.held_blow is None else self.held_blow.rattle
+    def model_error(self) -> ModelError | None:
+        """Estimated error of the model of the collision; None where nothing is frozen in it."""
+        return None if self.contact is None else self.contact.model_error
+
+    @property
+    def contact_replay(self) -> ContactReplay | None:
+        """The planned contact followed in full dynamics from the plan's state at contact; None of an impact
+        without duration, and where no usable plan was found.
+        """
+        return None if self.contact is None else self.contact.replay
+
+    @property
+    def caution(self) -> str:
+        """What the planned contact leaves out, in words; empty where it is as planned."""
+        replay = self.contact_replay
+        return str(replay) if replay is not None and (replay.partings or replay.off > AGREED) else ""
 
     @property
     def status(self) -> Status:
@@ -121,7 +117,8 @@ class Solved:
             "model_error_zmp_mm": None if self.model_error is None else self.model_error.zmp_mm,
             "problem": self.problem.describe(),
             **({"gains": [chosen.summary() for chosen in self.gains]} if self.gains else {}),
-            **({} if self.rattle is None else {"caution": str(self.rattle)}),
+            "contact_replay_pct": None if self.contact_replay is None else self.contact_replay.impulse_pct,
+            **({"caution": self.caution} if self.caution else {}),
         }
 
 
@@ -134,6 +131,9 @@ class Solution(Solved):
     contact_error : estimated error of the impulse by the contact's elements; None for an impact without
         duration, and if no usable plan was found.
     statement : names of the program's variables and rows, as `impactopt.transcription.statement` writes them.
+    causes : of an infeasible problem, bounds any one of which would make it solvable where it says; what is
+        cheapest first. Each has the ``problem`` with that value. Empty where none is known to.
+    window : what is to be said of the time that the contact may last; "" if that costs little.
     Its other attributes are those of :class:`Solved`.
     """
 
@@ -141,6 +141,8 @@ class Solution(Solved):
     nodes: MoreNodes = NO_MORE
     contact_error: ContactError | None = None
     statement: str = ""
+    causes: tuple[Cause, ...] = ()
+    window: str = ""
 
     @property
     def impulse(self) -> float:
@@ -177,7 +179,7 @@ class Solution(Solved):
     @cached_property
     def trajectory(self) -> Trajectory:
         """The servo's reference, sampled."""
-        return self.plan.trajectory()
+        return self.plan.trajectory() if self.contact is None else self.contact.reference
 
     @cached_property
     def missed_trajectory(self) -> Trajectory:
@@ -186,11 +188,16 @@ class Solution(Solved):
             missed=True, known=self.trajectory if self.plan.abort is not None else None
         )
 
+    @property
+    def _missed(self) -> Trajectory | None:
+        return self.missed_trajectory if self.plan.abort is not None else None
+
     def validate(self, *, engine: str = "pinocchio", **options: Any) -> Any:
         """Re-simulate the plan in full dynamics; a :class:`impactopt.simulation.Simulation`.
 
         engine : "pinocchio" holds the soles to the ground; "mujoco" holds nothing, the robot can fall (extra
-        ``validate``).  options : of the engine, such as ``step`` [s].
+        ``validate``).  options : of the engine, such as ``step`` [s], or of "pinocchio"
+            ``missing=True``: there is no target.
 
         Raises
         ------
@@ -198,8 +205,7 @@ class Solution(Solved):
         """
         from impactopt.simulation import simulate
 
-        if engine == "mujoco" and self.plan.abort is not None:
-            options.setdefault("missed", self.missed_trajectory)
+        options.setdefault("missed", self._missed)
         return simulate(self.problem, self.trajectory, engine=engine, **options)
 
     def moved(self, *, polish: bool = True, **changes: Any) -> Solution:
@@ -300,7 +306,7 @@ class Solution(Solved):
         problem, bodies = self.problem, self.problem.bodies
         least, nearest, touches = np.inf, "", list[dict[str, Any]]()
         for missed in (False, True) if self.plan.abort is not None else (False,):
-            motion = self.plan.motion(missed=missed, reference=None if missed else self.trajectory)
+            motion = self.plan.motion(missed=missed, reference=self._missed if missed else self.trajectory)
             at = Places.of(problem.robot, motion.q, motion.travel, np.where(missed, MISSED, motion.phase))
             found = bodies.survey(motion.time, at)
             if found.clearance < least:
@@ -335,7 +341,11 @@ class Solution(Solved):
 
     def margins(self) -> dict[str, dict[str, float]]:
         """ZMP margin [m] and torque demand over limit by phase, as of `Plan.margins`, in `collision`."""
-        return self.plan.margins(self.trajectory, self.collision)
+        return self.plan.margins(self.trajectory, self.collision, self._missed)
+
+    def sole_margins(self) -> dict[str, Any]:
+        """Margins of each sole by itself, as of `Plan.sole_margins`."""
+        return self.plan.sole_margins(self.trajectory, self.collision, self._missed)
 
     @cached_property
     def loads(self) -> DriveLoads:
@@ -356,6 +366,7 @@ class Solution(Solved):
             "collision_elements": self.contact_elements,
             "collision_error_pct": self.contact_error_pct,
             **self.margins(),
+            **self.sole_margins(),
             **self.loads.summary(),
             **self.clearance(),
             "slide_mm": 1e3 * way,
@@ -377,7 +388,7 @@ class Solution(Solved):
         if replay is not None:
             out["replayed"] = replay.report(**known)
         replayed = [run.loads for run in (replay, simulation) if run is not None]
-        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way)))):
+        if caution := " ".join(filter(None, (out.get("caution"), slide_caution(way), self.window))):
             out["caution"] = caution
         return out | gear_caution(self.problem, [self.loads, *replayed])
 

@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.chosen_gains import roomy, settled
+from impactopt.planning.contact_replay import checked
 from impactopt.planning.gears import gear_caution
 from impactopt.planning.keeping_apart import Margins, solved_apart
-from impactopt.planning.models import carried_start, climbed, model_error
+from impactopt.planning.models import carried_start, climbed, planned_contact
 from impactopt.planning.multistart import (
     Budget,
     Starts,
@@ -37,7 +38,6 @@ from impactopt.problem.terms import GearLoad
 from impactopt.solvers.program import Callback, SolverResult, Status
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
-from impactopt.transcription.rattle import held_blow
 from impactopt.transcription.start import strike_iterate
 from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
@@ -193,15 +193,17 @@ def _optimized(
     t, fields = solve_from(t, _starts(t, given, which, seed), budget, began, work)
     t, fields = settled(t, fields, budget, report)
     result = fields["result"] = with_reason(t, fields["result"])
-    held = held_blow(t, result.x) if result.status.usable else None
     problem = fields["problem"]
     if method == "shooting":  # it is what the result is to be told as: it knows of no accelerations
         terms = (*(term for term in problem.terms if not isinstance(term, GearLoad)), GearLoad(enabled=False))
         fields["problem"] = problem = replace(problem, collision="sdc", terms=terms)
+    strike, contact = t.decode(result.x), None
+    if result.status.usable:
+        contact = planned_contact(t, result.x, strike, problem)
+        fields["result"] = checked(result, contact.replay)
     return StrikeSolution(
-        strike=t.decode(result.x),
-        held_blow=held,
-        model_error=model_error(t, result.x, problem) if result.status.usable else None,
+        strike=strike,
+        contact=contact,
         elements=t.hit.elements if t.hit.guarded else (),
         shares=t.hit.shares,
         apart=t.apart_rows,

@@ -75,8 +75,10 @@ def bodies_too_near(t: Transcription, x: Array, margins: Margins, *, share: floa
     asked, nodes = _Asked(t, spots, margins), _Nodes(t, plan)
     for (beside, pair), found in sorted(worst.items(), key=lambda item: item[1].apart):
         least = (1 - AT_NODES) * margins.of(pair) + DEEPEST
-        if any(bodies.exact(spots.at, k, pair) < least for k in beside):
-            continue  # at a place: as bodies are near there, it has constraints from then on
+        here = [k for k in beside if bodies.exact(spots.at, k, pair) < least]
+        if here:  # at a place: as bodies are near there, it has constraints from then on
+            asked.more(here, pair, found.apart)
+            continue
         normals = [bodies.closest(spots.at, k, pair).normal for k in beside]
         if not nodes.add(found, bool(normals[0] @ normals[-1] < 0)):
             asked.more(beside, pair, found.apart)

@@ -1,20 +1,27 @@
-"""What a solve that ended without a verdict is worth: another solver's word, and what point masses say."""
+"""What a solve that ended without a solution is worth: another solver's word, and why there is none."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from impactopt.errors import InputError
+from impactopt.planning.causes import Cause
 from impactopt.planning.multistart import VIOLATED, Budget
+from impactopt.planning.solution import Solution
+from impactopt.problem.doubts import too_weak
+from impactopt.robots.sole_margins import shortfalls
 from impactopt.solvers.program import NonlinearProgram, SolverResult, Status, max_violation
 from impactopt.transcription.at_contact import ContactProgram
 from impactopt.transcription.collision import Collision
 from impactopt.transcription.guess import Parting, fastest, parting
 
 Array = NDArray[np.float64]
+TOLD = 3  # margins at most, in a message
 
 
 def second_look(
@@ -48,19 +55,56 @@ def _rank(result: SolverResult) -> tuple[bool, bool, float]:
     return not result.status.usable, result.status is not Status.INFEASIBLE, result.max_violation
 
 
-def with_reason(t: ContactProgram, result: SolverResult) -> SolverResult:
-    """A result without a solution, and why there is none, where a blow of point masses says so.
+def lacks_rows(t: ContactProgram, result: SolverResult) -> bool:
+    """Whether a solver has ended by itself, with rows that are not met."""
+    if result.status not in (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT):
+        return False
+    return max_violation(t.program, result.x, t.program.constraints(result.x)) > VIOLATED
+
+
+def with_reason(
+    t: ContactProgram, result: SolverResult, causes: Sequence[Cause] = (), *, known: Sequence[str] = ()
+) -> SolverResult:
+    """A result without a solution, and why there is none: what is ``known`` of the problem anyway, a bound
+    that would have to move, or what a blow of point masses says.
 
     Such a program is infeasible, whatever its solver ended with.
     """
-    rows = max_violation(t.program, result.x, t.program.constraints(result.x))
-    if result.status not in (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT) or rows <= VIOLATED:
+    if not lacks_rows(t, result):
         return result
-    why = _too_stiff(t) or _too_long(t)
-    if not why:
-        return result
+    would_do = [cause for cause in causes if cause.problem is not None]
+    weak = too_weak(t.problem)
+    if known:
+        why = f"Infeasible: {'; '.join(known)}."
+    elif would_do:
+        first, *others = would_do
+        why = f"Infeasible: {first.first}. {first.text} would do, with all else as it is"
+        why += "".join(f"; or {other.text}" for other in others) + "."
+        # what point masses say is of the contact alone, and not always of what keeps a plan from being
+        masses = (_too_stiff(t) or _too_long(t)) if "contact" in first.first else ""
+        why += "".join(f" Besides, {text}." for text in (weak, masses) if text)
+    else:
+        beyond = [f"{cause.first}: {cause.text}, which may not be" for cause in causes]
+        found = weak or _too_stiff(t) or _too_long(t) or "".join(beyond[:1])
+        if not found:
+            return result
+        why = f"Infeasible: {found}."
     rest = result.message.partition(". ")[2] or result.message
-    return replace(result, status=Status.INFEASIBLE, message=f"Infeasible: {why}. {rest}")
+    return replace(result, status=Status.INFEASIBLE, message=f"{why} {rest}")
+
+
+def with_soles_kept(solution: Solution) -> Solution:
+    """A solution whose soles keep at least half of each margin between its program's nodes, too; one of which
+    some keeps less is acceptable at best, and says so.
+    """
+    if solution.status is not Status.SOLVED:
+        return solution
+    with contextlib.suppress(InputError):  # legs that do not reach: what completes the motion says so
+        if short := shortfalls(solution.sole_margins()):
+            message = f"A sole keeps less than half of a margin between nodes: {'; '.join(short[:TOLD])}."
+            result = replace(solution.result, status=Status.ACCEPTABLE, message=message)
+            return replace(solution, result=result)
+    return solution
 
 
 def _too_stiff(t: ContactProgram) -> str:

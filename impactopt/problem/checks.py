@@ -10,11 +10,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
 from impactopt.contact.laws import ContactLaw, SpringDamper, rough_at
 from impactopt.contact.targets import FreeMass, RigidWall, Target
 from impactopt.errors import MOST, InputError, check_array, check_number, check_whole, did_you_mean, shortened
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.held import Held
+from impactopt.kinematics.stance import Free
 from impactopt.kinematics.support import margin, support_polygon
 from impactopt.problem.terms import Grip, Term
 from impactopt.robots.checks import LEG, check_arms
@@ -32,7 +34,9 @@ __all__ = [
     "check_hands",
     "check_moves",
     "check_names",
+    "check_prices",
     "check_stance",
+    "check_world",
 ]
 
 # models of the collision, cheapest first; those of no duration; "auto": the cheapest that is good enough
@@ -73,9 +77,39 @@ def check_at_rest(
         )
 
 
+def check_world(problem: Any) -> None:
+    """InputError for bodies of the world that are none; for a ground that is not where the soles stand."""
+    if not isinstance(problem.body, TargetBody):
+        raise InputError(f"body must be a TargetBody, not {problem.body!r}")
+    obstacles, ground = problem.obstacles, problem.ground
+    if not isinstance(obstacles, (list, tuple)) or not all(isinstance(o, Obstacle) for o in obstacles):
+        raise InputError(f"obstacles must be a tuple of Obstacle, not {obstacles!r}")
+    object.__setattr__(problem, "obstacles", tuple(obstacles))
+    check_apart("obstacle", [o.name for o in obstacles])
+    if ground is not None and not isinstance(ground, Ground):
+        raise InputError(f"ground must be a Ground, such as Ground(height=-0.8), not {ground!r}")
+    if ground is not None and ground.height and problem.robot.floating:
+        raise InputError(
+            f"the ground of {problem.robot.name!r} is z = 0, where its soles stand: leave `ground` out"
+        )
+
+
 def check_stance(problem: Any) -> None:
-    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own."""
+    """InputError for a stance that plans have not: a virtual base, a hand with no arm of its own, soles on a
+    ground that is not level.
+    """
     robot, stance = problem.robot, problem.stance
+    if isinstance(stance, Free):
+        raise InputError(
+            f"a plan stands {robot.name!r} on soles or on a fixed base, and Free() lets it float: models of "
+            "a collision have that (SDC, FullDynamics, effective_mass; impactopt collide)"
+        )
+    pull = np.array(robot.model.gravity.linear)
+    if stance.sole_frames(robot) and not (pull[2] < 0 and not pull[:2].any()):
+        raise InputError(
+            f"gravity is {pull.tolist()} m/s2, and soles that stand need one along -z: turn it, as <option "
+            "gravity> of an MJCF, or bolt the robot to the ground (floating = false)"
+        )
     if np.any(stance.compliance > 0):
         raise InputError(
             f"a plan holds its soles exactly: give {type(stance).__name__} without the virtual base "
@@ -220,6 +254,15 @@ def check_elements(problem: Any) -> None:
         raise InputError(
             f"contact_duration must be (shortest, longest) in seconds, not {problem.contact_duration}"
         )
+
+
+def check_prices(problem: Any) -> None:
+    """InputError for prices on motion that are no numbers of 0 or more."""
+    for name in ("smoothness", "wrench_price", "return_price"):
+        number = check_number(name, getattr(problem, name))
+        object.__setattr__(problem, name, number)
+        if not 0 <= number <= MOST:
+            raise InputError(f"{name} must be a number of 0 to {MOST:g}, not {number:g}")
 
 
 def check_freezes(problem: Any) -> None:

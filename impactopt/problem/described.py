@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from impactopt.bodies.world import told_body
 from impactopt.problem.objectives import DEFAULT_OBJECTIVES
 from impactopt.problem.terms import ON_DEMAND_TERMS
 
@@ -23,9 +24,12 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
         "point_m": p.point.tolist(),
         "normal": p.normal.tolist(),
         "target": repr(p.target),
+        "target_body": told_body(p.body, p.target),
         "law": repr(p.law),
         "hash": p.hash,
     }
+    if not p.robot.floating:
+        out["ground"] = "none" if p.ground_height is None else f"z = {p.ground_height:g} m"
     if p.collision != "full":
         frozen = f", {p.freezes} freezes" if p.freezes else ""
         more = {"rigid": f", restitution {p.coefficient_of_restitution:g}", "sdc": frozen}
@@ -36,6 +40,8 @@ def described(problem: ImpactProblem) -> dict[str, Any]:
         out["holds_on_with"] = [hand.name for hand in hands]
     if p.robot.source and p.robot.source.repairs:
         out["inertias"] = [f"repaired: {text}" for text in p.robot.source.repairs]
+    if p.robot.source and p.robot.source.notes:
+        out["notes"] = list(p.robot.source.notes)
     out |= {"scenarios": [str(s) for s in p.scenarios]} if p.scenarios else {}
     if p.gains:
         out["gains"] = [f"{', '.join(g.joints)}: {g.factor[0]:g} to {g.factor[1]:g} times" for g in p.gains]

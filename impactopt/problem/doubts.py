@@ -7,41 +7,33 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from impactopt.kinematics.balanced import Reach, reach
 from impactopt.kinematics.striking_point import striking_point
 from impactopt.kinematics.support import support_polygon
+from impactopt.problem.plausibility import giant_soles
+from impactopt.problem.terms import TorqueLimit
 
 if TYPE_CHECKING:
     from impactopt.problem.problem import ImpactProblem
-    from impactopt.robots.robot import Robot
 
-__all__ = ["doubts", "hopeless"]
+__all__ = ["hopeless", "too_weak"]
 
 Array = NDArray[np.float64]
 LEANS = 0.05  # [m] a motion may take the centre of mass so far out of the soles, and back in time
 OFF = 0.005  # [m] of a posture that counts as one
+_ROUNDED = 1e-6
 PAST = 1e-3  # [m] beyond the target's plane, for rounded numbers
 DRAWN = 3  # postures that are tried beside the two there are
 
 
 def hopeless(problem: ImpactProblem) -> list[str]:
-    """What no solve can mend, first what to mend first: a start beyond the target, a point out of balance."""
-    found = [_beyond(problem), _out_of_balance(problem)]
+    """What no solve can mend, first what to mend first: soles of a giant, a start beyond the target, a
+    point out of balance.
+    """
+    found = list(giant_soles(problem.robot)) or [_beyond(problem), _out_of_balance(problem)]
     return [text for text in found if text]
-
-
-def doubts(robot: Robot) -> list[str]:
-    """What a robot's numbers lack that a blow depends on."""
-    driven = zip(robot.joint_names, robot.armature, robot.passive, strict=True)
-    without = [joint for joint, a, passive in driven if a == 0 and not passive]
-    if not without:
-        return []
-    which = "no joint has" if len(without) == robot.n - np.sum(robot.passive) else f"{', '.join(without)}: no"
-    return [
-        f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too light "
-        "and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, by joint"
-    ]
 
 
 def _beyond(problem: ImpactProblem) -> str:
@@ -53,6 +45,40 @@ def _beyond(problem: ImpactProblem) -> str:
         f"the motion starts beyond the target: the start posture has {problem.striker!r} at "
         f"{np.round(at, 3).tolist()} m, {1e3 * past:.0f} mm past the target's plane along the normal; start "
         "from a posture behind it, move the point further along the normal, or turn the normal round"
+    )
+
+
+def too_weak(problem: ImpactProblem) -> str:
+    """Whether no wrenches of what is held let the torques hold the robot at rest where it starts, in words;
+    "" if some do. A motion that falls from there at once may be planned all the same.
+    """
+    robot, c, limit = problem.robot, problem.coordinates, problem.term(TorqueLimit).fraction
+    q = problem.start_posture
+    weight = np.array(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
+    held = c.sole_jacobians(q)[0].T if c.legs else np.zeros((robot.nv, 0))
+    base = robot.nv - robot.n
+    driven = np.flatnonzero(~(robot.passive | robot.hinges))
+    rows, most = base + driven, robot.torque_limit[driven]
+    # the least largest share of a limit: a linear program in the wrenches and that share
+    each = held[rows] / most[:, None]
+    asked = weight[rows] / most
+    ones = np.ones((len(rows), 1))
+    found = linprog(
+        np.append(np.zeros(held.shape[1]), 1.0),
+        A_ub=np.vstack([np.hstack([-each, -ones]), np.hstack([each, -ones])]),
+        b_ub=np.concatenate([-asked, asked]),
+        A_eq=np.hstack([held[c.undriven], np.zeros((len(c.undriven), 1))]) if len(c.undriven) else None,
+        b_eq=weight[c.undriven] if len(c.undriven) else None,
+        bounds=(None, None),
+    )
+    if found.status != 0 or found.fun <= limit + _ROUNDED:
+        return ""
+    share = np.abs(asked - each @ found.x[:-1])
+    joint = robot.joint_names[int(driven[int(share.argmax())])]
+    return (
+        f"the torque limits do not hold the robot's own weight: at rest at its start {joint} bears "
+        f"{share.max():.3g} of its limit, and [terms.torque_limit] fraction lets it bear {limit:.3g}; "
+        "raise the limits or the fraction, or start from another posture"
     )
 
 

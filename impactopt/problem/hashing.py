@@ -27,6 +27,9 @@ def problem_hash(problem: Any) -> str:
     """
     shape = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem) if f.name != "name"}
     second = shape.pop("second")
+    shape.pop("ground")
+    if not problem.robot.floating:
+        shape["ground"] = problem.ground_height
     if gains := shape.pop("gains"):
         each = zip(problem.gain_joints, gains, strict=True)
         shape["gains"] = sorted((joints, gain.factor) for joints, gain in each)

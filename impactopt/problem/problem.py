@@ -11,19 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies
-from impactopt.bodies.shapes import Obstacle, TargetBody
-from impactopt.bodies.world import WorldBody, ground, obstacle_bodies, target_bodies
+from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
+from impactopt.bodies.world import WorldBody, ground_body, obstacle_bodies, target_bodies
 from impactopt.collision.effects import Effects
 from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import (
     FARTHEST,
-    MOST,
     InputError,
     Mistakes,
     check_array,
     check_name,
-    check_number,
 )
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
@@ -39,7 +37,9 @@ from impactopt.problem.checks import (
     check_hands,
     check_moves,
     check_names,
+    check_prices,
     check_stance,
+    check_world,
 )
 from impactopt.problem.described import described
 from impactopt.problem.hashing import problem_hash
@@ -76,8 +76,9 @@ class ImpactProblem:
     Attributes
     ----------
     robot, striker : the robot, and the name of the one of its strikers that hits.
-    point (3,) [m] : where the striking point meets the target, in the world frame. The ground is z = 0. The
-        soles of the start posture are centred on the origin.
+    point (3,) [m] : where the striking point meets the target, in the world frame: that of a fixed base, or
+        with z = 0 at the ground on which the soles stand, and the soles of the start posture centred on the
+        origin.
     normal (3,) : unit vector in the world frame, along which the target is pushed.
     second : another striker that hits the same target at the same time, at a point of its own.
     law, target : contact law and target. In a plan a `Board` breaks during compression, and a `Nail` moves
@@ -104,6 +105,7 @@ class ImpactProblem:
     scenarios : other targets, or none, that the robot has to survive with the same swing.
     body : the target's shape, which all of the robot but the striking point keeps off.
     obstacles : bodies in the world that the robot keeps off.
+    ground : the floor below a robot on a fixed base; None: there is none. Soles stand on the ground z = 0.
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
         `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
@@ -140,6 +142,7 @@ class ImpactProblem:
     scenarios: tuple[Scenario, ...] = ()
     body: TargetBody = field(default_factory=TargetBody)
     obstacles: tuple[Obstacle, ...] = ()
+    ground: Ground | None = None
     terms: tuple[Term, ...] = ()
     objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
     smoothness: float = 1e-5
@@ -162,12 +165,12 @@ class ImpactProblem:
         hits = found.attempt(lambda: self.robot.striker(self.striker))
         aimed = found.attempt(self._check_aim)
         stands = found.attempt(partial(check_stance, self)) and found.attempt(self._check_start)
-        for check in (partial(check_elements, self), self._check_prices, partial(check_collision, self)):
-            found.attempt(check)
+        for check in (check_elements, check_prices, check_collision):
+            found.attempt(partial(check, self))
         if found.attempt(self._check_scenarios):
             for scenario in self.scenarios:
                 found.attempt(partial(scenario.numbers, self.law, self.target))
-        found.attempt(self._check_world)
+        found.attempt(partial(check_world, self))
         found.attempt(partial(check_gains, self))
         termed = found.attempt(self._check_terms)
         if termed:
@@ -190,13 +193,6 @@ class ImpactProblem:
             raise InputError(f"normal must be a unit vector, its length is {length:.6g}{unit}")
         object.__setattr__(self, "normal", normal / np.linalg.norm(normal))
 
-    def _check_prices(self) -> None:
-        for name in ("smoothness", "wrench_price", "return_price"):
-            number = check_number(name, getattr(self, name))
-            object.__setattr__(self, name, number)
-            if not 0 <= number <= MOST:
-                raise InputError(f"{name} must be a number of 0 to {MOST:g}, not {getattr(self, name)}")
-
     def _check_scenarios(self) -> None:
         listed = isinstance(self.scenarios, (list, tuple))
         if not listed or not all(isinstance(s, Scenario) for s in self.scenarios):
@@ -205,16 +201,6 @@ class ImpactProblem:
         if self.scenarios and not self.lasts:
             raise InputError(f'scenarios need a contact that lasts, as "full", not {self.collision!r}')
         check_apart("scenario", [s.name for s in self.scenarios])
-
-    def _check_world(self) -> None:
-        if not isinstance(self.body, TargetBody):
-            raise InputError(f"body must be a TargetBody, not {self.body!r}")
-        if not isinstance(self.obstacles, (list, tuple)) or not all(
-            isinstance(o, Obstacle) for o in self.obstacles
-        ):
-            raise InputError(f"obstacles must be a tuple of Obstacle, not {self.obstacles!r}")
-        object.__setattr__(self, "obstacles", tuple(self.obstacles))
-        check_apart("obstacle", [o.name for o in self.obstacles])
 
     def _check_terms(self) -> None:
         listed = isinstance(self.terms, (list, tuple))
@@ -364,11 +350,20 @@ class ImpactProblem:
         mine = (self.striker, self.point)
         return (mine,) if self.second is None else (mine, (self.second.striker, self.second.point))
 
+    @property
+    def ground_height(self) -> float | None:
+        """[m] of the floor; None: there is none."""
+        if self.robot.floating:
+            return 0.0
+        return None if self.ground is None else self.ground.height
+
     @cached_property
     def world(self) -> tuple[WorldBody, ...]:
-        """The bodies that are not the robot's: the ground, the target and what holds it, the obstacles."""
+        """The bodies that are not the robot's: the ground if there is one, the target and what holds it, the
+        obstacles.
+        """
         return (
-            ground(),
+            *([] if self.ground_height is None else [ground_body(self.ground_height)]),
             *target_bodies(self.body, self.target, self.middle, self.normal),
             *obstacle_bodies(self.obstacles),
         )

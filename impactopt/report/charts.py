@@ -43,7 +43,7 @@ def charts_of(record: Record, problem: ImpactProblem | None = None) -> tuple[lis
             _torque_ratio(record, arrays),
             _joint(record, arrays, "torque", "torque", "torque [N m]"),
             _joint(record, arrays, "angle", "angle", "angle [rad]"),
-            _soles(record, arrays),
+            *_soles(record, arrays),
         ]
     charts += _convergence(record, arrays)
     return [chart for chart in charts if chart is not None], arrays
@@ -210,32 +210,39 @@ def _joint(record: Record, arrays: Arrays, which: str, title: str, unit: str) ->
     )
 
 
-def _soles(record: Record, arrays: Arrays) -> dict[str, Any] | None:
+def _soles(record: Record, arrays: Arrays) -> list[dict[str, Any]]:
+    """Each sole by itself, in the replay that is nearest to the truth."""
     prefix = "replayed" if record.replayed else "simulated"
     a = record.arrays
     names = a.get(f"{prefix}_soles", [n.removeprefix("sole_") for n in a if n.startswith("sole_")])
     if f"{prefix}_sole_ground" not in a or not len(names):
-        return None
-    series = [
-        _series(
-            record,
-            arrays,
-            f"load_{k}",
-            str(name),
-            OTHERS[k % len(OTHERS)],
-            a[f"{prefix}_time"],
-            a[f"{prefix}_sole_ground"][:, k, 2],
-        )
-        for k, name in enumerate(names)
-    ]
-    how = "on free soles" if record.replayed else "on held soles"
-    return _chart(
-        f"Normal force on each sole, simulated {how}",
-        "force [N]",
-        series,
-        bands=_bands(record),
-        include=[0.0],
-    )
+        return []
+    how, out = "on free soles" if record.replayed else "on held soles", []
+    for what, unit, title, values in (
+        (
+            "pressed",
+            "margin [mm]",
+            "Margin of each sole's centre of pressure",
+            1e3 * a[f"{prefix}_cop_margin"],
+        ),
+        ("load", "force [N]", "Normal force on each sole", a[f"{prefix}_sole_ground"][:, :, 2]),
+    ):
+        series = [
+            _series(
+                record,
+                arrays,
+                f"{what}_{k}",
+                str(name),
+                OTHERS[k % len(OTHERS)],
+                a[f"{prefix}_time"],
+                values[:, k],
+            )
+            for k, name in enumerate(names)
+        ]
+        note = {"note": "Distance from its own nearest edge; at 0 it tips."} if what == "pressed" else {}
+        bands = _bands(record)
+        out.append(_chart(f"{title}, simulated {how}", unit, series, bands=bands, include=[0.0], **note))
+    return out
 
 
 def _convergence(record: Record, arrays: Arrays) -> list[dict[str, Any]]:

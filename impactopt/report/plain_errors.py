@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import signal
+import threading
 import traceback
 import warnings
 from collections.abc import Iterator
@@ -19,17 +21,33 @@ BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130  # exit codes
 
 
 @contextlib.contextmanager
-def plain_errors(interrupted: str, *, verbose: bool = False) -> Iterator[Console]:
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM raises KeyboardInterrupt, in the main thread and where nobody else handles it."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def plain_errors(interrupted: str, *, verbose: bool = False, keeps: bool = False) -> Iterator[Console]:
     """A console on stderr, for a command's body.
 
     interrupted : what Ctrl-C prints, where the body does not catch it.  verbose : bad input has a traceback.
+    keeps : the body keeps what it has on Ctrl-C, and is to do so on SIGTERM, as of a scheduler, too.
     """
     from rich.console import Console
 
     from impactopt.errors import InputError, printable
 
     console = Console(stderr=True)
-    with warnings.catch_warnings():
+    on_sigterm = _terminated_as_interrupted() if keeps else contextlib.nullcontext()
+    with warnings.catch_warnings(), on_sigterm:
         warnings.showwarning = lambda message, *_a, **_k: console.print(
             printable(f"warning: {message}"), markup=False
         )

@@ -14,6 +14,7 @@ from impactopt.report.charts import charts_of
 from impactopt.report.page import html_page
 from impactopt.report.result_rows import result_columns, result_rows, worst_rows
 from impactopt.report.stage import stage_of
+from impactopt.robots.sole_margins import shortfalls
 
 __all__ = ["Report", "report_of"]
 
@@ -99,10 +100,13 @@ def _cards(s: Mapping[str, Any]) -> str:
         card(f"{s['peak_force_N']:.0f} N", f"planned peak force, over {s['contact_ms']:.0f}{NARROW}ms")
     if s.get("hand_speed_m_s") is not None:
         card(f"{s['hand_speed_m_s']:.2f} m/s", "speed of the hand at contact")
-    margins = s.get("zmp_margin_m")
-    if isinstance(margins, Mapping) and margins:
-        least = 1e3 * min(margins.values())
-        card(f"{least:.0f} mm", "least planned ZMP margin", "" if least >= 0 else "bad")
+    margins = s.get("sole_cop_margin_mm") or {}
+    if margins:
+        least = min(min(phases.values()) for phases in margins.values())
+        asked = min((s.get("sole_cop_margin_asked_mm") or {}).values(), default=None)
+        beside = "" if asked is None else f", {asked:g}{NARROW}mm asked"
+        kind = "bad" if shortfalls(s) else ""
+        card(f"{least:.0f} mm", f"least planned margin of a sole's centre of pressure{beside}", kind)
     standing = s.get("replayed", {}).get("standing")
     if standing is not None and margins:  # without soles nothing can fall
         card("stands" if standing else "falls", "replayed on free soles", "good" if standing else "bad")

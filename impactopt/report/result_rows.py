@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from impactopt.robots.sole_margins import SHARE, least_kept
 from impactopt.solvers.program import MINOR
 
 __all__ = [
@@ -26,7 +28,9 @@ __all__ = [
     "worst_rows",
 ]
 
-PHASES = ("swing", "collision", "follow")
+PHASES = ("swing", "collision", "follow", "missed")
+SLIP = 5.0  # [mm] on free soles: a plan within its friction slides less
+EDGE = 0.1  # [mm, N] by which a sole that tips on its edge may seem to be outside
 Columns = Mapping[str, Mapping[str, Any]]
 
 
@@ -69,6 +73,7 @@ def result_rows(columns: Columns, phases: Sequence[str] = PHASES) -> list[Row]:
 def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterator[Row | None]:
     yield from blow_rows(sources)
     yield from phase_rows(sources, phases)
+    yield from _sole_rows(sources)
     for label, key, joint, digits, most in (
         ("gear load / torque limit", "gear_ratio", "gear_joint", 2, np.inf),
         ("motor's use of its line", "motor_ratio", "motor_joint", 2, 1.0),
@@ -81,9 +86,9 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
             yield row
             if any(names := [source.get(joint) for source in sources]):
                 yield _of_joints(names)
+    slips = [None, *(source.get("sole_slip_mm") for source in sources[1:])]
+    yield _of_replays(number_row("largest slip of a sole [mm]", slips, 2, most=SLIP))
     for label, key, digits in (
-        ("least normal force [N]", "min_normal_force_N", 0),
-        ("largest slip of a sole [mm]", "sole_slip_mm", 2),
         ("largest lift of a sole [mm]", "sole_lift_mm", 2),
         ("impulse error [%]", "impulse_error_pct", 2),
         ("left uncertain by steps [%]", "step_error_pct", 3),
@@ -95,9 +100,33 @@ def _rows(sources: Sequence[Mapping[str, Any]], phases: Sequence[str]) -> Iterat
     yield _of_replays(word_row("stands at the end", stands, no_is_bad=True))
 
 
+def _sole_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
+    """Margins of each sole by itself, beside what is asked of the plan: of its centre of pressure to its own
+    edges in each phase, and its least normal force.
+
+    Good is half of that in a plan and on held soles, and a sole that does not tip on free ones.
+    """
+    asked, force = sources[0].get("sole_cop_margin_asked_mm") or {}, sources[0].get("sole_force_asked_N") or 0
+    free = np.array([source.get("engine") == "mujoco" for source in sources])
+    margins, forces = (
+        [source.get(key) or {} for source in sources] for key in ("sole_cop_margin_mm", "sole_force_N")
+    )
+    for sole in dict.fromkeys(name for source in margins for name in source):
+        own = [source.get(sole, {}) for source in margins]
+        for phase in dict.fromkeys(name for found in own for name in found):
+            wanted, half = "", -np.inf
+            if phase in asked:
+                wanted, half = f" (of {asked[phase]:g})", 1e3 * least_kept(1e-3 * asked[phase])
+            label = f"{sole} CoP margin [mm], {phase}{wanted}"
+            yield number_row(label, [f.get(phase) for f in own], 1, least=np.where(free, 0.0, half) - EDGE)
+        label = f"{sole} least force [N]{f' (of {force:g})' if force else ''}"
+        values = [min(source.get(sole, {}).values(), default=None) for source in forces]
+        yield number_row(label, values, 0, least=np.where(free, 0.0, SHARE * force) - EDGE)
+
+
 def standing(replay: Mapping[str, Any]) -> bool | None:
     """Whether a replay stands at the end; None where there are no soles: what is bolted cannot fall."""
-    return None if replay.get("min_normal_force_N") is None else replay.get("standing")
+    return replay.get("standing") if replay.get("sole_force_N") else None
 
 
 def blow_rows(sources: Sequence[Mapping[str, Any]]) -> Iterator[Row | None]:
@@ -203,14 +232,17 @@ def number_row(
     digits: int,
     *,
     scale: float = 1.0,
-    least: float = -np.inf,
+    least: float | NDArray[np.float64] = -np.inf,
     most: float = np.inf,
 ) -> Row | None:
-    """None where no column has a number; what is not between `least` and `most` is not good."""
+    """None where no column has a number; what is not between `least`, of each or all, and `most` is not
+    good.
+    """
     if all(value is None for value in values):
         return None
     cells = [
-        Cell("-") if v is None else Cell(_rounded(scale * v, digits), least <= v <= most) for v in values
+        Cell("-") if v is None else Cell(_rounded(scale * v, digits), bool(low <= v <= most))
+        for v, low in zip(values, np.broadcast_to(least, len(values)), strict=True)
     ]
     return Row(label, tuple(cells))
 

@@ -38,7 +38,13 @@ def bodies_page_of_problem(problem: ImpactProblem) -> Report:
     where = problem.start if isinstance(problem.start, str) else "start"
     title = problem.name or problem.robot.name
     return _page(
-        problem.robot, problem.start_posture, where, title, world=problem.world, normal=problem.normal
+        problem.robot,
+        problem.start_posture,
+        where,
+        title,
+        world=problem.world,
+        normal=problem.normal,
+        floor=problem.ground_height,
     )
 
 
@@ -50,6 +56,7 @@ def _page(
     *,
     world: tuple[WorldBody, ...] = (),
     normal: Array | None = None,
+    floor: float | None = 0.0,
 ) -> Report:
     links, arrays = bodies_of(robot), dict[str, Any]()
     header = {
@@ -64,6 +71,7 @@ def _page(
         "weight": 1.0,
         "around": 0.0,
         "far": 1.0,
+        "floor": floor,
         "legged": False,
         "charts": [],
     }
@@ -149,8 +157,11 @@ def _world(world: Sequence[WorldBody]) -> str:
     def place(body: WorldBody) -> str:
         return f"({', '.join(f'{x:.3g}' for x in body.place)}) m"
 
-    rows = [(b.name, shape(b), place(b)) for b in world[1:] if not b.core]
-    return _table(("body", "shape", "middle"), rows or [("the ground alone", "", "")])
+    rows = [(b.name, shape(b), place(b)) for b in world if not (b.core or b.ground)]
+    return _table(
+        ("body", "shape", "middle"),
+        rows or [("nothing but the ground" if any(b.ground for b in world) else "nothing", "", "")],
+    )
 
 
 def _left_out(links: RobotBodies, q: Array, posture: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:

@@ -47,6 +47,7 @@ def stage_of(record: Record, problem: ImpactProblem) -> tuple[dict[str, Any], Ar
         "weight": 9.81 * float(sum(i.mass for i in problem.robot.model.inertias)),
         "around": AROUND,
         "far": FAR,
+        "floor": problem.ground_height,
         "legged": len(record.arrays["polygon"]) > 0,
     }
     return header, arrays

@@ -15,10 +15,11 @@ from impactopt.contact.fields import Described, about, abouts
 from impactopt.errors import InputError, check_number, did_you_mean
 from impactopt.robots.checks import HEAVIEST, STRONGEST
 
-__all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "numbers_of", "with_classes"]
+__all__ = ["MOMENTARY_PEAK", "Actuator", "fitting", "known", "numbers_of", "with_classes"]
 
 # of a gear over the joint's torque limit, where nothing better is known: see docs/howto/gears.md
 MOMENTARY_PEAK = 2.0
+_FRICTION = ("viscous_friction", "coulomb_friction")
 FASTEST, LATEST = 1e6, 1.0  # [Hz], [s] of a motor: beyond, it is none, or in other units
 
 
@@ -35,16 +36,22 @@ class Actuator(Described):
             most=HEAVIEST,
         ),
     )
-    viscous_friction: float = field(
-        default=0.0,
+    viscous_friction: float | None = field(
+        default=None,
         metadata=about(
-            "that the motor overcomes beside the servo's torque", unit="N m s/rad", least=0, most=STRONGEST
+            "that the motor overcomes beside the servo's torque; left out: the robot's own",
+            unit="N m s/rad",
+            least=0,
+            most=STRONGEST,
         ),
     )
-    coulomb_friction: float = field(
-        default=0.0,
+    coulomb_friction: float | None = field(
+        default=None,
         metadata=about(
-            "that the motor overcomes beside the servo's torque", unit="N m", least=0, most=STRONGEST
+            "that the motor overcomes beside the servo's torque; left out: the robot's own",
+            unit="N m",
+            least=0,
+            most=STRONGEST,
         ),
     )
     continuous_torque: float | None = field(
@@ -126,10 +133,19 @@ def with_classes(
         if not isinstance(actuator, Actuator):
             raise InputError(f"actuators: of {pattern!r} is {actuator!r}; give an Actuator")
         for k in fitting(pattern, joints, "actuators"):
-            out[k] = replace(actuator, armature=None)
+            own = {name: getattr(out[k], name) for name in _FRICTION if getattr(actuator, name) is None}
+            out[k] = replace(actuator, armature=None, **own)
             if actuator.armature is not None:
                 model.armature[base + k] = actuator.armature
     return tuple(out)
+
+
+def known(actuators: Iterable[Actuator]) -> tuple[Actuator, ...]:
+    """The actuators of a robot: without friction where nothing is said of it."""
+    return tuple(
+        replace(actuator, **{name: 0.0 for name in _FRICTION if getattr(actuator, name) is None})
+        for actuator in actuators
+    )
 
 
 def fitting(pattern: str, joints: Sequence[str], where: str) -> list[int]:

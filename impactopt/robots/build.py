@@ -8,95 +8,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
-from xml.dom import expatbuilder
-from xml.parsers.expat import ExpatError
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from impactopt.codegen.files import is_plain_file
-from impactopt.errors import InputError, Mistakes, check_array, did_you_mean, raw_array, shortened
+from impactopt.errors import InputError, check_array, did_you_mean, raw_array, shortened
+from impactopt.robots.actuators import Actuator
 from impactopt.robots.checks import HEAVIEST, check_configuration, check_frame
+from impactopt.robots.names import reduced, tell_apart
 from impactopt.robots.parts import Striker
 
 Array = NDArray[np.float64]
 MANY = 100  # soles, strikers or tools
-# [kg m2] of moments of inertia, and relative: in a URDF decimals are rounded, and antennas are guessed
-_ROUNDED = 1e-6
-
-
-def read_urdf(
-    path: str | PathLike[str], srdf: str | PathLike[str] | None, *, floating: bool, repaired: bool = False
-) -> pin.Model:
-    """The model of a URDF, with an SRDF's reference configurations and rotors (as armature).
-
-    repaired : moments of inertia that no link can have are let through, as they are to be repaired.
-    """
-    urdf = existing(path, "URDF")
-    root = (pin.JointModelFreeFlyer(),) if floating else ()
-    try:
-        model = pin.buildModelFromUrdf(urdf, *root)
-    except (ValueError, RuntimeError) as error:
-        raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
-    _check_links(urdf, moments=not repaired)
-    if srdf is not None:
-        file = existing(srdf, "SRDF")
-        try:
-            pin.loadReferenceConfigurations(model, file, False)
-            pin.loadRotorParameters(model, file, False)
-        except (ValueError, RuntimeError) as error:
-            raise InputError(f"SRDF {file}: {error}") from error
-    return model
-
-
-def _check_links(urdf: str, *, moments: bool) -> None:
-    """InputError with all links that no matter is made of: what is fixed to another hides it in their sum.
-
-    Links without mass or inertia, as frames are, are none's trouble.
-    """
-    try:
-        # robots have tags of others with prefixes that no one declares: no trouble of theirs
-        root = expatbuilder.parse(urdf, namespaces=False).documentElement
-    except ExpatError as error:
-        raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
-    found = Mistakes()
-    for link in _children(root, "link"):
-        given = _children(link, "inertial")
-        masses = [mass for part in given for mass in _children(part, "mass")]
-        inertias = [inertia for part in given for inertia in _children(part, "inertia")]
-        if not masses or not inertias:
-            continue
-        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        entries = [_urdf_number(inertias[0].getAttribute(key)) for key in keys]
-        m, (xx, yy, zz, xy, xz, yz) = _urdf_number(masses[0].getAttribute("value")), entries
-        where = f"URDF {urdf}: the <inertial> of link {link.getAttribute('name')!r}"
-        numbers = np.array([m, *entries])
-        if not np.isfinite(numbers).all() or m < 0 or np.abs(numbers).max() > HEAVIEST:
-            found.found.append(
-                f"{where} has mass {m:g} kg and moments {xx:g}, {yy:g}, {zz:g} kg m2; give numbers from 0 to "
-                f"{HEAVIEST:g}"
-            )
-            continue
-        least = float(np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))[0])
-        if moments and least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
-            found.found.append(
-                f"{where} has a principal moment of inertia of {least:.3g} kg m2; correct its <inertia>, "
-                'which is about the centre of mass, or take inertias="repaired"'
-            )
-    found.raise_if_any(f"URDF {urdf}")
-
-
-def _children(element: Any, tag: str) -> list[Any]:
-    return [child for child in element.childNodes if getattr(child, "tagName", None) == tag]
-
-
-def _urdf_number(text: str) -> float:
-    """A number of a URDF; 0 for what its parser, which has read it before, has taken for none."""
-    try:
-        return float(text or 0.0)
-    except ValueError:
-        return 0.0
 
 
 def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -> pin.Model:
@@ -107,12 +32,14 @@ def lock_joints(model: pin.Model, locked: Iterable[str] | Mapping[str, float]) -
         )
     angles = dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked, 0.0)
     if not angles:
+        model = model.copy()
+        tell_apart(model)
         return model
     names = joint_names(model)
     for name in angles:
         joint_index(names, name, "locked")
     q = set_joints(model, pin.neutral(model), angles, "locked")
-    return pin.buildReducedModel(model, [model.getJointId(name) for name in angles], q)
+    return reduced(model, [model.getJointId(name) for name in angles], q)
 
 
 def is_floating(model: pin.Model) -> bool:
@@ -174,6 +101,34 @@ def armature(
 def effort_limit(model: pin.Model) -> Array:
     """(nv,) largest torques [N m]; renamed in Pinocchio 4."""
     return np.array(model.upperEffortLimit if hasattr(model, "upperEffortLimit") else model.effortLimit)
+
+
+def friction(model: pin.Model) -> tuple[Array, Array]:
+    """(nv,) viscous [N m s/rad] and dry friction [N m] of joints; the second renamed in Pinocchio 4."""
+    dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
+    return np.array(model.damping), np.array(dry)
+
+
+def set_friction(model: pin.Model, viscous: Array, dry: Array) -> None:
+    """The other way round."""
+    model.damping = viscous
+    if hasattr(model, "upperDryFrictionLimit"):
+        model.upperDryFrictionLimit, model.lowerDryFrictionLimit = dry, -dry
+    else:
+        model.friction = dry
+
+
+def frictions(model: pin.Model, joints: Sequence[str]) -> tuple[Actuator, ...]:
+    """Of each joint an `Actuator` of which only the friction is known, the model's."""
+    out = []
+    for name, viscous, dry in zip(
+        joints, *(x[model.nv - len(joints) :] for x in friction(model)), strict=True
+    ):
+        try:
+            out.append(Actuator(viscous_friction=viscous, coulomb_friction=dry))
+        except InputError as error:
+            raise InputError(f"joint {name!r}: damping {viscous:g}, friction {dry:g}: {error}") from error
+    return tuple(out)
 
 
 def velocity_limit(model: pin.Model) -> Array:

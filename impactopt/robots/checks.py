@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 MAX_SERVO_RATE = 3e4
 HEAVIEST = 1e6  # [kg], [kg m2] of a link, a tool, a rotor: a ship
 LEG = 6  # joints that hold a sole: as many as it has directions
+_LIMITS = ("torque_limit", "velocity_limit", "position_limit")
 STRONGEST = 1e15  # [N m], [rad/s] of a joint: a test may ask for no limit
 
 
@@ -43,8 +44,26 @@ def check_joints(joints: Sequence[str], name: str) -> None:
             raise InputError(f"the name of joint {joint!r} has control characters; take them out")
 
 
-def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: Array, upper: Array) -> None:
-    """InputError with all limits that are missing (zero or infinite in a URDF), negative or crossed."""
+# how a limit is mended in a file of that kind
+_MENDS = {
+    "URDF": dict.fromkeys(_LIMITS, "set it in the URDF's <limit>, or "),
+    "MJCF": {
+        "torque_limit": "set the joint's `actuatorfrcrange` in the MJCF, or ",
+        "velocity_limit": "an MJCF has none: ",
+        "position_limit": "set the joint's `range` in the MJCF, or ",
+    },
+    "": dict.fromkeys(_LIMITS, ""),
+}
+
+
+def check_limits(
+    joints: Sequence[str], torque: Array, velocity: Array, lower: Array, upper: Array, kind: str = ""
+) -> None:
+    """InputError with all limits that are missing (zero or infinite in a URDF), negative or crossed.
+
+    kind : of the file that they are from, "URDF" or "MJCF", "" for none.
+    """
+    mends = _MENDS[kind]
     found = Mistakes()
     for name, value, unit, option in (
         *((j, x, "N m", "torque_limit") for j, x in zip(joints, torque, strict=True)),
@@ -54,13 +73,13 @@ def check_limits(joints: Sequence[str], torque: Array, velocity: Array, lower: A
         if not 0 < value <= STRONGEST:
             found.found.append(
                 f"joint {name!r} has no usable {option.replace('_', ' ')} ({value:g} {unit}); "
-                f"set it in the URDF's <limit>, or give {option}={{{name!r}: ...}}"
+                f"{mends[option]}give {option}={{{name!r}: ...}}"
             )
     for name, low, high in zip(joints, lower, upper, strict=True):
         if not low < high:
             found.found.append(
                 f"joint {name!r} has no usable position limits (lower {low:g}, upper {high:g} rad); "
-                f"set them in the URDF's <limit>, or give position_limit={{{name!r}: (lower, upper)}}"
+                f"{mends['position_limit']}give position_limit={{{name!r}: (lower, upper)}}"
             )
     found.raise_if_any("the robot")
 
@@ -139,7 +158,7 @@ def check_frame(model: pin.Model, frame: str, what: str) -> int:
         names = [str(f.name) for f in model.frames]
         raise InputError(
             f"{what}: the model has no frame {frame!r}{did_you_mean(frame, names)}; "
-            "frames are the URDF's links and joints"
+            "frames are links, joints and sites"
         )
     try:
         return int(model.getFrameId(frame))

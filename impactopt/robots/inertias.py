@@ -20,7 +20,7 @@ INERTIAS = (GIVEN, REPAIRED)
 TRIANGLE = 1e-3  # relative, of the triangle inequality: room for rounded decimals
 THIN = 0.01  # [m] of the slab that a repaired body has at least the second moments of
 DENSITY = 2000.0  # [kg/m3] of the ball that takes the place of a point: motors, gears and housing
-_MEND = f'correct its <inertia>, which is about the centre of mass, or take inertias="{REPAIRED}"'
+_MEND = f'correct its <inertial>, with moments about the centre of mass, or take inertias="{REPAIRED}"'
 
 
 def check_inertias(model: pin.Model) -> None:
@@ -35,10 +35,13 @@ def check_inertias(model: pin.Model) -> None:
 def _wrong(model: pin.Model, i: int) -> Iterator[str]:
     """What no matter has, of the body that joint i moves: the first thing."""
     body = model.inertias[i]
-    where = f"the link moved by joint {model.names[i]!r} (with what is fixed to it)"
+    root = model.joints[i].nq == 7  # a free-flyer, which has no joint in the file
+    link = _root(model) if root else f"the link moved by joint {model.names[i]!r}"
+    where = f"{link} (with what is fixed to it)"
     inertia, placed = np.array(body.inertia), model.jointPlacements[i].translation
     if not 0 < body.mass <= HEAVIEST:
-        yield f"{where} has mass {body.mass:g} kg; give its <inertial> one > 0 and <= {HEAVIEST:g}"
+        bolt = ", or bolt the robot to the ground (floating = false)" if root else ""
+        yield f"{where} has mass {body.mass:g} kg; give its <inertial> one > 0 and <= {HEAVIEST:g}{bolt}"
     elif not (np.isfinite(inertia).all() and np.isfinite(body.lever).all()):
         yield f"{where} has NaN or infinity in its <inertial>; give finite numbers"
     elif not (np.abs(inertia).max() <= HEAVIEST and max(np.abs(body.lever)) <= FARTHEST):
@@ -61,6 +64,12 @@ def _wrong(model: pin.Model, i: int) -> Iterator[str]:
                 f"{where} has principal moments of inertia {moments}: one exceeds the sum of the others, "
                 f"which no body has; {_MEND}"
             )
+
+
+def _root(model: pin.Model) -> str:
+    links = (f for f in model.frames if f.parentJoint == 1 and f.type == pin.FrameType.BODY)
+    link = next(links, None)
+    return f"the root link {link.name!r}" if link is not None else "the root link"
 
 
 def repair_inertias(model: pin.Model) -> list[str]:

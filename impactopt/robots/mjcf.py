@@ -8,8 +8,6 @@ scenes, and says nothing of actuators.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
 
@@ -18,66 +16,16 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impactopt.errors import InputError, missing_package
-from impactopt.robots.actuators import Actuator
-from impactopt.robots.build import existing, joint_names
-from impactopt.robots.parts import Striker
+from impactopt.robots.build import existing, friction, set_friction
+from impactopt.robots.description import Description
+from impactopt.robots.mjcf_ties import Compiled, gravity_of, notes_of, ties_of
 
-__all__ = ["Mjcf", "compile_mjcf", "read_mjcf"]
+__all__ = ["compile_mjcf", "read_mjcf"]
 
 Array = NDArray[np.float64]
 _HINGES = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
 _TURNS = (pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ)  # without limits
 _SLIDES = (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ)
-
-
-@dataclass(kw_only=True)
-class Mjcf:
-    """A robot in an MJCF.
-
-    model : with its armature, limits, and its keyframes as reference configurations; a frame of type BODY for
-    each body, and an OP_FRAME for each site, by their names.  kp, kd, torque : by joint, what its actuators
-    say.  drives : friction and damping of joints.  sites : names of those on links that move.  coupled :
-    pairs of joints of which one follows the other.  shared : joints that move the body of another one too.
-    """
-
-    model: pin.Model
-    kp: dict[str, float] = field(default_factory=dict)
-    kd: dict[str, float] = field(default_factory=dict)
-    torque: dict[str, float] = field(default_factory=dict)
-    drives: dict[str, Actuator] = field(default_factory=dict)
-    sites: list[str] = field(default_factory=list)
-    coupled: list[tuple[str, str]] = field(default_factory=list)
-    shared: list[str] = field(default_factory=list)
-
-    def options(self, model: pin.Model, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Options of `Robot.from_model` for a model with some of these joints, under those that are given.
-
-        Raises
-        ------
-        InputError : two joints are left that move the same body, or of which one follows the other.
-        """
-        joints = joint_names(model)
-        for joint in (joint for joint in self.shared if joint in joints):
-            raise InputError(
-                f"MJCF: joint {joint!r} and another one move the same body, with no mass between them; "
-                "put a body with mass between the two, or lock one of them (`locked`)"
-            )
-        for one, other in self.coupled:
-            if one in joints and other in joints:
-                raise InputError(
-                    f"MJCF: joint {one!r} follows {other!r} by an equality, and here all joints have motors; "
-                    "lock one of them (`locked`)"
-                )
-        out = dict(given)
-        for key, found in (("kp", self.kp), ("kd", self.kd), ("torque_limit", self.torque)):
-            own = {joint: value for joint, value in found.items() if joint in joints}
-            if isinstance(given.get(key, {}), Mapping):
-                out[key] = {**own, **given.get(key, {})}
-        drives = {joint: drive for joint, drive in self.drives.items() if joint in joints}
-        out["actuators"] = {**drives, **(given.get("actuators") or {})}
-        named = {striker.name for striker in given.get("strikers", ())}
-        sites = [Striker(name=s, frame=s, point=np.zeros(3)) for s in self.sites if s not in named]
-        return {**out, "strikers": [*sites, *given.get("strikers", ())]}
 
 
 def compile_mjcf(path: str | PathLike[str]) -> Any:
@@ -93,24 +41,22 @@ def compile_mjcf(path: str | PathLike[str]) -> Any:
         raise InputError(f"MJCF {file}: {error}") from error
 
 
-def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Mjcf:
+def read_mjcf(path: str | PathLike[str], *, floating: bool | None = None) -> Description:
     """The robot of an MJCF: the body with a free joint, and joints below it; else all that have joints.
 
     floating : whether its root has a free joint; None: as the file says.
 
     Raises
     ------
-    InputError : no robot, or several; ball joints; loops (equality constraints that connect or weld).
+    InputError : no robot, or several; ball joints; equality constraints that hold it to other bodies.
     """
     mj = compile_mjcf(path)
     return _Reader(mj, f"MJCF {path}", floating).read()
 
 
-class _Reader:
+class _Reader(Compiled):
     def __init__(self, mj: Any, what: str, floating: bool | None) -> None:
-        import mujoco
-
-        self.mj, self.what, self.mujoco = mj, what, mujoco
+        super().__init__(mj, what)
         roots = [b for b in range(1, mj.nbody) if mj.body_parentid[b] == 0 and self._driven(b)]
         free = [b for b in roots if self._free(b)]
         if not roots:
@@ -122,18 +68,10 @@ class _Reader:
         if len(self.roots) > 1 and floating:
             raise InputError(f"{what} has several bodies with joints on the ground: it cannot float")
         self.floating = bool(free) if floating is None else floating
-        self.model = pin.Model()
         self.model.name = mj.names[: mj.names.index(b"\0")].decode() or "robot"
-        self.out = Mjcf(model=self.model)
-        self.body = {0: (0, pin.SE3.Identity(), 0)}  # MuJoCo's to joint, placement there, frame
-        self.joint: dict[int, int] = {}  # MuJoCo's to Pinocchio's
+        self.out = Description(kind="MJCF", model=self.model)
 
-    def name(self, kind: str, i: int) -> str:
-        """Of a thing; where it has none its kind and number."""
-        found = self.mujoco.mj_id2name(self.mj, getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i)
-        return str(found) if found else f"{kind}{i}"
-
-    def read(self) -> Mjcf:
+    def read(self) -> Description:
         inside = set(self.roots)
         for b in range(1, self.mj.nbody):  # parents come first
             if b in inside or int(self.mj.body_parentid[b]) in inside:
@@ -142,9 +80,11 @@ class _Reader:
         for s in range(self.mj.nsite):
             if int(self.mj.site_bodyid[s]) in inside:
                 self._add_site(s)
-        self._equalities()
         self._actuators()
         self._keyframes()
+        self.model.gravity = pin.Motion(gravity_of(self), np.zeros(3))
+        self.out.ties += ties_of(self)
+        self.out.notes += notes_of(self)
         return self.out
 
     def _driven(self, root: int) -> bool:
@@ -165,8 +105,6 @@ class _Reader:
             name = self.name("joint", first) if free else "root_joint"
             joint, place = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), name), _none()
             above = model.addJointFrame(joint, 0)
-        if not free:
-            self.out.shared += [self.name("joint", j) for j in range(first, first + count - 1)]
         for j in () if free else range(first, first + count):
             at = pin.SE3(np.eye(3), np.array(mj.jnt_pos[j]))
             joint, above = self._add_joint(j, joint, place * at, above)
@@ -207,14 +145,23 @@ class _Reader:
             lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
             lower[at.idx_q], upper[at.idx_q] = low, high
             model.lowerPositionLimit, model.upperPositionLimit = lower, upper
-        armature = np.array(model.armature)
-        armature[at.idx_v] = mj.dof_armature[lasting]
-        model.armature = armature
         self.joint[j] = added
-        viscous, coulomb = float(_first(mj.dof_damping[lasting])), float(mj.dof_frictionloss[lasting])
-        if viscous or coulomb:
-            self.out.drives[name] = Actuator(viscous_friction=viscous, coulomb_friction=coulomb)
+        self._add_to_joint(
+            j,
+            armature=mj.dof_armature[lasting],
+            viscous=0.0 if self.off("damper", "passive") else _first(mj.dof_damping[lasting]),
+            dry=0.0 if self.off("frictionloss", "constraint") else mj.dof_frictionloss[lasting],
+        )
         return added, int(model.addJointFrame(added, above))
+
+    def _add_to_joint(self, j: int, *, armature: float = 0.0, viscous: float = 0.0, dry: float = 0.0) -> None:
+        """More armature and friction; a negative one takes off."""
+        model, at = self.model, self.model.joints[self.joint[j]].idx_v
+        own = np.array(model.armature), *friction(model)
+        for numbers, more in zip(own, (armature, viscous, dry), strict=True):
+            numbers[at] += more
+        model.armature = own[0]
+        set_friction(model, *own[1:])
 
     def _add_site(self, s: int) -> None:
         joint, place, above = self.body[int(self.mj.site_bodyid[s])]
@@ -224,35 +171,38 @@ class _Reader:
         if joint > int(self.floating):
             self.out.sites.append(name)
 
-    def _equalities(self) -> None:
-        mj, kinds = self.mj, self.mujoco.mjtEq
-        for e in range(mj.neq):
-            if not mj.eq_active0[e]:
-                continue
-            one, other = int(mj.eq_obj1id[e]), int(mj.eq_obj2id[e])
-            if int(mj.eq_type[e]) in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
-                raise InputError(
-                    f"{self.what} closes a loop by the equality {self.name('equality', e)!r}; robots here "
-                    "are trees: take it out, with the rods that it holds"
-                )
-            if mj.eq_type[e] == kinds.mjEQ_JOINT and one in self.joint and other in self.joint:
-                self.out.coupled.append((self.name("joint", one), self.name("joint", other)))
-
     def _actuators(self) -> None:
         mj, kinds = self.mj, self.mujoco.mjtTrn
         inside = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
         most: dict[str, float] = {}
-        for a in range(mj.nu):
+        for a in range(len(mj.actuator_trntype)):
             j = int(mj.actuator_trnid[a, 0])
-            if int(mj.actuator_trntype[a]) not in inside or j not in self.joint:
+            if int(mj.actuator_trntype[a]) not in inside:
+                if mj.actuator_trntype[a] != kinds.mjTRN_TENDON:  # a tendon's is told with it
+                    self.out.notes.append(f"actuator {self.name('actuator', a)!r}, of no joint, is left out")
                 continue
-            name, gear = self.name("joint", j), abs(float(mj.actuator_gear[a, 0]))
+            if j not in self.joint:
+                continue
+            out = int(mj.actuator_outadr[a]) if hasattr(mj, "actuator_outadr") else a
+            name, gear = self.name("joint", j), abs(float(mj.actuator_gear[out, 0]))
             affine = mj.actuator_biastype[a] == self.mujoco.mjtBias.mjBIAS_AFFINE
             kp, kd = (-float(mj.actuator_biasprm[a, k]) * gear**2 if affine else 0.0 for k in (1, 2))
+            rotor, viscous = (
+                gear**2 * float(numbers[a]) if (numbers := self.numbers(f"actuator_{key}")).size else 0.0
+                for key in ("armature", "damping")
+            )
+            self._add_to_joint(j, armature=rotor, viscous=0.0 if self.off("damper", "passive") else viscous)
+            if self._disabled(a):
+                continue
             most[name] = most.get(name, 0.0) + _largest(mj, a, affine) * gear
             if kp > 0 or kd > 0:
                 self.out.kp[name] = self.out.kp.get(name, 0.0) + kp
                 self.out.kd[name] = self.out.kd.get(name, 0.0) + kd
+            if not self._simple(a):
+                self.out.notes.append(
+                    f"actuator {self.name('actuator', a)!r} has dynamics of its own, which are left out: a "
+                    "motor gives its torque at once, or with the `bandwidth` and `delay` that you give it"
+                )
         for j in self.joint:
             name = self.name("joint", j)
             if mj.jnt_actfrclimited[j]:
@@ -260,12 +210,27 @@ class _Reader:
                 most[name] = min(most[name], bound) if name in most else bound
             if np.isfinite(most.get(name, np.inf)):
                 self.out.torque[name] = most[name]
-            if self.out.kp.get(name, 0.0) > 0 and self.out.kd[name] == 0 and name in self.out.drives:
+            viscous = float(friction(self.model)[0][self.model.joints[self.joint[j]].idx_v])
+            if self.out.kp.get(name, 0.0) > 0 and self.out.kd[name] == 0 and viscous:
                 # a servo without damping of its own leans on the joint's, which is then no friction
-                drive = self.out.drives.pop(name)
-                self.out.kd[name] = drive.viscous_friction
-                if drive.coulomb_friction:
-                    self.out.drives[name] = Actuator(coulomb_friction=drive.coulomb_friction)
+                self.out.kd[name] = viscous
+                self._add_to_joint(j, viscous=-viscous)
+
+    def _disabled(self, a: int) -> bool:
+        """Whether the actuator's group is."""
+        group = int(self.mj.actuator_group[a])
+        return 0 <= group < 31 and bool(int(self.mj.opt.disableactuator) >> group & 1)
+
+    def _simple(self, a: int) -> bool:
+        """Whether an actuator has a force that is a control, or a servo of position and velocity, at once."""
+        mj, m = self.mj, self.mujoco
+        return bool(
+            mj.actuator_gaintype[a] == m.mjtGain.mjGAIN_FIXED
+            and int(mj.actuator_biastype[a]) in (int(m.mjtBias.mjBIAS_NONE), int(m.mjtBias.mjBIAS_AFFINE))
+            and mj.actuator_dyntype[a] == m.mjtDyn.mjDYN_NONE
+            and not self.numbers("actuator_delay")[a : a + 1].any()
+            and not self.numbers("actuator_dampingpoly")[a : a + 1].any()
+        )
 
     def _keyframes(self) -> None:
         mj = self.mj
@@ -288,8 +253,9 @@ def _largest(mj: Any, a: int, affine: bool) -> float:
     out = np.inf
     if mj.actuator_forcelimited[a]:
         out = float(np.abs(mj.actuator_forcerange[a]).min())
-    if mj.actuator_ctrllimited[a] and not affine:
-        out = min(out, float(np.abs(mj.actuator_ctrlrange[a]).min()) * abs(float(mj.actuator_gainprm[a, 0])))
+    k = int(mj.actuator_ctrladr[a]) if hasattr(mj, "actuator_ctrladr") else a
+    if mj.actuator_ctrllimited[k] and not affine:
+        out = min(out, float(np.abs(mj.actuator_ctrlrange[k]).min()) * abs(float(mj.actuator_gainprm[a, 0])))
     return out
 
 

@@ -265,6 +265,7 @@ class Source:
     options : what else was given: to the preset, or to `Robot.from_urdf` or `Robot.from_mjcf`.
     tools : what the robot was given to hold after that.
     repairs : inertias that were changed, in words.
+    notes : what of the file was left out, or taken otherwise than it says, in words.
     """
 
     preset: str | None = None
@@ -273,6 +274,7 @@ class Source:
     options: Mapping[str, Any] = field(default_factory=dict)
     tools: tuple[Tool, ...] = ()
     repairs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def read_only(array: ArrayLike) -> Array:

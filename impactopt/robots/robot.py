@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from os import PathLike, fspath
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from impactopt.errors import Mistakes, check_array
 from impactopt.robots import build, checks, tools
 from impactopt.robots import mjcf as _mjcf
-from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, numbers_of, with_classes
+from impactopt.robots import urdf as _urdf
+from impactopt.robots.actuators import MOMENTARY_PEAK, Actuator, known, numbers_of, with_classes
 from impactopt.robots.hinges import check_sole, with_hinges
-from impactopt.robots.inertias import GIVEN, REPAIRED, check_choice, check_inertias, repair_inertias
+from impactopt.robots.inertias import GIVEN, REPAIRED, check_inertias
+from impactopt.robots.names import tell_apart
 from impactopt.robots.parts import SoftGrip, Sole, Source, Striker, Tool, read_only
 
 __all__ = ["Robot", "Sole", "Striker", "Tool"]
@@ -87,9 +89,10 @@ class Robot:
         object.__setattr__(self, "strikers", dict(self.strikers))
         found, limits = Mistakes(), (self.torque_limit, self.velocity_limit, self.lower, self.upper)
         found.attempt(lambda: check_inertias(self.model))
-        found.attempt(lambda: checks.check_limits(self.joint_names, *limits))
+        kind = "URDF" if self.urdf else "MJCF" if self.mjcf else ""
+        found.attempt(lambda: checks.check_limits(self.joint_names, *limits, kind))
         found.raise_if_any(f"robot {self.name!r}")
-        object.__setattr__(self, "actuators", tuple(self.actuators) or (Actuator(),) * self.n)
+        object.__setattr__(self, "actuators", known(self.actuators or (Actuator(),) * self.n))
         checks.check_actuators(self.joint_names, self.actuators)
         for sole in self.soles:
             check_sole(self.model, sole)
@@ -128,17 +131,17 @@ class Robot:
         locked : joints to remove from the model: names (at angle 0), or angles [rad] by name.
         inertias : "given", or "repaired" where no body can have them: `source.repairs` lists these.
         options : as of `from_model`.
+
+        Raises
+        ------
+        InputError : no such file; Gazebo's springs and loops and <mimic>, unless their joints are locked.
         """
-        check_choice(inertias)
-        model = build.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
-        model = build.lock_joints(model, locked)
-        repairs = tuple(repair_inertias(model)) if inertias == REPAIRED else ()
-        robot = cls.from_model(model, name=name or model.name, **{"urdf": path, **options})
-        pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
-        robot = dataclasses.replace(robot, disable_collisions=pairs)
+        read = _urdf.read_urdf(path, srdf, floating=floating, repaired=inertias == REPAIRED)
         given = {"srdf": srdf, "name": name, "floating": floating, "locked": locked, "inertias": inertias}
-        source = Source(urdf=fspath(path), options=given | options, repairs=repairs)
-        return dataclasses.replace(robot, source=source)
+        model, every, source = read.made(path, given, options)
+        robot = cls.from_model(model, **every)
+        pairs = (*build.srdf_pairs(srdf), *robot.disable_collisions)
+        return dataclasses.replace(robot, disable_collisions=pairs, source=source)
 
     @classmethod
     def from_mjcf(
@@ -163,16 +166,12 @@ class Robot:
 
         Raises
         ------
-        InputError : no MuJoCo; no robot in the file; loops, ball joints, joints that follow others.
+        InputError : no MuJoCo; no robot; ball joints; springs, tendons, loops and followers that move.
         """
-        check_choice(inertias)
         read = _mjcf.read_mjcf(path, floating=floating)
-        model = build.lock_joints(read.model, locked)
-        repairs = tuple(repair_inertias(model)) if inertias == REPAIRED else ()
-        robot = cls.from_model(model, name=name or model.name, mjcf=path, **read.options(model, options))
         given = {"name": name, "floating": floating, "locked": locked, "inertias": inertias}
-        source = Source(mjcf=fspath(path), options=given | options, repairs=repairs)
-        return dataclasses.replace(robot, source=source)
+        model, every, source = read.made(path, given, options)
+        return dataclasses.replace(cls.from_model(model, **every), source=source)
 
     @classmethod
     def from_model(
@@ -214,20 +213,21 @@ class Robot:
             of that name (an SRDF's), or else of zero. The model's other postures are kept.
         disable_collisions : pairs of links that may pass through each other.
         urdf, mjcf : file whose visual shapes a picture shows, and whose collision shapes keep apart.
-        actuators : motors and gears, as of `with_actuators`.
+        actuators : motors and gears, as of `with_actuators`; friction is the model's where they have none.
         """
         build.check_count("sole", soles)
         build.check_count("striker", strikers)
         model = model.copy()
+        tell_apart(model)
         checks.check_joint_types(model)
         joints = build.joint_names(model)
         base = model.nv - len(joints)
         model.armature[base:] = build.armature(model, joints, armature, rotor or {})
-        drives = with_classes(actuators or {}, joints, (Actuator(),) * len(joints), model)
+        drives = with_classes(actuators or {}, joints, build.frictions(model, joints), model)
         limit = build.per_joint("torque_limit", torque_limit, joints, build.effort_limit(model)[base:])
         speed = build.per_joint("velocity_limit", velocity_limit, joints, build.velocity_limit(model)[base:])
         lower, upper = build.position_limit(model, joints, position_limit)
-        damping = build.per_joint("kd", kd, joints, np.minimum(150.0, 1.5 * limit))
+        damping = build.per_joint("kd", kd, joints, 1.5 * np.minimum(100.0, limit))
         for sole in soles:
             if sole.parent is not None:
                 build.add_frame(model, sole.frame, sole.parent, sole.placement, f"sole {sole.name!r}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from impactopt.errors import InputError, check_array, did_you_mean
@@ -60,7 +61,7 @@ def simulate(
             )
     _check_times({**(run.__kwdefaults__ or {}), **options}, float(reference.end))
     found = with_step_error(run, problem.robot, reference, scene_of(problem), **options)
-    return with_clearance(problem, found)
+    return with_clearance(problem, replace(found, expected=float(reference.contact_start)))
 
 
 def _check_times(options: Mapping[str, Any], end: float) -> None:

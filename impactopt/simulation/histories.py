@@ -13,7 +13,7 @@ from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads
 from impactopt.robots.robot import Robot
 from impactopt.simulation.result import Scene, Simulation
-from impactopt.simulation.soles import cop_margin, sole_names
+from impactopt.simulation.soles import cop_margins, sole_names
 from impactopt.simulation.touch import Touches
 
 Array = NDArray[np.float64]
@@ -75,7 +75,7 @@ def simulation_of(
         torque=torque,
         sole_ground=sole_ground,
         soles=sole_names(robot, scene),
-        cop_margin=cop_margin(robot, scene, q, sole_ground),
+        cop_margin=cop_margins(robot, scene, q, sole_ground),
         slip=slip,
         lift=lift,
         grip_force=np.linalg.norm(grips[:, :, :3], axis=2),

@@ -8,6 +8,7 @@ feed-forward), the robot's numbers and the scene's.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
+from impactopt.robots.sole_margins import BEARS, weight_of
 from impactopt.simulation.besides import Besides
 from impactopt.simulation.controller import ControllerSettings, WholeBodyController
 from impactopt.simulation.gears import GearWatch
@@ -26,15 +28,15 @@ from impactopt.simulation.mujoco_world import MujocoOptions, build_world, no_log
 from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
-from impactopt.simulation.soles import BEARS, sole_names, weight_of
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 THREE, NEXT, LAST = np.arange(3), [1, 2, 0], [2, 0, 1]  # axes, and those after and before each
 AWAY = np.array([0.0, 0.0, -100.0])  # [m] where what is broken goes
 FALLEN_TILT, FALLEN_DROP = 0.7, 0.3  # [rad] of the base from the reference's; of its height, as a fraction
 LEANS, STIRS = 0.2, 0.05  # [rad] of the base against the reference's last; [m/s] of it: more is no standing
+SLID = 0.05  # [m] of a sole along the floor, about half of one's width: it stands where it was not to
 
 
 class _Replay(MujocoRobot):
@@ -60,6 +62,7 @@ class _Replay(MujocoRobot):
         super().__init__(robot, world, *(site_name(k + 1) for k in range(len(scene.strikers))))
         self.grips = Welds(self.world, scene.hands)
         self.besides = Besides(self.world, solids)
+        self.planned = self.followed = reference
         self.follow(reference)
         self.struck = Struck(self.scene)
         # the target's state, and how far it has gone [m]
@@ -84,18 +87,14 @@ class _Replay(MujocoRobot):
         self.start(self.reference_q[0])
 
     def follow(self, reference: Any) -> None:
-        """What the servo follows from now on."""
-        world = self.perturbation
+        """What servo and controller follow from now on."""
+        world, self.followed = self.perturbation, reference
         self.servo = Servo(self.robot, reference, kp=world.kp, kd=world.kd, limit=world.torque_limit)
         self.reference_q = np.asarray(reference.q)
         if self.floating:
             self.upright = _upright(self.reference_q[:, 3:7].T)
-
-    def miss(self, reference: Any) -> None:
-        """What they follow from now on, as nothing is hit."""
-        self.follow(reference)
         if self.wbc is not None:
-            self.wbc.miss(reference)
+            self.wbc.follow(None if reference is self.planned else reference)
 
     def asked(self, t: float, forces: Array) -> tuple[Array, Array]:
         """Torque demand (n,) [N m] at a time [s], and what saturation leaves of it."""
@@ -232,8 +231,8 @@ class _Replay(MujocoRobot):
         w, x, y, z = self.data.qpos[3:7].tolist()
         return np.arccos(np.clip(self.upright[rows] @ _upright((x, y, z, w)), -1.0, 1.0))
 
-    def not_standing(self, sole_ground: Array, weight: float) -> str:
-        """Why the robot does not stand at the end, "" if it does."""
+    def not_standing(self, simulation: Simulation) -> str:
+        """Why the robot does not stand at the end of its simulation, where it stood; "" if it does."""
         if not self.floating:
             return ""
         lean, speed = float(self.base_errors(slice(-1, None))[0]), float(np.linalg.norm(self.data.qvel[:3]))
@@ -241,9 +240,13 @@ class _Replay(MujocoRobot):
             return f"leans at the end: base {lean:.2f} rad from where it should be"
         if speed > STIRS:
             return f"still moves at the end: base at {speed:.2f} m/s"
-        for name, wrench in zip(sole_names(self.robot, self.scene), sole_ground, strict=True):
-            if wrench[2] < BEARS * weight:
+        least = BEARS * weight_of(self.robot)
+        normal, slip = simulation.sole_normal[-1], simulation.slip.max(axis=0)
+        for name, force, slid in zip(simulation.soles, normal, slip, strict=True):
+            if force < least:
                 return f"the sole {name!r} bears no load at the end"
+            if slid > SLID:
+                return f"the sole {name!r} slid: {1e3 * slid:.0f} mm along the floor"
         return ""
 
 
@@ -274,8 +277,8 @@ def simulate_mujoco(
     :class:`impactopt.transcription.plan.Trajectory`. step [s], iterations, tolerance : of MuJoCo
     (semi-implicit Euler, Newton, elliptic cones). record : steps between recorded instants; every step is
     recorded in contact. perturbation : where the world differs from what was planned; default: nowhere.
-    missed : the reference that the robot goes on with if it has touched nothing by ``missed.contact_end``;
-        default: it does not notice.
+    missed : the reference of a robot that hits nothing, which it notices at ``missed.contact_end`` (see
+        :class:`impactopt.simulation.touch.FollowedReference`); default: it does not notice.
     controller : settings of a whole-body controller; default: the joints' servo.
     until [s] : it ends, if that is earlier.
 
@@ -304,6 +307,7 @@ def simulate_mujoco(
     ground = np.zeros((len(scene.soles) + len(scene.hands), 6))
     rows: list[tuple[Any, ...]] = []
     touches, saturated, peak, fall = Touches(), 0.0, 0.0, ""
+    followed = FollowedReference(reference, missed)
     motors, delay, cuts, passive = Motors(robot), Delay(robot), CutWatch(robot), robot.passive
     undriven = bool(passive.any())
     drive: Array | None = None  # torque of the motors
@@ -314,9 +318,9 @@ def simulate_mujoco(
         for k in range(round(min(float(reference.end) + settle, until) / step)):
             t = k * step
             mujoco.mj_step1(model, data)
-            if missed is not None and t >= missed.contact_end and not touches.intervals:
-                replay.miss(missed)
-                servo, missed = replay.servo, None
+            if (now := followed.at(t, bool(touches.intervals))) is not replay.followed:
+                replay.follow(now)
+                servo = replay.servo
             if k % hold == 0:
                 asked = replay.asked(t, forces)
                 # at rest before the start, it asked for the same
@@ -364,7 +368,7 @@ def simulate_mujoco(
                 if fall:
                     fall = f"{fall} at t = {t:.2f} s"
                     break
-    return simulation_of(
+    simulation = simulation_of(
         robot,
         replay.scene,
         rows,
@@ -377,7 +381,8 @@ def simulate_mujoco(
         saturated=saturated,
         cuts=cuts.told() if motors.lines else None,
         posture_error=posture_error(robot.model, replay.state()[0], replay.reference_q[-1]),
-        fall=fall or replay.not_standing(ground[: len(scene.soles)], weight_of(robot)),
+        fall=fall,
         touched=replay.besides.touched(),
         missed=world.missing,
     )
+    return simulation if fall else replace(simulation, fall=replay.not_standing(simulation))

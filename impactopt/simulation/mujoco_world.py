@@ -69,26 +69,32 @@ def build_world(
     ``target``. The contact law between target and striker is the engine's business. Hands that hold on are
     welded.
     """
-    spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver)
+    spec, bodies = robot_on_floor(robot, scene.strikers, perturbation, solver, scene.solids.floor)
     _solids(mujoco_module(), spec, bodies, scene, near)
     add_welds(spec, bodies, robot, scene.hands, solver.step)
     return spec.compile()
 
 
 def robot_on_floor(
-    robot: Robot, strikers: Sequence[str], perturbation: Perturbation, solver: MujocoOptions
+    robot: Robot,
+    strikers: Sequence[str],
+    perturbation: Perturbation,
+    solver: MujocoOptions,
+    height: float | None = 0.0,
 ) -> tuple[Any, list[Any]]:
     """The world of :func:`build_world` before it is compiled, without target and solids; and its bodies, as
     of :func:`robot_bodies`.
 
-    strikers : frames of the model that hit.
+    strikers : frames of the model that hit.  height : of the floor [m]; None: nothing can touch it.
     """
     mujoco = mujoco_module()
     spec = spec_of(robot, solver)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0  # friction as hard as the normal direction: no creep
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    floor = spec.worldbody.add_geom(name="floor", type=plane, size=[5.0, 5.0, 0.1])
+    floor = spec.worldbody.add_geom(
+        name="floor", type=plane, size=[5.0, 5.0, 0.1], pos=[0.0, 0.0, height or 0.0]
+    )
     _surface(floor, perturbation, sole=False)
     return spec, _robot_bodies(mujoco, spec, robot, strikers, perturbation)
 

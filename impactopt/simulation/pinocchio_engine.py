@@ -22,7 +22,7 @@ from impactopt.simulation.pinocchio_robot import PinocchioBody
 from impactopt.simulation.result import Scene, Simulation
 from impactopt.simulation.servo import Servo
 from impactopt.simulation.struck import Push, Struck
-from impactopt.simulation.touch import Touches
+from impactopt.simulation.touch import FollowedReference, Touches
 
 Array = NDArray[np.float64]
 
@@ -53,8 +53,8 @@ class _Rates:
 
 
 class _World:
-    def __init__(self, robot: Robot, scene: Scene, reference: Any) -> None:
-        self.robot, self.scene = robot, scene
+    def __init__(self, robot: Robot, scene: Scene, reference: Any, *, missing: bool = False) -> None:
+        self.robot, self.scene, self.missing, self.followed = robot, scene, missing, reference
         self.model, self.base = robot.model, robot.model.nv - robot.n
         self.body = PinocchioBody(
             robot, (*scene.soles, *scene.hands), np.zeros(6), scene.strikers, scene.normal
@@ -62,22 +62,31 @@ class _World:
         self.servo, self.struck = Servo(robot, reference), Struck(scene)
         self.motors, self.delay = Motors(robot), Delay(robot)
 
+    def follow(self, reference: Any) -> None:
+        """What the servo follows from now on."""
+        self.servo, self.followed = Servo(self.robot, reference), reference
+
     def at_start(self, reference: Any) -> _State:
         """Where the motion begins: at rest, with motors that give what is asked for."""
-        q, v, struck = np.array(reference.q[0]), np.zeros(self.model.nv), self.struck
-        first = np.array(self.servo.torque(0.0, self.servo.angles(q), v[self.base :]))
+        travel = self.struck.travel_at_start(reference)
+        return self._begin(0.0, np.array(reference.q[0]), np.zeros(self.model.nv), travel)
+
+    def at_contact(self, reference: Any) -> _State:
+        """Where contact is planned to begin: as the swing's reference ends."""
+        k = int(np.flatnonzero(reference.phase == 0)[-1])
+        return self._begin(float(reference.contact_start), np.array(reference.q[k]), reference.v[k], 0.0)
+
+    def _begin(self, t: float, q: Array, v: Array, travel: float) -> _State:
+        """A state before any contact."""
+        first = np.array(self.servo.torque(t, self.servo.angles(q), v[self.base :]))
         drive = self.motors.cut(first[1], v[self.base :])
-        return _State(
-            q,
-            v,
-            struck.travel_at_start(reference),
-            struck.untouched,
-            np.zeros(len(self.scene.strikers)),
-            drive,
-        )
+        return _State(q, v, travel, self.struck.untouched, np.zeros(len(self.scene.strikers)), drive)
 
     def depths(self, s: _State) -> Array:
-        """(h,) [m] of the striking points in the target, at the state at which the body has been last."""
+        """(h,) [m] of the striking points in the target, at the state at which the body has been last; -inf
+        where there is none."""
+        if self.missing:
+            return np.full(len(self.scene.strikers), -np.inf)
         return self.struck.depths(self.body.hand_places(), s.x)
 
     def rates(self, t: float, s: _State, *, forces: Array | None = None, step: float = 0.0) -> _Rates:
@@ -163,6 +172,71 @@ class _World:
         return replace(after, x=float(known.mean()) if known.size else push.travel)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Followed:
+    """A contact, from where it is planned to begin.
+
+    impulse [N s] to the target.  peak [N] : the largest force of all strikers together.  outcome : of the
+    target, by name and unit.  touches : start and end [s] since contact of each time that they touch.
+    events : when [s] since contact the target has switched.
+    """
+
+    impulse: float
+    peak: float
+    outcome: dict[str, float]
+    touches: tuple[tuple[float, float], ...]
+    events: tuple[float, ...]
+
+
+def follow_contact(
+    robot: Robot, reference: Any, scene: Scene, *, step: float, until: float, longest: float
+) -> Followed:
+    """The contact alone, in the same full dynamics, from the state and at the time at which it is planned.
+
+    reference : as of :func:`simulate_pinocchio`.  step [s].  until [s] since contact: it goes on for so long,
+    and from then on while they touch, for the `longest` time.
+
+    Raises
+    ------
+    InputError : it diverges.
+    """
+    world = _World(robot, scene, reference)
+    state, start = world.at_contact(reference), float(reference.contact_start)
+    left, peak, touches = state.target, 0.0, list[list[float]]()
+    side, events = world.struck.side(state.target, 0.0), list[float]()
+    touching = False
+    for k in range(round(longest / step)):
+        since = k * step
+        if since >= until and not touching:
+            break
+        first = world.rates(start + since, state, step=step)
+        world.delay.keep(start + since, first.asked)
+        push = first.push
+        if push is None:
+            touching = False
+        else:
+            peak = max(peak, push.peak)
+            for t, on in zip(since + push.times, push.touching, strict=True):
+                if on and not touching:
+                    touches.append([t, t])
+                if on:
+                    touches[-1][1] = t
+                touching = bool(on)
+        before, state = state, world.step(start + since, state, first, step)
+        now = world.struck.side(state.target, 0.0 if push is None else push.last)
+        events += [since + step] if now != side else []
+        side = now
+        left = state.target if state.impulses.sum() > before.impulses.sum() else left
+        check_not_diverged(state.v, start + since, step)
+    return Followed(
+        impulse=float(state.impulses.sum()),
+        peak=peak,
+        outcome=scene.target.outcome(left),
+        touches=tuple((float(a), float(b)) for a, b in touches),
+        events=tuple(events),
+    )
+
+
 def simulate_pinocchio(
     robot: Robot,
     reference: Any,
@@ -171,6 +245,8 @@ def simulate_pinocchio(
     step: float = 1e-4,
     settle: float = 0.3,
     record: int = 5,
+    missing: bool = False,
+    missed: Any = None,
     until: float = np.inf,
 ) -> Simulation:
     """The whole motion from the reference's first posture at rest, in constrained forward dynamics.
@@ -180,20 +256,25 @@ def simulate_pinocchio(
         order).  settle [s] : simulated beyond the end of the reference's motion.
     until [s] : it ends, if that is earlier.
     record : steps between recorded instants; every step is recorded in contact.
+    missing : there is no target.  missed : the reference of a robot that hits nothing, which it notices at
+        ``missed.contact_end`` (:class:`impactopt.simulation.touch.FollowedReference`); default: it does not.
 
     Raises
     ------
     InputError : the simulation diverges (with the time at which it did).
     """
-    world = _World(robot, scene, reference)
+    world = _World(robot, scene, reference, missing=missing)
     state = world.at_start(reference)
     left = state.target  # as the last touch has left it
     end = min(float(reference.end) + settle, until)
     rows: list[tuple[Any, ...]] = []
     saturated = peak = 0.0
     touches, gears, cuts = Touches(), GearWatch(robot), CutWatch(robot)
+    followed = FollowedReference(reference, missed)
     for k in range(round(end / step)):
         t = k * step
+        if (now := followed.at(t, bool(touches.intervals))) is not world.followed:
+            world.follow(now)
         first = world.rates(t, state, step=step)
         world.delay.keep(t, first.asked)
         cuts.look(t, first.wanted, first.cut, step)
@@ -227,6 +308,7 @@ def simulate_pinocchio(
         outcome=scene.target.outcome(left),
         saturated=saturated,
         cuts=cuts.told() if world.motors.lines else None,
-        posture_error=posture_error(robot.model, state.q, np.asarray(reference.q[-1])),
+        posture_error=posture_error(robot.model, state.q, np.asarray(world.followed.q[-1])),
         fall=None,
+        missed=missing,
     )

@@ -12,11 +12,13 @@ from impactopt.contact.laws import ContactLaw
 from impactopt.contact.targets import Target
 from impactopt.errors import InputError
 from impactopt.robots.loads import DriveLoads
+from impactopt.robots.sole_margins import least_margins
 from impactopt.simulation.motors import MotorCut
 from impactopt.simulation.solids import Solids, Touched
 
 Array = NDArray[np.float64]
 PHASES = ("swing", "collision", "follow")
+PHASES_OF_MISS = ("swing", "missed")  # up to the planned contact, and from there on
 REPORT = (
     "engine",
     "standing",
@@ -47,9 +49,9 @@ REPORT = (
     "motor_cut_joint",
     "motor_cuts",
     "sole_lift_collision_mm",
-    "min_normal_force_N",
     "hand_speed_m_s",
-    "sole_cop_margin_m",
+    "sole_cop_margin_mm",
+    "sole_force_N",
     "target",
     "grip_force_N",
     "clearance_mm",
@@ -101,9 +103,9 @@ class Simulation:
     q (k, nq) and v (k, nv), pin's; force (k,) [N]; target_speed, hand_speed (k,) [m/s]; demand (k, n) [N m]
     servo torque before saturation; torque (k, n) after it; sole_ground (k, soles, 6) wrench of the ground on
     each sole of the scene about the world's origin [N, N m], pulling where the engine holds the soles; soles:
-    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, nan
-    where it bears no load; slip, lift (k, soles) [m]: how far the corner of a sole that moved most went along
-    the ground, and rose.
+    their names; cop_margin (k, soles) [m]: from each sole's centre of pressure to its own nearest edge, as
+    of :func:`impactopt.robots.sole_margins.cop_margin`; slip, lift (k, soles) [m]: how far the corner of a
+    sole that moved most went along the ground, and rose.
     contact_start, contact_end [s]: nan if the target was not hit.  impulse [N s]: the contact force's
     integral over the whole motion.  peak_force [N]: its largest value, which may lie within a step.
     outcome: the target's result after the last touch, by name and unit (``speed_m_s``, ``depth_m``,
@@ -112,7 +114,8 @@ class Simulation:
     posture_error [rad]: of the joint, or of the base's orientation, that ends farthest from the reference's
     last posture.  touched: pairs of bodies that touched and should not have, if the engine has solids that
     push back.  clearance [m], nearest: the least distance of any two bodies that are not to touch, by exact
-    geometry, and which two.  missed: there was no target.  touches: start and end [s] and impulse [N s] of
+    geometry, and which two.  missed: there was no target.  expected [s]: when the reference has contact
+    begin.  touches: start and end [s] and impulse [N s] of
     each.  step_error: estimated error of the impulse by the engine's steps, relative; nan if it was not
     computed, or nothing was hit.
     gear (k, n) [N m]: torque through the gears, that of largest magnitude in all steps since the instant
@@ -147,6 +150,7 @@ class Simulation:
     clearance: float = np.nan
     nearest: tuple[str, ...] = ()
     missed: bool = False
+    expected: float = np.nan
     touches: tuple[tuple[float, float, float], ...] = ()
     step_error: float = np.nan
     gear: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
@@ -194,9 +198,11 @@ class Simulation:
         Without contact there is no speed at contact and no error of its impulse: None.
         """
         hit = bool(np.isfinite(self.contact_start))
-        if not hit and self.fall is None:
+        if not hit and self.fall is None and not self.missed:
             raise InputError("the simulated motion never touched the target")
-        phase, known = self.phase(), bool(np.isfinite(self.clearance))
+        known = bool(np.isfinite(self.clearance))
+        phase = self.phase() if hit else (self.time >= self.expected).astype(int)
+        names = PHASES if hit else PHASES_OF_MISS
         out: dict[str, Any] = {
             "engine": self.engine,
             "standing": self.standing,
@@ -223,21 +229,21 @@ class Simulation:
             out["impulses_Ns"] = self.impulses.tolist()
         ratio = np.abs(self.demand / torque_limit).max(axis=1)
         out["torque_ratio"] = {
-            n: float(ratio[phase == k].max()) for k, n in enumerate(PHASES) if (phase == k).any()
+            n: float(ratio[phase == k].max()) for k, n in enumerate(names) if (phase == k).any()
         }
         if len(polygon):
             inside = distance_inside(polygon, self.zmp())
             out["zmp_margin_m"] = {
                 n: float(np.nanmin(inside[phase == k]))
-                for k, n in enumerate(PHASES)
+                for k, n in enumerate(names)
                 if np.isfinite(inside[phase == k]).any()
             }
-            out["min_normal_force_N"] = float(self.sole_normal.min())  # of any one sole
-            out["sole_cop_margin_m"] = {
-                n: float(np.nanmin(m))
-                for n, m in zip(self.soles, self.cop_margin.T, strict=True)
-                if np.isfinite(m).any()
-            }
+            out |= least_margins(
+                self.soles,
+                self.cop_margin,
+                self.sole_normal,
+                {n: phase == k for k, n in enumerate(names)},
+            )
             if self.grip_force.size:
                 out["grip_force_N"] = float(self.grip_force.max())
             out["sole_slip_mm"] = 1e3 * float(self.slip.max())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from impactopt.bodies.clearance import GROUND
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.simulation.result import Scene
@@ -34,9 +33,11 @@ def solids_of(problem: ImpactProblem) -> Solids:
     solids = [Solid(name=piece.link, joint=piece.joint, vertices=piece.vertices) for piece in pieces]
     number = {id(piece): k for k, piece in enumerate(pieces)}
     pairs = [(number[id(a)], number[id(b)]) for found in bodies.pairs.values() for a, b in found]
-    place = {GROUND: FLOOR}
+    place = dict[int, int]()
     for w, body in enumerate(bodies.world):
-        if w == GROUND or body.core:
+        if body.ground:
+            place[w] = FLOOR
+        if body.ground or body.core:
             continue
         place[w] = len(solids)
         solids.append(
@@ -54,4 +55,5 @@ def solids_of(problem: ImpactProblem) -> Solids:
     for joint, w in bodies.world_pairs:
         if w in place:
             pairs += [(number[id(piece)], place[w]) for piece in bodies.links.of_joint[joint]]
-    return Solids(solids=tuple(solids), pairs=tuple(pairs))
+    height = problem.ground_height
+    return Solids(solids=tuple(solids), pairs=tuple(pairs), floor=0.0 if height is None else height)

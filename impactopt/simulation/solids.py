@@ -61,10 +61,14 @@ class Solid:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solids:
-    """All solids of a scene; pairs of their numbers that are not to touch, the floor's being `FLOOR`."""
+    """All solids of a scene; pairs of their numbers that are not to touch, the floor's being `FLOOR`.
+
+    floor : its height [m], where a pair has it.
+    """
 
     solids: tuple[Solid, ...] = ()
     pairs: tuple[tuple[int, int], ...] = ()
+    floor: float = 0.0
 
     def moved(self, way: Array) -> Solids:
         """With the target and what holds it somewhere else by ``way`` (3,) [m]."""
@@ -122,7 +126,7 @@ class Solids:
         out = []
         for one, other in self.pairs:
             if other == FLOOR:
-                gap = centre[:, one, 2] - radius[one]
+                gap = centre[:, one, 2] - radius[one] - self.floor
             else:
                 way = centre[:, one] - centre[:, other]
                 gap = np.linalg.norm(way, axis=1) - radius[one] - radius[other]

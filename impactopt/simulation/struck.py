@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -29,7 +29,8 @@ class Push:
 
     Of each striker (h,): forces [N], their means over the step, and over its first half (halves); peaks [N],
     when their sum is largest; depths [m] in the target, at the end. state, travel [m]: of the target, then;
-    since [s]: up to when in the step there was no force.
+    since [s]: up to when in the step there was no force. times (k,) [s] in the step, and whether there is a
+    force then (touching); last [N]: the force at the end.
     """
 
     forces: Array
@@ -39,6 +40,9 @@ class Push:
     travel: float
     depths: Array
     since: float = 0.0
+    times: Array = field(default_factory=lambda: np.zeros(0))
+    touching: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    last: float = 0.0
 
     @property
     def force(self) -> float:
@@ -156,6 +160,9 @@ class Struck:
             travel=travel + float(end[2 * h]),
             depths=np.where(np.isfinite(depths), end[:h], -np.inf),
             since=float(found.t[max(int(np.argmax(total > 0)) - 1, 0)]),
+            times=found.t,
+            touching=total > 0,
+            last=float(total[-1]),
         )
 
     def rates(self, state: Array, force: float) -> Array:

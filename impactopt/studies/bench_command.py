@@ -75,6 +75,13 @@ def _truth(controller: Controller = ControllerName.servo) -> None:
     """Every problem of problems/ and variants of the demo: planned, replayed on held and on free soles."""
 
 
+@_command("contacts")
+def _contacts(
+    count: Annotated[int, typer.Option(min=1, help="Number of problems.")] = 200, seed: Seed = 0
+) -> None:
+    """Solved, and true? Drawn boards, nails and masses on three arms, planned and replayed."""
+
+
 @_command("robustness")
 def _robustness(
     file: Annotated[
@@ -183,6 +190,11 @@ def _moved(
     quick: Annotated[bool, typer.Option("--quick", help="The planar arm only.")] = False,
 ) -> None:
     """Plans bent for other points, masses and stiffnesses: first order, and polished by the solver."""
+
+
+@_command("causes")
+def _causes(draws: Draws = 26, seed: Seed = 0) -> None:
+    """Drawn variants of the arms that ask too much: is there a plan where the message says there is?"""
 
 
 @_command("fidelity")
@@ -300,12 +312,14 @@ def _all(
 
     drawn = {"seed": seed, "workers": workers}
     options: dict[str, dict[str, Any]] = {
+        "contacts": {"count": FEW_PROBLEMS, "seed": seed},
         "robustness": {"draws": draws, **drawn},
         "baselines": drawn,
         "margins": {"draws": min(draws, FEW_DRAWS), "quick": True, **drawn},
         "feedback": {"problems": ["punch"], "draws": min(draws, FEW_DRAWS), **drawn},
         "models": {"quick": True},
         "moved": {"shifts": min(draws, FEW_DRAWS), "quick": True, "seed": seed},
+        "causes": {"seed": seed},
         "fidelity": {"workers": workers, "quick": True},
         "freezes": drawn,
         "gains": {"quick": True},

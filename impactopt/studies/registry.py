@@ -17,6 +17,7 @@ __all__ = ["BENCHES", "REPRODUCED", "names_of", "reproduce", "run_bench"]
 # name -> module in `bench`; `impactopt bench all` runs them in this order
 BENCHES = {
     "truth": "truth",
+    "contacts": "contacts",
     "robustness": "robustness",
     "replay": "replay",
     "baselines": "baselines",
@@ -24,6 +25,7 @@ BENCHES = {
     "feedback": "feedback",
     "models": "models",
     "moved": "moved",
+    "causes": "causes",
     "fidelity": "fidelity",
     "freezes": "freezes",
     "gains": "gains",

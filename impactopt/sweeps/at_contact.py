@@ -20,7 +20,7 @@ from impactopt.simulation.reference import FullDynamics
 
 __all__ = ["AtContact", "check_at_contact", "collision_model", "full_names"]
 
-_FIRST_STEP = 1e-4  # [s] of the full dynamics, which halve it
+_STEP = 1e-4  # [s] between instants of the full dynamics
 
 
 class AtContact(Section):
@@ -88,5 +88,5 @@ def collision_model(
         "horizon": section.horizon,
     }
     if section.model == "full":
-        return FullDynamics(**options, step=_FIRST_STEP)
+        return FullDynamics(**options, step=_STEP)
     return frozen_model(section.model, section.freezes, accuracy=accuracy, **options)

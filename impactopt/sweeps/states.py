@@ -18,7 +18,7 @@ from impactopt.errors import InputError, did_you_mean
 from impactopt.files.output import load_record
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.inverse_kinematics import inverse_kinematics
-from impactopt.kinematics.stance import Stance
+from impactopt.kinematics.stance import Free, Stance
 from impactopt.kinematics.support import support_polygon
 from impactopt.robots.robot import Robot
 from impactopt.simulation.reference import coasting_reference
@@ -109,6 +109,11 @@ class ContactStates:
 
     def _reach(self, point: tuple[float, ...]) -> Posture | str:
         robot, q = self.robot, self.start
+        if isinstance(self.stance, Free):
+            raise InputError(
+                f"[at_contact] posture: {robot.name} floats freely, so it reaches the point from no "
+                f"known place: name a posture; there are {', '.join(robot.postures)}"
+            )
         coordinates = self._coordinates(q)
         try:
             q = inverse_kinematics(coordinates, self.striker, np.array(point), q)
@@ -128,6 +133,8 @@ class ContactStates:
                 f"[at_contact] posture: {robot.name} has no posture {name!r}{did_you_mean(name, known)}; "
                 f"there are {', '.join(known)}"
             )
+        if isinstance(self.stance, Free) and result is None:
+            return Posture(q=q, polygon=np.zeros((0, 2)))
         robot.check_stance(q, self.stance.sole_names(robot))
         coordinates = self._coordinates(q)
         bend = None if v is None else coasting_reference(coordinates, q, v, until=lasts)

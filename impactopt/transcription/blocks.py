@@ -69,6 +69,7 @@ def sizes(
             "speed": 1,
             "event": int(bool(target.guards)),
             "invariant": int(bool(target.guards)),
+            "reserve": int(bool(target.guards)),
             **(dict.fromkeys(SECOND, 1) if second else {}),
         },
         "impact": {"base": base, "joints": n, "blow": 1},
@@ -98,7 +99,7 @@ def node(c: StanceCoordinates) -> BlockExpression:
     tau = rnea(c.configuration(y, legs), v, a) - c.sole_wrench_map(y, legs, w)
     out = {
         "closure": c.closure(y, legs),
-        "base": tau[: c.base] / base_scale(c, weight, lever),
+        "base": tau[: c.base, :] / base_scale(c, weight, lever),
         "torque": tau[c.base :] / limit,
         "leg_rate": leg_part(c, v) / rate_limit,
         "extension": c.leg_determinants(legs) / start,
@@ -180,7 +181,7 @@ def balance(c: StanceCoordinates, edges: int) -> BlockExpression:
     stages.append(Stage(ca.vertcat(com, h), ca.vertcat(*momentum(c.configuration(y, legs), v))))
     mass = sum(i.mass for i in c.model.inertias)
     velocity = h[:3] / mass
-    capture = com[:2] + velocity[:2] * ca.sqrt(com[2] / 9.81)
+    capture = com[:2] + velocity[:2] * ca.sqrt(-com[2] / float(c.model.gravity.linear[2]))
     polygon = ca.SX.sym("polygon", 3 * edges)
     e = ca.reshape(polygon, 3, edges).T
     out = {"capture": ca.mtimes(e[:, :2], capture) - e[:, 2], "vertical": velocity[2], "angular": h[3:]}

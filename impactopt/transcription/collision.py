@@ -84,7 +84,8 @@ class Collision(ContactNumbers, Collocated):
         # it ends with contact; where law or target might make it pull, it has to be kept from that
         last = (np.arange(n) == n - 1)[:, None]
         least = 0.0 if p.target.guards or pulls_apart(p.law) or guarded else np.where(last, 0.0, -np.inf)
-        # what is driven and rattles is held on to meanwhile: see `rattle`; of no use where forces are wanted
+        # what is driven and rattles is held on to meanwhile, and the check of plans says what that leaves
+        # out; of no use where forces are wanted
         self.holds = not p.target.turns and not any(isinstance(o, PeakForce) for o in p.objectives)
         if self.holds:
             driven = np.array([0 < s.phase < len(self.end) - 1 for s in self.stages])
@@ -276,7 +277,17 @@ class Collision(ContactNumbers, Collocated):
         b.equal("target's motion", place, states, first + part["target"], of_size)
         b.equal("target's motion", place, ["travel"], first + part["travel"], fast)
         b.equal("impulse", place, ["target"], first + part["impulse"], Measure("N s", 1.0, "off"))
+        k, still = self.stages[i].phase, [0.0] * target.n_states
         if i in self.end:
+            if target.reserve(still, 0.0, k):
+                b.rows.add(
+                    term=target.guards[k],
+                    place=place,
+                    components=["reserve"],
+                    outputs=first + part["reserve"],
+                    lower=0,
+                    measure=percent("short"),
+                )
             return
         if self._switches and target.guards:
             back = self._restitution(i)
@@ -289,14 +300,13 @@ class Collision(ContactNumbers, Collocated):
                 upper=0.0 if back else np.inf,
                 measure=Measure("m/s", 1.0, "the other way"),
             )
-        k, still = self.stages[i].phase, [0.0] * target.n_states
         if target.invariant(still, 0.0, k):
             b.rows.add(
                 term=target.guards[min(k, len(target.guards) - 1)],
                 place=place,
                 components=["target"],
                 outputs=first + part["invariant"],
-                lower=0,
+                lower=target.margin(k, self.stages[i].place),
                 measure=percent("out of turn"),
             )
 

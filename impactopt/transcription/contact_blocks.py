@@ -146,7 +146,7 @@ def collision(
     servo = ff + (stiff * ahead + damped * c.configuration(u0 - u, slower)[c.base :]) / limit
     out = {
         "closure": c.closure(y, legs),
-        "base": tau[: c.base] / base_scale(c, weight, lever),
+        "base": tau[: c.base, :] / base_scale(c, weight, lever),
         "joints": tau[c.base :] / limit - servo,
         "torque": servo,
         **slopes,
@@ -194,8 +194,8 @@ def force(
         events before them, of each phase, 1 in it else 0, and how long [s] it has to last; the second point.
     out = (f - law) / 100 N, state' - T d(state)/dt over its typical size, x' - speed [m/s], p' - T f [N s],
         approach speed [m/s], penetration / 1 cm, what is zero at separation / 100 N, speed of the target's
-        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts; of a second
-        striker: law, approach speed, penetration and what is zero at separation.
+        surface [m/s], what is zero when its phase ends, what is not below zero while it lasts, and when it
+        ends; of a second striker: law, approach speed, penetration and what is zero at separation.
     """
     ny, n = c.ny if frozen is None else 1, target.n_states
     y0, d1, d, u = (ca.SX.sym(s, ny) for s in ("y0", "d1", "d", "u"))
@@ -223,7 +223,7 @@ def force(
     numbers = {name: of_target[i] for i, name in enumerate(target.parameters)}
     pieces = [target.smooth(state, total, k, numbers) for k in phases or (0,)]
     speed, moves = ca.SX(pieces[0][0]), ca.vertcat(ca.SX(0, 1), *pieces[0][1])
-    event = invariant = ca.SX(0, 1)
+    event = invariant = reserve = ca.SX(0, 1)
 
     def of_phase(parts: list[list[Any]]) -> Any:
         return sum((ca.vertcat(ca.SX(0, 1), *part) * within[k] for k, part in enumerate(parts) if part), 0.0)
@@ -234,6 +234,7 @@ def force(
             [[target.guard(state, total, T - shortest, k, numbers)] for k in range(len(target.guards))]
         )
         invariant = of_phase([target.invariant(state, total, k, numbers) for k in phases])
+        reserve = ca.SX(of_phase([target.reserve(state, total, k, numbers) for k in phases]))
     of_hands = []
     for k, (way, approach) in enumerate(hands):
         penetration, rate = way - gone, approach - speed
@@ -253,6 +254,7 @@ def force(
         "speed": speed,
         "event": event,
         "invariant": invariant,
+        "reserve": reserve,
         **(dict(zip(SECOND, of_hands[1], strict=True)) if second else {}),
     }
     z = [*([y0] if frozen is None else []), d1, T1, d, T, u, f, state, slope, x, rate_x, x1, rate_p]
@@ -286,7 +288,7 @@ def carried(c: StanceCoordinates) -> BlockExpression:
     force = _inverse_dynamics(c, c.configuration(y, legs), v, ca.SX.zeros(c.rb.nv)) - c.sole_wrench_map(
         y, legs, w
     )
-    out = {"base": force[: c.base] / base_scale(c, weight, lever)}
+    out = {"base": force[: c.base, :] / base_scale(c, weight, lever)}
     return make_block([y, legs, u, w], [weight, lever], out, lanes=1)
 
 
@@ -321,7 +323,7 @@ def impact(c: StanceCoordinates, striker: str) -> BlockExpression:
     stiff = damping / 2 * ca.sqrt((lost / blow + inverse_mass) / stiffness)
     e = rigid * given + (1 - rigid) * two_mass_restitution(stiff)
     out = {
-        "base": balance[: c.base] / (0.1 * base_scale(c, weight, lever)),
+        "base": balance[: c.base, :] / (0.1 * base_scale(c, weight, lever)),
         "joints": balance[c.base :] / (0.1 * limit),
         "blow": blow * inverse_mass + lost - (1 + e) * approach,
     }
@@ -351,7 +353,7 @@ def first_instant(c: StanceCoordinates, striker: str, law: ContactLaw) -> BlockE
     v, a = c.motion(y, legs, u0, ca.SX.zeros(ny))
     named = {name: of_law[i] for i, name in enumerate(law.parameters)}
     out = {
-        "base": balance[: c.base] / base_scale(c, weight, lever),
+        "base": balance[: c.base, :] / base_scale(c, weight, lever),
         "joints": balance[c.base :] / limit,
         "law": (f - law.branch(0.0, ca.dot(push, v) - before, True, named)) / FORCE_SCALE,
         "rotors": -armature * (a + jump)[c.base :] / limit,

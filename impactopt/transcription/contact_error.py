@@ -117,6 +117,14 @@ def refined_elements(error: ContactError | None, elements: Elements, asked: floa
     return None if refined == elements else refined
 
 
+def all_halved(elements: Elements) -> Elements | None:
+    """All of them in two, where a phase may have so many; None where none may."""
+    finer = tuple(
+        new if len(new) <= _MOST else old for new, old in zip(halved(elements), elements, strict=True)
+    )
+    return None if finer == elements else finer
+
+
 class _Again:
     """The contact alone on elements half as long, from a state at contact that is given, for as long."""
 
@@ -158,13 +166,27 @@ class _Again:
         for new, old in zip(self.hit.collisions, self._of.collisions, strict=True):
             assert isinstance(new, Collision) and isinstance(old, Collision)
             carry_contact(new, old, z, x)
-            held += [group.index(0) for group in new.T]
             held += [new.after.index(0)] if new.after.count else []
-        free = np.setdiff1d(np.arange(program.n), np.concatenate(held))
         ends = {*self._builder.problem.target.guards, "end of compression", "separation"}
         equal = program.g_lower == program.g_upper
-        rows = np.flatnonzero([e and o.term not in ends for e, o in zip(equal, program.origins, strict=True)])
-        self._newton(z, free, rows)
+        events = np.array([o.term in ends for o in program.origins])
+
+        def parts(*, timed: bool) -> tuple[Index, Index]:
+            """Free variables, and the rows that determine them; whether events end phases when they come."""
+            times = [] if timed else [g.index(0) for hit in self.hit.collisions for g in hit.T]
+            free = np.setdiff1d(np.arange(program.n), np.concatenate([*held, *times]))
+            return free, np.flatnonzero(equal & (timed | ~events))
+
+        before = z.copy()
+        try:
+            if self._builder.problem.second is not None:
+                raise ArithmeticError("two strikers end one phase")
+            free, rows = parts(timed=True)
+            self._newton(z, free, rows)
+        except ArithmeticError:
+            z = before
+            free, rows = parts(timed=False)
+            self._newton(z, free, rows)
         branches = z.copy()
         for _ in range(_SWITCHES if switches(self._builder.problem.law) else 0):
             if not self._turned(z):

@@ -12,15 +12,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.kinematics.support import margin, zmp
+from impactopt.kinematics.wrench_cone import contact_wrench_cone
 from impactopt.problem.terms import ContactWrenchCone, TorqueLimit
-from impactopt.transcription.plan import Plan
+from impactopt.robots.sole_margins import cop_margin, least_kept, weight_of
+from impactopt.transcription.plan import Plan, sampled
 from impactopt.transcription.planned_loads import gear_share
 from impactopt.transcription.reference import complete_reference
 
 Array = NDArray[np.float64]
-_SHARE = 0.5  # of a margin that may be given up between nodes
-_ZMP, _TORQUE = 1e-3, 0.01  # [m], and of the limit: what may be given up of any
+STEP = 1e-3  # [s] at which a motion is looked at: as the servo's reference is sampled
+_SHARE, _TORQUE = 0.5, 0.01  # of the room to all torque, and of the limit: what may be given up between nodes
+_FRICTION = 1.1  # of the friction coefficient that a plan may use: what it may use between nodes
+_ROUNDING = 1e-6  # of the weight, by which a cone's rows may be off
 GEAR = 0.03  # of what a gear may bear: what it may bear more between nodes, or collocation points
 
 
@@ -40,11 +43,12 @@ NO_MORE = MoreNodes()
 
 
 def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
-    """Those known, and more where the plan leaves its limits half-way from one node to the next.
+    """Those known, and more in the middle between two nodes where the plan leaves its limits on the way.
 
-    That is where it gives up more than half of a margin that it has at the nodes: of the ZMP to the edge of
-    the support polygon, of torques to all that the motors have; where a joint of a held leg is faster than it
-    may be; and where a gear bears 3 % more than it may.
+    It is looked at every millisecond. That is where a sole gives up more than half of a margin that it has at
+    the nodes: of its centre of pressure to its own edges, or of its least normal force; or uses a tenth more
+    friction than it may; where torques give up half of the room to all that the motors have; where a joint of
+    a held leg is faster than it may be; and where a gear bears 3 % more than it may.
     """
     start = plan.coordinates.split(plan.problem.start_posture)[1]
     swing, legs = _middles_outside(plan, 0, start)
@@ -60,19 +64,30 @@ def nodes_to_add(plan: Plan, known: MoreNodes) -> MoreNodes:
 def _middles_outside(
     plan: Plan, phase: int, legs: Array, *, missed: bool = False
 ) -> tuple[list[float], Array]:
-    """Middles between nodes at which the plan is out of its limits, and the legs at the last of them."""
+    """Middles between nodes between which the plan is out of its limits, and the legs at its end."""
     p, c = plan.problem, plan.coordinates
     curve, begin, nodes, _ = plan.segment(phase, missed=missed)
-    places = (nodes[1:] + nodes[:-1]) / 2
-    y, yd, ydd, wrench = plan.independent(phase, begin + places * curve.duration, missed=missed)
-    q, v, a, torque, ground = complete_reference(p, y, yd, ydd, wrench, legs)
-    limit, cone = p.term(TorqueLimit).fraction, p.term(ContactWrenchCone)
-    ratio = np.abs(torque / p.robot.torque_limit).max(axis=1, initial=0.0)
+    time = sampled(0.0, curve.duration, STEP)
+    at = complete_reference(p, *plan.independent(phase, begin + time, missed=missed), legs)
+    limit, joints = p.term(TorqueLimit).fraction, slice(c.base, None)
+    ratio = np.abs(at.torque / p.robot.torque_limit).max(axis=1, initial=0.0)
     outside = ratio > limit + max(_SHARE * (1.0 - limit), _TORQUE)
     # the others' rates are bounded by their splines' control points
-    outside |= (np.abs(v[:, c.base :]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
-    outside |= gear_share(p, torque, a[:, c.base :]) > 1.0 + GEAR
-    if len(plan.polygon):
-        inside = margin(plan.polygon, zmp(ground)) >= cone.margin - max(_SHARE * cone.margin, _ZMP)
-        outside |= ~inside | (ground[:, 2] <= 0.0)
-    return [float(s) for s in places[outside]], c.split(q[-1])[1]
+    outside |= (np.abs(at.v[:, joints]) > p.robot.velocity_limit)[:, c.dependent].any(axis=1)
+    outside |= gear_share(p, at.torque, at.a[:, joints]) > 1.0 + GEAR
+    outside |= _soles_outside(plan, at.sole_wrench)
+    between = np.searchsorted(nodes, time[outside] / curve.duration, side="right").clip(1, len(nodes) - 1)
+    middles = [float((nodes[k - 1] + nodes[k]) / 2) for k in np.unique(between)]
+    return middles, c.split(at.q[-1])[1]
+
+
+def _soles_outside(plan: Plan, wrenches: Array) -> NDArray[np.bool_]:
+    """Instants (k,) at which some sole keeps too little of its limits, from wrenches (k, 6 a sole)."""
+    robot, soles, cone = plan.problem.robot, plan.coordinates.soles, plan.problem.term(ContactWrenchCone)
+    own, least = wrenches.reshape(len(wrenches), -1, 6)[:, : len(soles)], least_kept(cone.margin)
+    outside = (cop_margin(robot, [sole.polygon for sole in soles], own) < least).any(axis=1)
+    outside |= (own[:, :, 2] < _SHARE * cone.minimum_force).any(axis=1)
+    for k, sole in enumerate(soles):
+        rows = contact_wrench_cone(sole.polygon, _FRICTION * cone.friction, margin=max(least, 0.0))
+        outside |= (own[:, k] @ rows.T < -_ROUNDING * weight_of(robot)).any(axis=1)
+    return np.asarray(outside)

@@ -17,9 +17,16 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.kinematics.splines import CubicSpline
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.problem import ImpactProblem
-from impactopt.transcription.reference import complete_reference
+from impactopt.problem.terms import ContactWrenchCone
+from impactopt.robots.sole_margins import cop_margin, least_margins
+from impactopt.transcription.reference import Completed, complete_reference
 
 Array = NDArray[np.float64]
+
+
+def sampled(start: float, end: float, step: float) -> Array:
+    """Instants (k,) [s] about every ``step`` [s], both ends included."""
+    return np.linspace(start, end, max(2, round((end - start) / step) + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +36,8 @@ class Trajectory:
     time (k,) [s], ascending, an instant twice where the reference jumps; phase (k,): 0 swing, 1 collision, 2
     follow-through; q (k, nq) pin configurations; v (k, nv) pin velocities; a (k, nv); torque (k, n)
     feed-forward [N m]; ground (k, 6) total ground wrench about the world's origin that the feed-forward
-    assumes [N, N m]. contact_start, contact_end, end [s]: when the plan expects contact to begin and to end,
+    assumes [N, N m], sole_wrench (k, 6 a sole, 6 a hand that holds on) its parts, in own frames; (0, 0): not
+    known. contact_start, contact_end, end [s]: when the plan expects contact to begin and to end,
     and the motion to be over.
     """
 
@@ -40,6 +48,7 @@ class Trajectory:
     a: Array = field(repr=False)
     torque: Array = field(repr=False)
     ground: Array = field(repr=False)
+    sole_wrench: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     contact_start: float
     contact_end: float
     end: float
@@ -124,6 +133,7 @@ class Plan:
     hand_speed : [m/s] along the normal, at contact.
     impulse : [N s] to the target.
     scenarios : what is predicted of other targets, in the problem's order, without those that are missing.
+    coast_wrench : (6 a sole) where a robot that has hit nothing ceases to coast; None as of `abort`.
     abort, abort_wrench : the abort motion, as `follow` and `follow_wrench`; None if the problem has none.
     """
 
@@ -142,6 +152,7 @@ class Plan:
     scenarios: tuple[PlannedScenario, ...] = ()
     abort: CubicSpline | None = None
     abort_wrench: Array | None = None
+    coast_wrench: Array | None = None
 
     def __repr__(self) -> str:
         """One line: its arrays would fill pages."""
@@ -178,13 +189,16 @@ class Plan:
 
         time (k,) [s] : since the motion's start.
         phase 0: swing; 1: contact, where the reference coasts at its velocity at contact; 2: follow-through,
-        then rest; ``missed``: the abort motion instead.
+        then rest; ``missed``: coasting as long as it takes to notice, and the abort motion, instead.
         """
         ts, nw = np.asarray(time, dtype=float), self.swing_wrench.shape[1]
         if phase == 1:
             end, rate, _ = self.swing.sample(self.contact_start)
             y = end + rate * (ts[:, None] - self.contact_start)
             wrenches = np.tile(self.swing_wrench[-1], (len(ts), 1))
+            if missed and self.coast_wrench is not None:
+                way = (ts - self.contact_start) / (self.segment(2, missed=True)[1] - self.contact_start)
+                wrenches += way[:, None] * (self.coast_wrench - self.swing_wrench[-1])
             return y, np.repeat(rate, len(ts), axis=0), np.zeros_like(y), wrenches
         curve, start, nodes, wrench = self.segment(phase, missed=missed)
         local = np.clip(ts - start, 0.0, curve.duration)
@@ -233,24 +247,19 @@ class Plan:
         legs = self.coordinates.split(self.problem.start_posture)[1]
         parts: list[tuple[Any, ...]] = []
         for phase, (a, b) in enumerate(((0.0, t0), (t0, t1), (t1, end))):
-            times = np.linspace(a, b, max(2, round((b - a) / step) + 1))
+            times = sampled(a, b, step)
             if phase == 0 and known is not None:
                 own = known.phase == 0
-                rows: tuple[Array, ...] = (
-                    known.q[own],
-                    known.v[own],
-                    known.a[own],
-                    known.torque[own],
-                    known.ground[own],
-                )
+                rows = Completed(*(getattr(known, name)[own] for name in Completed._fields))
             else:
                 rows = complete_reference(self.problem, *self.independent(phase, times, missed=missed), legs)
             parts.append((phase, times, *rows))
             legs = self.coordinates.split(parts[0][2][-1])[1] if phase == 0 else legs
         phases = np.concatenate([np.full(len(p[1]), p[0]) for p in parts])
-        time, q, v, a_, torque, ground = (np.concatenate([p[k] for p in parts]) for k in range(1, 7))
-        # held while in contact: the collision model counts on what makes the robot coast at contact
-        torque[phases == 1] = self.collision.torque[0]
+        time, q, v, a_, torque, ground, wrench = (np.concatenate([p[k] for p in parts]) for k in range(1, 8))
+        # held while in contact: the collision model counts on what makes the robot coast at contact. Beyond
+        # the planned contact nothing does, and postures on the way differ: there it is what coasting needs
+        torque[(phases == 1) & (time <= self.contact_end)] = self.collision.torque[0]
         return Trajectory(
             time=time,
             phase=phases,
@@ -259,6 +268,7 @@ class Plan:
             a=a_,
             torque=torque,
             ground=ground,
+            sole_wrench=wrench,
             contact_start=t0,
             contact_end=t1,
             end=rest,
@@ -281,14 +291,14 @@ class Plan:
         """
         last, t1, _, _ = self.segment(2, missed=missed)
         t0, end = self.contact_start, t1 + last.duration
-        within = np.linspace(t0, t1, max(2, round((t1 - t0) / step) + 1))
+        within = sampled(t0, t1, step)
         during = self.closed(self.through_contact((within - t0) / max(t1 - t0, 1e-12), missed=missed))
         if reference is not None:
             parts = [
                 (reference.time[k], reference.q[k]) for k in (reference.phase == 0, reference.phase == 2)
             ]
         else:
-            spans = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in ((0.0, t0), (t1, end))]
+            spans = [sampled(a, b, step) for a, b in ((0.0, t0), (t1, end))]
             parts = [
                 (times, self.closed(self.independent(phase, times, missed=missed)[0]))
                 for phase, times in zip((0, 2), spans, strict=True)
@@ -338,14 +348,18 @@ class Plan:
         return np.array(q).reshape(len(y), self.problem.robot.nq)
 
     def margins(
-        self, trajectory: Trajectory | None = None, collision: PlannedCollision | None = None
+        self,
+        trajectory: Trajectory | None = None,
+        collision: PlannedCollision | None = None,
+        missed: Trajectory | None = None,
     ) -> dict[str, dict[str, float]]:
-        """Planned ZMP margin [m] and torque demand over limit, in swing, collision and follow-through.
+        """Planned ZMP margin [m] and torque demand over limit, in swing, collision, follow-through, and from
+        the planned contact on if nothing is hit.
 
         Of an impact without duration the plan knows neither, so there is no number for the collision.
 
         trajectory : the reference, if it is known.  collision : the planned one at more instants than the
-        program has, such as `ContactError.finer`.
+        program has, such as `ContactError.finer`.  missed : the reference of a robot that hits nothing.
         """
         ref = self.trajectory() if trajectory is None else trajectory
         limit = self.problem.robot.torque_limit
@@ -354,7 +368,10 @@ class Plan:
         grounds = [ref.ground[phase == 0], hit.ground, ref.ground[phase == 2]]
         during = hit.torque if len(hit.ground) else hit.torque[:0]
         torques = [ref.torque[phase == 0], during, ref.torque[phase == 2]]
-        names = ("swing", "collision", "follow")
+        if missed is not None:
+            grounds.append(missed.ground[missed.phase > 0])
+            torques.append(missed.torque[missed.phase > 0])
+        names = ("swing", "collision", "follow", "missed")[: len(torques)]
         ratio = {n: float(np.abs(t / limit).max()) for n, t in zip(names, torques, strict=True) if len(t)}
         out = {"torque_ratio": ratio}
         if len(self.polygon):
@@ -364,3 +381,47 @@ class Plan:
                 if len(g)
             }
         return out
+
+    def sole_margins(
+        self,
+        trajectory: Trajectory | None = None,
+        collision: PlannedCollision | None = None,
+        missed: Trajectory | None = None,
+    ) -> dict[str, Any]:
+        """Planned margins of each sole by itself, and what is asked of them, as ``summary.json`` has them.
+
+        ``sole_cop_margin_mm`` and ``sole_force_N`` by sole and phase: the least distance of its centre of
+        pressure from its own edges (:func:`impactopt.robots.sole_margins.cop_margin`) and its least normal
+        force, every millisecond of swing and follow-through, at the instants of the collision that are known,
+        and after a blow that meets nothing. ``sole_cop_margin_asked_mm`` by phase, ``sole_force_asked_N``.
+        Nothing of a robot without soles.
+
+        trajectory, collision : as of :meth:`margins`.  missed : the reference of a missed blow, if known.
+        """
+        c, cone = self.coordinates, self.problem.term(ContactWrenchCone)
+        if not c.soles:
+            return {}
+        ref = self.trajectory() if trajectory is None else trajectory
+        hit = self.collision if collision is None else collision
+        parts = {
+            "swing": ref.sole_wrench[ref.phase == 0],
+            "collision": hit.sole_wrench,
+            "follow": ref.sole_wrench[ref.phase == 2],
+        }
+        if self.abort is not None:
+            way = self.trajectory(missed=True, known=ref) if missed is None else missed
+            parts["missed"] = way.sole_wrench[way.phase > 0]
+        labels = np.repeat(list(parts), [len(part) for part in parts.values()])
+        wrench = np.concatenate(list(parts.values())).reshape(len(labels), -1, 6)[:, : len(c.soles)]
+        margins = cop_margin(self.problem.robot, [sole.polygon for sole in c.soles], wrench)
+        asked = {name: cone.collision_margin if name == "collision" else cone.margin for name in parts}
+        return {
+            **least_margins(
+                [sole.name for sole in c.soles],
+                margins,
+                wrench[:, :, 2],
+                {name: labels == name for name in parts},
+            ),
+            "sole_cop_margin_asked_mm": {n: 1e3 * m for n, m in asked.items() if m is not None},
+            "sole_force_asked_N": cone.minimum_force,
+        }

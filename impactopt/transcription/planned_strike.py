@@ -75,4 +75,4 @@ class PlannedStrike:
         data = model.createData()
         pin.centerOfMass(model, data, self.posture_after, self.velocity_after)
         com, rate = np.array(data.com[0]), np.array(data.vcom[0])
-        return np.asarray(com[:2] + rate[:2] * np.sqrt(com[2] / 9.81))
+        return np.asarray(com[:2] + rate[:2] * np.sqrt(com[2] / np.linalg.norm(model.gravity.linear)))

@@ -128,7 +128,7 @@ class Shooting:
     # ------------------------------------------------------------------ compiled
     @cached_property
     def _value(self) -> _Called:
-        rest: tuple[str, ...] = ("force", "target_speed", "hand_speed")
+        rest: tuple[str, ...] = ("separated", "force", "target_speed", "hand_speed")
         rest += ("target_result",) if self.model.target.results else ()
         return _Called(self.model.function((*self._carried, *rest), parameters=("reference",), by=()))
 

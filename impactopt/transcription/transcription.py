@@ -328,5 +328,6 @@ class Transcription(ContactProgram):
             follow_wrench=self.follow.w.read(x),
             abort=None if abort is None else abort.spline(x),
             abort_wrench=None if abort is None else abort.w.read(x),
+            coast_wrench=None if abort is None else abort.coast_w.read(x)[0],
             **self.hit.decode(x, self.program.outputs(x)),
         )

@@ -270,6 +270,7 @@ class Blow:
         target, law, place, phase = self.problem.target, self.problem.law, self.place(i), self.stages[i].phase
         inner, n = i not in self.end, target.n_states
         guarded = inner and bool(target.invariant([0.0] * n, 0.0, phase))
+        reserved = not inner and bool(target.reserve([0.0] * n, 0.0, phase))
         signed = inner and bool(target.guards) and _switches(law)
         releases = phase == self.phases - 1
 
@@ -290,6 +291,8 @@ class Blow:
                 parts.append(np.array([rate]))
             if guarded:
                 parts.append(np.array([float(x) for x in target.invariant(now, f, phase, self.target)]))
+            if reserved:
+                parts.append(np.array([float(x) for x in target.reserve(now, f, phase, self.target)]))
             return np.concatenate(parts)
 
         states = [f"state {k}" for k in range(n)]
@@ -304,7 +307,10 @@ class Blow:
             rows.append(("approach speed", place, ["striker and target"], *way))
         if guarded:
             name = target.guards[min(phase, len(target.guards) - 1)]
-            rows.append((name, place, ["target"], 0.0, np.inf))
+            least = target.margin(phase, self.stages[i].place)
+            rows.append((name, place, ["target"], least, np.inf))
+        if reserved:
+            rows.append((target.guards[phase], place, ["reserve"], 0.0, np.inf))
         return [Piece.of(value, rows)]
 
     def _ends(self) -> list[Piece]:

@@ -35,7 +35,7 @@ from impactopt.verification.apart import apart_pieces
 from impactopt.verification.blow import Blow
 from impactopt.verification.drives import COASTED, Drives, node_torque
 from impactopt.verification.motions import Limits, Way, node_piece, rate_pieces
-from impactopt.verification.robot_motion import GRAVITY, RobotMotion
+from impactopt.verification.robot_motion import RobotMotion
 from impactopt.verification.variables import Piece, Variables
 from impactopt.verification.worth import GONE, orientation_pieces, price_pieces, speed_pieces, worth_pieces
 
@@ -368,7 +368,7 @@ class Program:
                 y, legs, u = state(v)
                 q, qd, _ = robot.motion(y, legs, u, np.zeros(robot.ny))
                 com, fast, turning = robot.momentum(q, qd)
-                capture = com[:2] + fast[:2] * np.sqrt(com[2] / GRAVITY)
+                capture = com[:2] + fast[:2] * np.sqrt(-com[2] / robot.model.gravity.linear[2])
                 edges = inward @ capture - offset - (margin or 0.0)
                 if equal:
                     turning = turning - v.get("angular momentum")

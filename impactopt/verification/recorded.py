@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from impactopt.bodies.clearance import MISSED, Places
 from impactopt.kinematics.support import margin, support_polygon, zmp
 from impactopt.problem.objectives import Impulse
+from impactopt.problem.terms import ContactWrenchCone
+from impactopt.robots.sole_margins import SHARE, cop_margin, least_kept
 from impactopt.verification.motions import Way
 from impactopt.verification.program import Program
 from impactopt.verification.variables import Variables
@@ -89,12 +91,11 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
     r, n = robot.robot, robot.n
     start, end = (float(arrays[f"{prefix}_contact_{side}"]) for side in ("start", "end"))
     worst.note(f"{prefix} times", _gap(start, v.one(swing.T)), "contact")
+    lasts = blow = sum(v.one(name) for name in p.blows[0].durations) if p.blows else end - start
     if not p.problem.lasts:
-        lasts = 0.0
-    elif last.kind == "abort":
+        lasts = blow = 0.0
+    if last.kind == "abort":
         lasts = float(p.problem.abort_after or 0.0)
-    else:
-        lasts = sum(v.one(name) for name in p.blows[0].durations) if p.blows else end - start
     worst.note(f"{prefix} times", _gap(end - start, lasts), "end of contact")
     worst.note(f"{prefix} times", _gap(float(arrays[f"{prefix}_end"]), end + v.one(last.T)), "end")
     angles = np.array([r.joint_positions(q) for q in a["q"]])
@@ -120,7 +121,7 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
         worst.note(f"{prefix} rates", _gap(a["v"][k], qd), where)
         worst.note(f"{prefix} accelerations", _gap(a["a"][k], qdd, max(1.0, np.abs(qdd).max())), where)
         demand = a["torque"][k] / r.torque_limit
-        if phase == 1:
+        if phase == 1 and time <= start + blow:
             worst.note(f"{prefix} torque", _gap(demand, ff), where)
         else:
             for what, off in _balanced(p, q, tau, a["torque"][k], a["ground"][k]):
@@ -142,7 +143,8 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
 def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) -> Iterator[tuple[str, float]]:
     """Whether torques and the ground's wrench are what a motion needs, that needs tau (nv,) without soles.
 
-    Each sole's wrench follows from its leg's torques; together they have to be the ground's.
+    Each sole's wrench follows from its leg's torques; together they have to be the ground's, and each has to
+    keep half of the margins that the problem asks for.
     """
     robot, limit = p.robot, p.problem.robot.torque_limit
     free, rest = np.setdiff1d(np.arange(robot.n), robot.dependent), tau.copy()
@@ -157,6 +159,12 @@ def _balanced(p: Program, q: Array, tau: Array, torque: Array, ground: Array) ->
     six = robot.wrench_scale[:6]
     yield "ground wrench", _gap(world, ground, six)
     yield "equation of motion of the base", _gap(rest[: robot.base] / six, np.zeros(robot.base))
+    if robot.standing:
+        corners = [leg.sole.polygon for leg, *_ in robot.soles if leg.sole is not None]
+        own, cone = wrenches.reshape(-1, 6)[: robot.standing], p.problem.term(ContactWrenchCone)
+        kept = float(cop_margin(robot.robot, corners, own[None]).min())
+        yield "margin of a sole's centre of pressure", least_kept(cone.margin) - kept
+        yield "normal force of a sole", (SHARE * cone.minimum_force - float(own[:, 2].min())) / robot.weight
 
 
 def _blow(p: Program, v: Variables, arrays: Arrays) -> Iterator[Off]:

@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
+from support import urdfs
 from support.small_plans import arm_problem, biped_problem
 
 from impactopt import KeepOut, TargetBody, load_problem
@@ -24,7 +25,8 @@ from impactopt.bodies.fit import PLANES, Planes, Spheres, enclose, fill, surface
 from impactopt.bodies.pieces import convex, inertia_box, pieces_of
 from impactopt.bodies.robot_bodies import bodies_of, distance
 from impactopt.bodies.shapes import Obstacle, face_axes
-from impactopt.bodies.world import BEHIND, WorldBody, ground, obstacle_bodies, target_bodies
+from impactopt.bodies.urdf import lost_meshes, urdf_root
+from impactopt.bodies.world import BEHIND, WorldBody, ground_body, obstacle_bodies, target_bodies
 from impactopt.contact import Board, FreeMass, Nail, RigidWall
 from impactopt.errors import InputError
 from impactopt.problem.problem import ImpactProblem
@@ -405,7 +407,7 @@ def test_the_target_comes_goes_and_moves() -> None:
     q = np.tile(problem.start_posture, (4, 1))
     places = Places.of(problem.robot, q, np.array([0.0, 0.0, 0.2, 0.0]), np.array([0, 1, 2, MISSED]))
     there = {body.name: bodies.present(body, places).tolist() for body in bodies.world}
-    assert there["ground"] == [True] * 4
+    assert "ground" not in there, "the base is fixed"
     assert there["target"] == [True, False, False, False], "a board is broken"
     assert there["target's support"] == [True, True, True, False]
     free = arm_problem().bodies
@@ -462,6 +464,28 @@ def test_a_boxs_face_has_the_point_in_its_middle(
     assert core.core and core.before and not core.strikable and not core.moves
 
 
+@pytest.mark.parametrize(
+    ("target", "body", "told"),
+    [
+        (FreeMass(mass=1.0), TargetBody(), "assumed: box, 18 x 18 x 18 cm"),
+        (RigidWall(), TargetBody(), "assumed: wall, 150 x 150 x 10 cm"),
+        (FreeMass(mass=1.0), TargetBody(shape="ball"), "assumed: ball, 18 cm"),
+        (FreeMass(mass=1.0), TargetBody(shape="ball", size=(0.1,)), "ball, 10 cm"),
+        (FreeMass(mass=1.0), TargetBody(size=(0.9, 2.0, 0.04)), "box, 90 x 200 x 4 cm"),
+        (FreeMass(mass=1.0), TargetBody(shape="none"), "none: nothing keeps off it"),
+    ],
+)
+def test_a_problem_says_which_body_its_target_has_and_whether_it_is_assumed(
+    target: Any, body: TargetBody, told: str
+) -> None:
+    problem = dataclasses.replace(arm_problem(), target=target, body=body)
+    assert problem.describe()["target_body"] == told
+    # and it is that size
+    for found in bodies_at(target, body).get("target", []):
+        sides = 2 * (found.half if found.radius == 0 else np.array([found.radius]))
+        assert " x ".join(f"{100 * side:.3g}" for side in sides) in told
+
+
 def test_a_ball_begins_at_the_point() -> None:
     (ball,) = bodies_at(FreeMass(mass=1.0), TargetBody(shape="ball", size=(0.1,)))["target"]
     np.testing.assert_allclose(ball.place, POINT + 0.05 * NORMAL)
@@ -500,7 +524,7 @@ def test_a_nail_stands_out_of_its_block() -> None:
 
 
 def test_the_ground_is_what_is_below() -> None:
-    floor = ground()
+    floor = ground_body(0.0)
     assert distance(coal.Sphere(0.1), at(np.array([1.0, 2.0, 0.3])), floor.shape, at(floor.place)) == (
         pytest.approx(0.2, abs=1e-9)
     )
@@ -591,7 +615,7 @@ def test_a_start_in_something_is_refused() -> None:
     with pytest.raises(InputError, match=r"at the start the link '\w+' is in the body 'post'"):
         _ = inside.bodies
     free = dataclasses.replace(inside, terms=(KeepOut(enabled=False),))
-    assert len(free.bodies.world) == len(inside.obstacles) + 3, "who switches it off is not told"
+    assert len(free.bodies.world) == len(inside.obstacles) + 2, "who switches it off is not told"
     large = dataclasses.replace(problem, body=TargetBody(size=(0.9, 3.0, 3.0)))
     moved = dataclasses.replace(large, point=np.array(problem.point) - np.array([0.0, 0.4, 0.0]))
     with pytest.raises(InputError, match="is in the body 'target"):
@@ -642,3 +666,31 @@ def test_a_robots_bodies_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> Non
         np.savez(file, out=np.array(list(found.out.values())))
     assert all(isinstance(s, float) for s in (*found.out.values(), *found.short.values()))
     assert isinstance(Spheres(centre=found.centre, radius=found.radius, out=0.0, short=0.0), Spheres)
+
+
+MESHES = {
+    "pointer.stl": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+    "cut.stl": (b"\0" * 80 + (99).to_bytes(4, "little") + b"\0" * 60, "cannot be read"),
+    "empty.stl": (b"\0" * 80 + (0).to_bytes(4, "little"), "no triangles"),
+    "broken.obj": (b"f 1 2", "cannot be read"),
+    "gone.stl": (None, "is not found"),
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_a_mesh_that_is_no_body_is_told(tmp_path: Path, name: str) -> None:
+    data, said = MESHES[name]
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    mesh = f'<geometry><mesh filename="{name}"/></geometry>'
+    after = '</collision></link><joint name="elbow"'
+    text = urdfs.arm().replace(f'<geometry><box size="0.08 0.08 0.3"/></geometry>{after}', f"{mesh}{after}")
+    (tmp_path / "robot.urdf").write_text(text)
+    robot = Robot.from_urdf(tmp_path / "robot.urdf", floating=False)
+    pieces, source = pieces_of(robot)
+    assert "boxes of the inertia of 1 that have lost their meshes" in source
+    elbow = robot.model.getJointId("elbow")
+    assert [piece.link for piece in pieces if piece.joint == elbow] == ["elbow"]  # its joint's box
+    root = urdf_root(tmp_path / "robot.urdf")
+    assert root is not None
+    assert said in lost_meshes(robot.model, root, tmp_path / "robot.urdf")[elbow][name]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import signal
 import subprocess
 import sys
 import warnings
@@ -50,12 +51,15 @@ class Planner:
         self.solution: dict[str, Any] = {}
         self.raises: BaseException | None = None
         self.warns = ""
+        self.signal: int | None = None
 
     def __call__(self, problem: ImpactProblem, **options: Any) -> Solution:
         self.options = options
         options["report"]("compiling [something]")
         if self.raises is not None:
             raise self.raises
+        if self.signal is not None:
+            signal.raise_signal(self.signal)
         if self.warns:
             warnings.warn(self.warns, impactopt.NoCompilerWarning, stacklevel=2)
         for i in range(3):
@@ -307,6 +311,41 @@ def test_an_interrupt_before_there_is_a_plan(planner: Planner, file: Path, tmp_p
     planner.raises = KeyboardInterrupt()
     _, err = run("solve", file, "--out", tmp_path / "out", code=130)
     assert "interrupted" in err
+
+
+def test_sigterm_is_as_ctrl_c(planner: Planner, file: Path, tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    planner.signal = signal.SIGTERM
+    _, err = run("solve", file, "--out", tmp_path / "out", code=130)
+    assert "interrupted" in err
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(
+    ("status", "off", "told"),
+    [
+        (Status.INTERRUPTED, 1e-9, "no replay of what was interrupted"),
+        (Status.TIME_LIMIT, 3e-3, "no replay: what meets its constraints only to 0.003 is no plan"),
+    ],
+)
+def test_what_is_no_plan_is_not_replayed(
+    planner: Planner,
+    file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    status: Status,
+    off: float,
+    told: str,
+) -> None:
+    def replay(self: Solution, **options: Any) -> None:
+        pytest.fail("it is replayed")
+
+    monkeypatch.setattr(FakeSolution, "validate", replay)
+    violations = (Violation("hit point", "3 mm away", off),) if off > 1e-6 else ()
+    planner.solution = {"status": status, "violations": violations}
+    _, err = run("solve", file, "--out", tmp_path / "out", code=1)
+    assert told in err
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 
 
 def test_warnings_are_lines_without_source(planner: Planner, file: Path, tmp_path: Path) -> None:

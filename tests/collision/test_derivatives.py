@@ -37,7 +37,7 @@ CASES: dict[str, tuple[str, dict[str, Any], tuple[str, ...]]] = {
     "tangents": ("arm", {}, ("impulse", "torque", "velocity", "separated")),
     "an adjoint": ("arm", {}, ("impulse",)),
     "friction": ("arm", {"effects": Effects(friction=True), "friction": FRICTION}, ("impulse", "duration")),
-    "three freezes": ("arm", {"freezes": 3}, ("impulse", "demand")),
+    "three freezes": ("arm", {"freezes": 3}, ("impulse", "demand", "separated")),
     "Runge-Kutta": ("arm", {"method": "rk4", "step": 1e-4}, ("impulse", "configuration")),
     "a point mass": ("arm", {"kind": VirtualMass}, ("impulse", "force")),
     "a biped": ("biped", {}, ("zmp", "torque")),

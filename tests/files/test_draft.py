@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +14,18 @@ import pytest
 from support import urdfs
 from typer.testing import CliRunner
 
+from impactopt import Robot, Tool, optimize_strike, solve
 from impactopt.cli.app import app
 from impactopt.errors import InputError
 from impactopt.files.draft.description import find_description
 from impactopt.files.draft.drafting import Draft, draft_problem
+from impactopt.files.draft.robot import draft_robot
 from impactopt.files.problem_file import load_problem
 from impactopt.files.problem_file.toml import read_toml
-from impactopt.problem.doubts import doubts, hopeless
+from impactopt.problem.doubts import hopeless
+from impactopt.problem.plausibility import doubts
 from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import best_share
 
 FLAT = 'ixx="0.001" iyy="0.001" izz="0.01" ixy="0" ixz="0" iyz="0"'
 
@@ -150,6 +157,115 @@ def test_a_striker_is_at_the_end_of_its_link(tmp_path: Path) -> None:
     assert striker["frame"] == "wrist_link" and striker["point_m"] == [0.0, 0.0, 0.15]  # the claws' tips
 
 
+def _strike(problem: ImpactProblem) -> float:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        solved = optimize_strike(problem)
+    return solved.impulse if solved.status.usable else 0.0
+
+
+def test_a_bolted_arm_hits_where_it_is_strong(tmp_path: Path) -> None:
+    """At least 0.8 of the best of 20 strikes elsewhere, at points and normals that are drawn here."""
+    problem = _problem(tmp_path, urdfs.arm())
+    drafted, model = _strike(problem), problem.robot.model
+    rng, data, elsewhere = np.random.default_rng(1), model.createData(), []
+    frame = model.getFrameId(f"striker:{problem.striker}")
+    while len(elsewhere) < 20:
+        q = rng.uniform(problem.robot.lower, problem.robot.upper)
+        pin.framesForwardKinematics(model, data, q)
+        point, normal = np.array(data.oMf[frame].translation), np.eye(3)[rng.integers(3)]
+        normal = normal * (1.0 if normal[0] else rng.choice([-1.0, 1.0]))
+        if point[0] < 0.2 or point[2] < 0.1:
+            continue
+        try:
+            elsewhere.append(_strike(dataclasses.replace(problem, point=point, normal=normal)))
+        except InputError:  # out of reach with all joints inside, or the start is in the target
+            continue
+    assert drafted > 0.8 * max(elsewhere) > 0
+    found = best_share(problem)
+    assert found is not None and found[0] > 0.6
+
+
+def test_a_weak_blow_is_told_as_such(tmp_path: Path) -> None:
+    problem = _problem(tmp_path, urdfs.arm())
+    strong = best_share(problem)
+    weak = best_share(dataclasses.replace(problem, normal=np.array([1.0, 0.0, 0.0])))
+    assert strong is not None and weak is not None and problem.normal[0] != 1.0
+    assert weak[0] < strong[0] and weak[1].normal[0] != 1.0
+    done = CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")])
+    assert f"{100 * strong[0]:.0f} % of the hardest blow nearby" in done.output
+
+
+@pytest.mark.parametrize("velocity", [0.3, 4.0])
+def test_phases_last_as_long_as_slow_joints_need(tmp_path: Path, velocity: float) -> None:
+    problem = _problem(tmp_path, urdfs.arm(velocity=velocity))
+    robot = problem.robot
+    way = robot.joint_positions(problem.contact_posture) - robot.joint_positions(problem.start_posture)
+    needed = float(np.max(np.abs(way) / robot.velocity_limit))
+    for phase in (problem.swing, problem.follow):
+        assert phase.duration[1] > 1.2 * needed
+    if velocity == 0.3:
+        assert solve(problem, refine=False).status.usable
+
+
+def _flange(tool: str = "", *, axis: str = "0 0 1") -> str:
+    """An arm of four joints and a flange, whose shape is behind its frame; tool : more links."""
+    parts, parent = [urdfs.link("base", 10.0, (0.3, 0.3, 0.4), (0.0, 0.0, 0.2))], "base"
+    for name, turn, z, long in (
+        ("turn", "0 0 1", 0.4, 0.1),
+        ("shoulder", "0 1 0", 0.1, 0.3),
+        ("elbow", "0 1 0", 0.3, 0.3),
+        ("wrist", "0 1 0", 0.3, 0.1),
+    ):
+        parts += [urdfs.link(f"{name}_link", 2.0, (0.08, 0.08, long), (0.0, 0.0, long / 2))]
+        parts += [urdfs.joint(name, parent, f"{name}_link", turn, (0.0, 0.0, z), (-2.2, 2.2))]
+        parent = f"{name}_link"
+    parts += [urdfs.link("flange", 0.2, (0.07, 0.07, 0.03), (0.0, 0.0, -0.015))]
+    parts += [urdfs.joint("roll", parent, "flange", axis, (0.0, 0.0, 0.13), (-2.2, 2.2))]
+    return urdfs.robot("flanged", *parts, tool)
+
+
+def _fixed(parent: str, child: str, place: str) -> str:
+    return (
+        f'<link name="{child}"/><joint name="{child}_fixed" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin {place}/></joint>'
+    )
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "0 1 0"], ids=["rolls", "pitches"])
+def test_of_a_flange_behind_its_frame_the_face_away_from_the_arm_strikes(tmp_path: Path, axis: str) -> None:
+    (striker,) = read_toml(_drafted(tmp_path, _flange(axis=axis)).text)["robot"]["strikers"]
+    assert striker["frame"] == "flange" and striker["point_m"] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "point"),
+    [
+        ("tool0", 'xyz="0 0 0"', [0.0, 0.0, 0.0]),
+        ("gripper_tcp", 'xyz="0 0 0.12"', [0.0, 0.0, 0.0]),
+        ("link_eef", 'xyz="0 0 0.05" rpy="0 -1.5707963267948966 0"', [0.0, 0.0, 0.0]),
+        ("tool0", 'xyz="0 0 -0.02"', [0.0, 0.0, 0.02]),  # the flange's face is ahead of it
+    ],
+)
+def test_a_tool_frame_wins_over_shapes(tmp_path: Path, name: str, place: str, point: list[float]) -> None:
+    problem = _problem(tmp_path, _flange(_fixed("flange", name, place)))
+    striker = problem.robot.striker(problem.striker)
+    assert striker.frame == name and striker.point == pytest.approx(point, abs=1e-6)
+
+
+def test_a_shape_far_from_its_link_is_told_and_does_not_strike(tmp_path: Path) -> None:
+    text = urdfs.arm().replace(
+        '<collision><origin xyz="0.0 0.0 0.05"/><geometry><box size="0.08 0.08 0.1"/>',
+        '<collision><origin xyz="0.0 0.6 0.05"/><geometry><box size="0.08 0.08 0.1"/>',
+    )
+    assert text != urdfs.arm()
+    problem = _problem(tmp_path, text)
+    (told,) = [line for line in doubts(problem.robot) if "wrist_link" in line]
+    assert "a shape of link 'wrist_link', 0.15 m large, is 0." in told and "correct its <origin>" in told
+    point = problem.robot.striker(problem.striker).point
+    assert abs(point[1]) < 0.05 and point[2] > 0.05
+
+
 def test_what_the_file_lacks_is_guessed_and_said_to_be(tmp_path: Path) -> None:
     draft = _drafted(tmp_path, urdfs.arm(effort=0.0, velocity=0.0))
     keys = read_toml(draft.text)["robot"]
@@ -217,6 +333,90 @@ def test_an_mjcf_is_drafted_too(tmp_path: Path) -> None:
     assert set(read_toml(draft.text)["robot"]["torque_limit_N_m"]) == {"shoulder"}
     (tmp_path / "arm.toml").write_text(draft.text)
     assert load_problem(tmp_path / "arm.toml").robot.torque_limit[1] == 30.0
+
+
+def test_a_joint_may_have_a_links_name(tmp_path: Path) -> None:
+    same = urdfs.arm().replace('joint name="elbow"', 'joint name="elbow_link"')
+    same = same.replace('joint name="slide_0"', 'joint name="claw_0"')
+    problem = _problem(tmp_path, same)
+    other = _problem(tmp_path, urdfs.arm())
+    assert problem.robot.joint_names == ("turn", "shoulder", "elbow_link", "wrist")
+    assert problem.start_posture == pytest.approx(other.start_posture)
+    model = problem.robot.model
+    assert model.frames[model.getFrameId("elbow_link")].type == pin.FrameType.BODY
+    tool = problem.robot.with_tool(Tool.hammer(frame="elbow_link"))  # a name of a file's is the link's
+    assert tool.model.inertias[3].mass > model.inertias[3].mass
+
+
+@pytest.mark.parametrize(
+    "base",
+    ["", '<inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>'],
+    ids=["none", "zero"],
+)
+def test_the_root_of_an_arm_needs_no_mass(tmp_path: Path, base: str) -> None:
+    text = re.sub(r'(<link name="base">)<inertial>.*?</inertial>', rf"\1{base}", urdfs.arm(), count=1)
+    assert text != urdfs.arm()
+    light, heavy = _problem(tmp_path, text), _problem(tmp_path, urdfs.arm())
+    assert not light.robot.floating
+    q = heavy.start_posture
+    assert light.start_posture == pytest.approx(q)
+    one, other = (pin.crba(r.model, r.model.createData(), q) for r in (light.robot, heavy.robot))
+    assert np.allclose(one, other, rtol=0, atol=1e-12)
+
+
+def test_the_root_of_a_walker_needs_one(tmp_path: Path) -> None:
+    text = re.sub(r'(<link name="trunk">)<inertial>.*?</inertial>', r"\1", urdfs.biped(), count=1)
+    with pytest.raises(InputError, match=r"root link has no mass.*stands on legs.*--bolted"):
+        _drafted(tmp_path, text)
+    assert not draft_robot(tmp_path / "robot.urdf", bolted=True).robot.floating
+    with pytest.raises(InputError, match=r"the root link 'trunk' .*mass 0 kg.*floating = false"):
+        Robot.from_urdf(tmp_path / "robot.urdf")
+
+
+def test_a_follower_is_locked_where_its_leader_is_bent(tmp_path: Path) -> None:
+    text = urdfs.arm().replace('joint name="wrist"', 'joint name="hinge"')
+    follows = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/></joint>'
+    text = re.sub(r'(<joint name="elbow".*?)</joint>', rf"\1{follows}", text)
+    draft = _drafted(tmp_path, text)
+    # a quarter of the shoulder's range, -1.8 to 1.8 rad
+    assert read_toml(draft.text)["robot"]["locked_rad"]["elbow"] == pytest.approx(0.1 + 0.5 * 0.9)
+    assert any("'elbow' follows 'shoulder' by <mimic>; 'elbow' is locked" in line for line in draft.said)
+    with pytest.raises(InputError, match=r"'elbow' follows 'shoulder'.*lock one"):
+        Robot.from_urdf(tmp_path / "robot.urdf", floating=False)
+
+
+def test_check_tells_meshes_that_are_no_bodies(tmp_path: Path) -> None:
+    lost = (
+        ('"0.08 0.08 0.3"/>', '<mesh filename="cut.stl"/>'),
+        ('"0.08 0.08 0.1"/>', '<mesh filename="gone.stl"/>'),
+    )
+    text = urdfs.arm()
+    for size, mesh in lost:
+        text = text.replace(f"<box size={size}", mesh)
+    (tmp_path / "cut.stl").write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    (tmp_path / "robot.toml").write_text(_drafted(tmp_path, text).text)
+    told = " ".join(CliRunner().invoke(app, ["check", str(tmp_path / "robot.toml")]).output.split())
+    assert "2 are lost, and boxes of inertia stand for links without any: cut.stl cannot be read" in told
+    assert "git lfs pull" in told and "gone.stl is not found" in told
+
+
+def test_crossed_limits_are_a_mistake(tmp_path: Path) -> None:
+    text = re.sub('lower="-2.4" upper="2.4"', 'lower="2.4" upper="-2.4"', urdfs.arm())
+    with pytest.raises(InputError, match=r"'elbow' .*lower 2.4, upper -2.4.*URDF's <limit>"):
+        _drafted(tmp_path, text)
+
+
+def test_an_mjcf_of_a_walker_without_a_free_joint_stands(tmp_path: Path) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    path, xml = tmp_path / "robot.urdf", tmp_path / "robot.xml"
+    kept = '<mujoco><compiler fusestatic="false"/></mujoco></robot>'  # its root is bolted, and a body still
+    path.write_text(urdfs.biped().replace("</robot>", kept))
+    mujoco.mj_saveLastXML(str(xml), mujoco.MjModel.from_xml_path(str(path)))
+    draft = draft_problem(xml, folder=tmp_path, mjcf=True)
+    robot = read_toml(draft.text)["robot"]
+    assert robot["floating"] is True and len(robot["soles"]) == 2
+    assert any("no free joint" in line for line in draft.said)
+    assert not draft_robot(xml, mjcf=True, bolted=True).robot.floating
 
 
 def test_robots_of_example_robot_data_go_by_name() -> None:

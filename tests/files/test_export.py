@@ -439,11 +439,14 @@ def test_a_punch_replays_from_csv_and_stands(punch: Solution, tmp_path: Path) ->
     assert (
         found.impulse == pytest.approx(memory.impulse, rel=NEAR) and found.standing is memory.standing is True
     )
-    # the motion of a missed blow is the planned one until that is noticed
+    # the motion of a missed blow is the planned one up to contact, then coasts until that is noticed
     whole, missed = (read_csv(path) for path in (files[2], files[1]))
-    noticed = json.loads(files[0].read_text())["missed"]["from_s"]
-    start = punch.plan.contact_start
-    assert noticed == pytest.approx(start + punch.problem.abort_after)
+    told, start = json.loads(files[0].read_text())["missed"], punch.plan.contact_start
+    assert told["abort_s"] == pytest.approx(start + punch.problem.abort_after)
+    assert told["from_s"] == pytest.approx(min(told["abort_s"], punch.plan.contact_end))
+    time, speed = missed["time [s]"], table(missed, "velocity")[1]
+    before, after = (np.searchsorted(time, told["abort_s"] + shift) for shift in (-2e-6, 2e-6))
+    assert np.abs(speed[after] - speed[before]).max() < 0.05, "rad/s: the abort motion goes on from there"
     early = whole["time [s]"] < start
     np.testing.assert_array_equal(
         table(whole, "position")[1][early], table(missed, "position")[1][missed["time [s]"] < start]

@@ -51,7 +51,7 @@ def test_the_summary_has_the_keys_that_readers_rely_on(record: Record) -> None:
     keys = ["status", "solver", "iterations", "solve_seconds", "build_seconds", "max_violation", "impulse_Ns"]
     keys += ["peak_force_N", "contact_ms", "hand_speed_m_s"]
     keys += ["simulated.impulse_Ns", "simulated.impulse_error_pct"]
-    keys += ["simulated.min_normal_force_N", "simulated.sole_slip_mm"]
+    keys += ["simulated.sole_force_N", "simulated.sole_slip_mm"]
     for key in ("zmp_margin_m", "torque_ratio"):
         keys += [f"{where}{key}.{phase}" for where in ("", "simulated.") for phase in phases]
     assert set(keys) <= set(numbers(record.summary))

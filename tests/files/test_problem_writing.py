@@ -18,7 +18,7 @@ from support.term_cases import CASES
 
 import impactopt
 from impactopt import contact
-from impactopt.bodies.shapes import Obstacle, TargetBody
+from impactopt.bodies.shapes import Ground, Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.files.problem_file import (
     SolverSettings,
@@ -185,6 +185,7 @@ CHANGES = st.fixed_dictionaries(
         "scenarios": SCENARIOS.map(tuple),
         "body": BODIES,
         "obstacles": OBSTACLES.map(tuple),
+        "ground": st.none() | st.builds(Ground, height=st.floats(-2, 0)),
         "terms": st.fixed_dictionaries({}, optional=TERMS).map(lambda found: tuple(found.values())),
         "objectives": OBJECTIVES,
         "smoothness": SMALL,

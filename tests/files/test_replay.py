@@ -62,7 +62,7 @@ def test_json_is_the_flat_report(saved: Path, punch: Solution, tmp_path: Path) -
     assert report["impulse_error_pct"] == pytest.approx(100 * (report["impulse_Ns"] / punch.impulse - 1))
     assert report["zmp_margin_m"] == min(report["zmp_margin_by_phase_m"].values())
     assert report["torque_ratio"] == max(report["torque_ratio_by_phase"].values())
-    assert report["sole_cop_margin_m"].keys() == {"left", "right"}
+    assert report["sole_cop_margin_mm"].keys() == {"left", "right"}
     written = {path.name for path in (tmp_path / "new" / "place").iterdir()}
     assert written == {"replay.json", "replay.png"}
     assert json.loads((tmp_path / "new" / "place" / "replay.json").read_text()) == report
@@ -73,6 +73,15 @@ def test_held_soles_cannot_say_whether_it_stands(saved: Path) -> None:
     report = json.loads(out)
     assert report["standing"] is None and "held" in report["reason"]
     assert abs(report["impulse_error_pct"]) < 2
+
+
+def test_a_missed_blow_is_replayed_on_held_soles_too(saved: Path) -> None:
+    out, _ = run(saved, "--engine", "pinocchio", "--missing", "--json", "--step", "5e-4")
+    report = json.loads(out)
+    assert report["impulse_Ns"] == 0 and report["impulse_error_pct"] is None
+    assert report["torque_ratio_by_phase"].keys() == report["zmp_margin_by_phase_m"].keys()
+    assert report["torque_ratio_by_phase"].keys() == {"swing", "missed"}
+    assert report["torque_ratio"] < 1.05 and report["zmp_margin_m"] > 0
 
 
 def test_a_fall_exits_1_and_says_when(saved: Path) -> None:
@@ -95,7 +104,7 @@ def test_every_condition_is_an_option_with_its_default() -> None:
     ("arguments", "parts"),
     [
         (["--friction", "-1"], ["friction is -1"]),
-        (["--engine", "pinocchio", "--missing"], ["pinocchio", "take engine 'mujoco'"]),
+        (["--engine", "pinocchio", "--mass", "2"], ["pinocchio", "take engine 'mujoco'"]),
         (["--step", "0"], ["step [s]: 0"]),
         (["--animation", "punch.mp4", "--step", "1e-3", "--settle", "0"], ["punch.mp4", ".gif"]),
     ],

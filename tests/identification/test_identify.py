@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import tracemalloc
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -240,8 +243,47 @@ def test_files_that_are_no_logs_are_refused(tmp_path: Path, text: str, message: 
         read_log(tmp_path / "bad.npz")
     with open(tmp_path / "one.npz", "wb") as file:
         np.save(file, np.zeros(3))
-    with pytest.raises(InputError, match="a single array"):
+    with pytest.raises(InputError, match="no npz file"):
         read_log(tmp_path / "one.npz")
+
+
+def test_an_archive_that_unpacks_to_more_than_a_log_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "small.npz"
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("time_s.npy", "w", force_zip64=True) as entry,
+    ):
+        for _ in range(33):  # 528 MiB of zeros
+            entry.write(bytes(1 << 24))
+    assert path.stat().st_size < 1 << 23
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"small\.npz: no npz file of numbers \(larger than 512 MiB"):
+            read_log(path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 24
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_force_that_is_cut_off_is_left_out_and_told() -> None:
+    whole = log_of(TrueBlow("Kelvin-Voigt"), TrueBlow("Kelvin-Voigt", speed=0.5), seed=5)
+    level = 0.6 * float(whole.force.max())
+    log = dataclasses.replace(whole, force=np.minimum(whole.force, level))
+    found = identify(log, laws=["Kelvin-Voigt"])
+    lost = int(np.sum(whole.force >= level))
+    assert found.clipped == (lost, 0)
+    assert f"cut off at {level:.4g} N: {lost} samples of 1 of 2 blows" in found.cautions[0]
+    for name, true in (("stiffness", 1e5), ("damping", 150.0), ("effective_mass", MASS)):
+        estimate = found.best.estimates[name]
+        assert estimate.low <= true <= estimate.high, name
+
+
+@pytest.mark.parametrize("step", [0.0, 0.5, 5.0, 20.0])
+def test_neither_a_round_top_nor_a_coarse_converter_is_taken_for_a_cut(step: float) -> None:
+    """step : [N] of the converter; the peak is some 500 N."""
+    log = log_of(TrueBlow("Kelvin-Voigt"), noise=0.0, rate=3e4)
+    force = np.round(log.force / step) * step if step else log.force
+    assert identify(dataclasses.replace(log, force=force), laws=["Kelvin-Voigt"]).clipped == (0,)
 
 
 # ---------------------------------------------------------------- command

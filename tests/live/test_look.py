@@ -7,16 +7,24 @@ import os
 import signal
 import subprocess
 import sys
+import types
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.parse import quote, urlsplit
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import viser
+import websockets.asyncio.server
 from support.browser import Job, visit
 from support.small_plans import biped_problem
 from typer.testing import CliRunner
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from impactopt import load_problem, solve
 from impactopt.cli.app import app
@@ -214,9 +222,54 @@ def test_a_result_that_does_not_say_its_program_is_solved_again(
 
 
 def test_a_port_that_is_taken_is_refused(look: LiveLook, arm: Solution) -> None:
-    port = int(look.address.rsplit(":", 1)[1])
+    port = urlsplit(look.address).port
     with pytest.raises(InputError, match=rf"cannot serve a page at 127\.0\.0\.1:{port}.*another --port"):
         LiveLook(arm, port=port)
+
+
+def _opened(address: str, origin: str | None) -> int:
+    """Status of a websocket's handshake, 101 if it is opened, as the page asks for it."""
+    headers = {"Origin": origin} if origin else {}
+    protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+    try:
+        with connect(address, additional_headers=headers, subprotocols=protocol) as socket:
+            assert socket.recv(timeout=LONG)
+            return 101
+    except InvalidStatus as error:
+        return error.response.status_code
+
+
+def test_pages_of_other_origins_and_those_without_the_address_drive_nothing(look: LiveLook) -> None:
+    there, token = look.address.rsplit("/", 1)
+    own, host = there.replace("http", "ws"), urlsplit(look.address).netloc
+    assert len(token) == 32
+    assert _opened(f"{own}/{token}", there) == 101
+    assert _opened(f"{own}/{token}", None) == 101  # no browser: it knows the token
+    for origin in ("http://example.com", "null", f"http://example.com@{host}", f"http://{host}.example.com"):
+        assert _opened(f"{own}/{token}", origin) == 403, origin
+    for path in ("", "/", f"/{token[:-1]}", f"/x/{token}", f"/?{token}", "/é"):
+        assert _opened(f"{own}{quote(path)}", there) == 403, path
+    for path in ("/", "/index.html", f"/{token[::-1]}/"):
+        with pytest.raises(HTTPError, match="403"):
+            urllib.request.urlopen(there + path, timeout=LONG)
+    with urllib.request.urlopen(look.address, timeout=LONG) as page:
+        assert b"<html" in page.read().lower()
+
+
+def test_a_viser_that_lets_no_request_be_checked_is_refused(
+    arm: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = websockets.asyncio.server.serve
+    monkeypatch.setattr(
+        "viser.infra._infra.websockets",
+        types.SimpleNamespace(
+            asyncio=types.SimpleNamespace(server=types.SimpleNamespace(serve=served)),
+            datastructures=websockets.datastructures,
+            exceptions=websockets.exceptions,
+        ),
+    )
+    with pytest.raises(InputError, match="lets no request be checked"):
+        LiveLook(arm)
 
 
 def test_viser_that_is_missing_is_named(arm: Solution, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from impactopt import (
     Actuator,
     GearLoad,
     ImpactProblem,
+    NotSolvedWarning,
     Scenario,
     Solution,
     load_problem,
@@ -86,7 +87,8 @@ def test_no_blow_within_the_limit_is_told() -> None:
 
     Which rows the point of least violation leaves off is a matter of rounding; what would do is not.
     """
-    found = solve(_weak(0.8))
+    with pytest.warns(NotSolvedWarning):
+        found = solve(_weak(0.8))
     assert not found.status.usable
     assert found.violations
     assert "Without [terms.gear_load] there is a plan, but gear of wrist: 2.01" in found.result.message

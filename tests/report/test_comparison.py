@@ -176,6 +176,6 @@ def test_what_is_bolted_does_not_stand() -> None:
     columns: dict[str, dict[str, Any]] = {"planned": {"impulse_Ns": 1.0}, "free soles": replay}
     assert [row for row in result_rows(columns) if row.label == "stands at the end"] == []
     assert standing(replay) is None
-    columns["free soles"] = {**replay, "min_normal_force_N": 120.0}
+    columns["free soles"] = {**replay, "sole_force_N": {"left": {"swing": 120.0}}}
     (row,) = (row for row in result_rows(columns) if row.label == "stands at the end")
     assert [cell.text for cell in row.cells] == ["", "yes"]

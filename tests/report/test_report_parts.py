@@ -13,7 +13,6 @@ import pytest
 from scipy.integrate import trapezoid
 from support.fake_solution import still_problem, still_solution
 
-from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.meshes import find_mesh, read_mesh
 from impactopt.bodies.pieces import pieces_of
 from impactopt.bodies.shapes import Obstacle, TargetBody
@@ -222,7 +221,7 @@ def test_what_is_drawn_of_the_world_is_what_a_plan_keeps_off(
     )
     parts = surroundings_of(problem.world)
     assert [part.kind for part in parts] == [*kinds, "obstacle", "obstacle"]
-    kept = [b for k, b in enumerate(problem.world) if k != GROUND and not b.core]
+    kept = [b for b in problem.world if not (b.ground or b.core)]
     drawn = np.concatenate([part.solid.vertices for part in parts])
     for part in parts:  # no corner of what is drawn is off all bodies that are there
         gaps = [

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import urdfs
 from support.small_robots import arm
 
 from impactopt import Actuator, Robot, load_problem, write_problem
@@ -85,6 +86,23 @@ def test_the_armature_of_an_actuator_is_the_robots() -> None:
 def test_what_makes_no_sense_is_refused(make: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         make()
+
+
+def test_friction_is_the_files_until_an_actuator_has_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(urdfs.arm().replace("</joint>", '<dynamics damping="3.0" friction="1.5"/></joint>'))
+    more: dict[str, Any] = {"floating": False, "armature": 0.1}
+    robot = Robot.from_urdf(path, **more, actuators={"elbow": Actuator(bandwidth=50.0)})
+    other = robot.with_actuators({"turn": Actuator(viscous_friction=0.5)})
+    k, j = robot.joint_index("elbow"), robot.joint_index("turn")
+    assert (robot.actuators[k].viscous_friction, robot.actuators[k].coulomb_friction) == (3.0, 1.5)
+    assert robot.actuators[k].bandwidth == 50.0
+    assert (other.actuators[j].viscous_friction, other.actuators[j].coulomb_friction) == (0.5, 1.5)
+    # at 2 rad/s and 10 N m a motor gives 10 + 1.5 + 3 x 2 N m
+    assert motor_power(robot, np.full(robot.n, 10.0), np.full(robot.n, 2.0))[k] == pytest.approx(2 * 17.5)
+    path.write_text(urdfs.arm().replace("</joint>", '<dynamics damping="-3.0"/></joint>', 1))
+    with pytest.raises(InputError, match="joint 'turn': damping -3"):
+        Robot.from_urdf(path, **more)
 
 
 def test_files_name_classes_of_joints(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
+from support import urdfs
 
-from impactopt import Robot
+from impactopt import FreeMass, Robot, Sole, SpringDamper, Striker
 from impactopt.errors import InputError
 from impactopt.files.problem_file import problem_from_data
+from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.mjcf import read_mjcf
 
 mujoco = pytest.importorskip("mujoco")
@@ -203,7 +206,7 @@ def test_own_numbers_win_over_the_files(tree: Path) -> None:
         (
             '<joint name="turn"',
             '<joint name="sway" axis="1 0 0" range="-10 10"/><joint name="turn"',
-            "'sway' and another one move the same body.*lock one",
+            "joints 'sway', 'turn' move the same body.*lock one",
         ),
         ("<mujoco model", "<mujoco nonsense='1' model", "MJCF .*tree.xml: .*nonsense"),
     ],
@@ -215,6 +218,41 @@ def test_what_is_no_robot_here_is_refused(tree: Path, old: str, new: str, said: 
     tree.write_text(text)
     with pytest.raises(InputError, match=said):
         Robot.from_mjcf(tree, **LACKS)
+
+
+def test_missing_limits_are_mended_in_the_files_own_words(tree: Path) -> None:
+    with pytest.raises(InputError) as found:
+        Robot.from_mjcf(tree, torque_limit={"lift": 100.0})
+    said = str(found.value)
+    assert "'turn' has no usable torque limit" in said and "`actuatorfrcrange` in the MJCF" in said
+    assert "velocity limit" in said and "an MJCF has none" in said and "URDF" not in said
+
+
+def test_soles_stand_where_gravity_is_along_z(tmp_path: Path) -> None:
+    path = tmp_path / "walker.urdf"
+    path.write_text(urdfs.biped())
+    sizes = {"length": 0.2, "width": 0.1, "center": (0.04, 0.0)}
+    down = pin.SE3(np.eye(3), np.array([0.0, 0.0, -urdfs.ANKLE]))
+    soles = [
+        Sole.box(name=s, frame=f"{s}_sole", parent=f"{s}_ankle_roll_link", placement=down, **sizes)
+        for s in ("left", "right")
+    ]
+    bent = {"hip_pitch": -0.4, "knee": 0.8, "ankle_pitch": -0.4}
+    posture = {f"{side}_{joint}": angle for side in ("left", "right") for joint, angle in bent.items()}
+    fist = Striker(name="fist", frame="right_elbow_link", point=np.zeros(3))
+    robot = Robot.from_urdf(path, armature=0.1, soles=soles, strikers=[fist], postures={"ready": posture})
+    model = robot.model.copy()
+    model.gravity = pin.Motion(np.array([1.0, 0.0, -9.0]), np.zeros(3))
+    with pytest.raises(InputError, match=r"gravity is \[1.0, 0.0, -9.0\] .*along -z"):
+        ImpactProblem(
+            robot=dataclasses.replace(robot, model=model),
+            striker="fist",
+            start="ready",
+            point=[0.3, -0.3, 0.9],
+            normal=[1.0, 0.0, 0.0],
+            target=FreeMass(mass=1.0),
+            law=SpringDamper(stiffness=1e4, damping=100.0),
+        )
 
 
 def test_a_file_without_joints_is_no_robot(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from impactopt.files.problem_file import read_problem_file
 from impactopt.robots.robot import Robot
 from impactopt.simulation import ControllerSettings, Perturbation, Scene, Simulation, simulate_mujoco, solids
 from impactopt.simulation.controller import controller_of
+from impactopt.simulation.controller.clearance import Clearance
 from impactopt.simulation.controller.cones import cone_of
 from impactopt.simulation.controller.estimate import StateEstimate
 from impactopt.simulation.controller.held import HeldDynamics
@@ -360,3 +362,71 @@ def test_only_links_that_a_shift_brings_nearer_are_looked_at() -> None:
     moves[model.joints[foot].idx_v] = 0.1
     assert all_pairs.links_between(model, moves).pairs == ((0, 2), (1, 2))
     assert all_pairs.links_between(model, np.r_[np.ones(6), np.zeros(robot.nv - 6)]).pairs == ()
+
+
+# ---- clearance
+
+
+def test_near_links_brake_by_how_their_distance_changes() -> None:
+    """Two cubes on sliders: what keeps them apart is known in closed form."""
+    model = pin.Model()
+    slider = pin.JointModelPX()
+    for k in range(2):
+        model.addJoint(0, slider, pin.SE3.Identity(), f"slider {k}")
+    cube = 0.05 * np.array(list(itertools.product((-1, 1), repeat=3)), dtype=float)
+    apart = Solids(
+        solids=tuple(Solid(name=f"cube {k}", joint=k + 1, vertices=cube) for k in range(2)), pairs=((0, 1),)
+    )
+
+    def constraints(of: Clearance, gap: float, speed: float) -> tuple[Array, Array]:
+        data, q, v = model.createData(), np.array([0.0, 0.1 + gap]), np.array([speed, 0.0])
+        pin.forwardKinematics(model, data, q, v, np.zeros(2))
+        pin.computeJointJacobians(model, data)
+        return of.constraints(data)
+
+    rows, least = constraints(Clearance(model, apart, period=1e-3), 0.01, 0.0)
+    np.testing.assert_allclose(rows, [[-1.0, 1.0]], atol=1e-9)
+    assert least[0] == pytest.approx(-(40.0**2) * (0.01 - 0.002))
+    # far apart at rest there is none; faster than they can be stopped in there is one that asks them to brake
+    near = Clearance(model, apart, period=1e-3)
+    assert len(constraints(near, 0.2, 0.0)[1]) == 0
+    constraints(near, 0.052, 2.0)
+    _, least = constraints(near, 0.05, 2.0)
+    assert least[0] == pytest.approx(2 * 40.0 * 2.0 - 40.0**2 * 0.048)
+    # who is held to it comes to rest before the distance is used up
+    near, gap, rate = Clearance(model, apart, period=1e-3), 0.1, -1.5
+    for _ in range(200):
+        _, least = constraints(near, gap, -rate)
+        rate += 1e-3 * (float(least[0]) if len(least) else 0.0)
+        gap += 1e-3 * rate
+    assert 0.002 < gap < 0.02 and abs(rate) < 0.1
+
+
+def test_a_link_that_turns_and_an_obstacle_brake_by_their_distances_second_rate() -> None:
+    """A cube's corner above a floor of its own: the least rate, against differences of the distance."""
+    model = pin.Model()
+    places = pin.SE3.Identity(), pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.1]))
+    for k, (joint, place) in enumerate(zip((pin.JointModelRY(), pin.JointModelRX()), places, strict=True)):
+        model.addJoint(k, joint, place, f"joint {k}")
+    cube = 0.05 * np.array(list(itertools.product((-1, 1), repeat=3)), dtype=float)
+    plate = Solid(
+        name="plate", half=np.array([1.0, 1.0, 0.05]), place=np.array([0.0, 0.0, -0.3]), rotation=np.eye(3)
+    )
+    apart = Solids(solids=(Solid(name="cube", joint=2, vertices=cube), plate), pairs=((0, 1),))
+    q, v, a, h = np.array([0.9, 0.4]), np.array([1.3, -0.8]), np.array([0.7, 2.0]), 1e-4
+
+    def height(t: float) -> float:
+        """Of the lowest corner above the plate, by kinematics."""
+        data = model.createData()
+        pin.forwardKinematics(model, data, q + t * v + t**2 / 2 * a)
+        return float(min(data.oMi[2].act(corner)[2] for corner in cube) + 0.25)
+
+    data = model.createData()
+    pin.forwardKinematics(model, data, q, v, np.zeros(2))
+    pin.computeJointJacobians(model, data)
+    rows, least = Clearance(model, apart, period=1e-3).constraints(data)
+    before, now, after = (height(t) for t in (-h, 0.0, h))
+    rate, second = (after - before) / (2 * h), (after - 2 * now + before) / h**2
+    # what the accelerations have beyond what is asked for, is what the second rate has
+    beyond = second + 2 * 40.0 * rate + 40.0**2 * (now - 0.002)
+    assert float(rows[0] @ a - least[0]) == pytest.approx(beyond, abs=1e-4)

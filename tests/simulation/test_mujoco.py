@@ -246,7 +246,22 @@ def test_a_summary_of_a_fall_and_a_report() -> None:
     assert summary["impulse_error_pct"] is summary["hand_speed_m_s"] is None, "nothing was hit"
     assert report["zmp_margin_m"] == summary["zmp_margin_m"]["swing"]
     assert report["torque_ratio_by_phase"] == summary["torque_ratio"]
-    assert set(report["sole_cop_margin_m"]) <= {"left", "right"}
+    for key, least in (("sole_cop_margin_mm", 1e3 * sim.cop_margin), ("sole_force_N", sim.sole_normal)):
+        for k, name in enumerate(("left", "right")):
+            assert report[key][name] == {"swing": least[:, k].min()}
+
+
+def test_what_slides_away_stands_no_more() -> None:
+    """On ice, pushed: it is upright and at rest in the end, but not where it stood."""
+    robot = biped()
+    motion, there, _ = standing(robot)
+    for part, slides in ((1.2, True), (0.2, False)):  # of what friction bears
+        world = Perturbation(friction=0.05, push=part * 0.05 * weight(robot), push_time=0.6)
+        sim = simulate_mujoco(robot, motion, there, step=1e-3, settle=4.0, perturbation=world)
+        assert (sim.slip.max() > 0.05) == slides
+        assert (sim.fall == "") != slides
+        if slides:
+            assert "slid" in str(sim.fall) and f"{1e3 * sim.slip[:, 0].max():.0f} mm" in str(sim.fall)
 
 
 # ---- a blow on free soles

@@ -131,7 +131,8 @@ def test_fixed_arm_against_scipy(options):
 # ------------------------------------------------------------ the two forms
 @pytest.mark.parametrize("stance", [None, OneSole("left")])
 def test_forms_agree(stance):
-    options = {"stance": stance, "friction": FRICTION, "step": 1e-4}
+    # so exact that their histories, which lie inside of other steps, are the same
+    options = {"stance": stance, "friction": FRICTION, "step": 1e-4, "tolerance": 1e-10}
     dense, tree = small(**options), small(form="pinocchio", **options)
     q, v, torque = blow(dense, speed=1.5)
     a, b = dense.collide(q, v, torque), tree.collide(q, v, torque)
@@ -221,29 +222,62 @@ def test_impulse_energy_and_histories():
 
 
 # ------------------------------------------------------------ integration
-def test_fourth_order_through_all_its_events():
+def test_errors_below_the_tolerance_through_all_events():
     model = small(mass=5.0, horizon=0.5, friction=JointFriction(viscous=1.0, coulomb=1.0, transition=0.05))
     q, v, torque = blow(model, speed=2.0)
 
-    def final(step):
-        result = dataclasses.replace(model, step=step).collide(q, v, torque, torque_limit=60.0)
+    def final(tolerance):
+        result = dataclasses.replace(model, tolerance=tolerance).collide(q, v, torque, torque_limit=60.0)
         assert (np.abs(result.demand) > 60.0).any()
         return np.append(result.velocity, result.impulse)
 
-    exact = final(2.5e-5)
-    errors = [np.abs(final(step) - exact).max() for step in (8e-4, 4e-4, 2e-4)]
-    orders = np.log2(np.divide(errors[:-1], errors[1:]))
-    assert (orders > 3.3).all(), (errors, orders)
+    exact = final(1e-10)
+    for tolerance in (1e-4, 1e-6):
+        assert np.abs(final(tolerance) - exact).max() < tolerance
 
 
 def test_converged_says_how_well():
     model = small(mass=2.0, step=4e-4)
     q, v, torque = blow(model)
     result, change = model.converged(q, v, torque, tolerance=1e-7)
-    fine = dataclasses.replace(model, step=2e-5).collide(q, v, torque)
+    fine = dataclasses.replace(model, tolerance=1e-10).collide(q, v, torque)
     assert abs(result.impulse - fine.impulse) <= 1e-7 * result.impulse and change <= 1e-7 * result.impulse
     with pytest.raises(InputError, match="tolerance"):
         model.converged(q, v, torque, tolerance=0.0)
+
+
+@pytest.mark.parametrize("engine", [FullDynamics, MujocoDynamics])
+@pytest.mark.parametrize("stiffness", [1e3, 1e9])
+@pytest.mark.parametrize("mass", [1e-4, 1e-2, 1e3])
+def test_closed_form_from_light_to_heavy_from_soft_to_stiff(engine, stiffness, mass):
+    """At the default step, whatever the contact's own time scale is (0.7 us to 0.14 s)."""
+    mobility = 1 / 2.0 + 1 / mass
+    for ratio in (0.3,) if engine is MujocoDynamics else (0.0, 0.3, 2.0):
+        damping = 2 * ratio * np.sqrt(stiffness / mobility)
+        law = SpringDamper(stiffness=stiffness, damping=damping)
+        robot, target = small_robots.slider(2.0), FreeMass(mass=mass)
+        model = engine(robot=robot, striker="tip", normal=X, law=law, target=target, kd=0.0, horizon=0.5)
+        impulse, duration = two_masses(2.0, mass, stiffness, damping, 1.3)
+        result = model.collide([0.0], [1.3], [0.0])
+        assert result.impulse == pytest.approx(impulse, rel=1e-5)
+        assert result.duration == pytest.approx(duration, rel=2e-3 if engine is MujocoDynamics else 1e-8)
+        if ratio == 0:
+            assert result.peak_force == pytest.approx(1.3 * np.sqrt(stiffness / mobility), rel=1e-8)
+
+
+def test_a_contact_too_fast_to_follow_is_refused(monkeypatch):
+    """A nail that rings against the hammer some ten thousand times."""
+    monkeypatch.setattr("impactopt.simulation.reference.motion._MOST_LOOKS", 500)
+    model = FullDynamics(
+        robot=small_robots.slider(2.0),
+        striker="tip",
+        normal=X,
+        law=KelvinVoigt(stiffness=1e7, damping=1e5),
+        target=Nail(mass=1e-3, resistance=100.0),
+        horizon=0.5,
+    )
+    with pytest.raises(InputError, match="too fast to follow"):
+        model.collide([0.0], [1.3], [0.0])
 
 
 # ------------------------------------------------------------ the simplified computation
@@ -373,11 +407,6 @@ def test_two_masses_in_mujoco():
         robot=small_robots.slider(2.0), striker="tip", normal=X, law=LAW, target=TARGET, kd=0.0
     )
     impulse, duration = two_masses(2.0, TARGET.mass, LAW.stiffness, LAW.damping, 1.3)
-    errors = [
-        in_mujoco(model, step=step).collide([0.0], [1.3], [0.0]).impulse / impulse - 1.0
-        for step in (8e-5, 4e-5, 2e-5)
-    ]
-    np.testing.assert_allclose(np.divide(errors[1:], errors[:-1]), 0.5, atol=0.05)
     result, change = in_mujoco(model).converged([0.0], [1.3], [0.0], tolerance=1e-4)
     assert result.impulse == pytest.approx(impulse, rel=1e-5) and change < 1e-4 * impulse
     assert result.duration == pytest.approx(duration, abs=4e-5)
@@ -422,8 +451,9 @@ def test_mujoco_is_asked_for(monkeypatch):
     with pytest.raises(InputError, match="virtual base"):
         in_mujoco(small(stance=BothSoles(base_mass=1e5, base_inertia=1e5)))
     q, v, torque = blow(model)
-    with pytest.raises(InputError, match="MujocoDynamics a step below"):
-        in_mujoco(model, step=5e-3).collide(q, v, torque)
+    # a step too long for the servo is shortened
+    exact = model.collide(q, v, torque).impulse
+    assert in_mujoco(model, step=5e-3).collide(q, v, torque).impulse == pytest.approx(exact, rel=2e-5)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"pip install -e '\.\[validate\]'"):
         in_mujoco(model)
@@ -477,7 +507,6 @@ def test_bad_numbers_are_refused():
         ({"torque": None}, r"torque: give"),
         ({"torque": torque[:-1]}, r"torque \[N m\]: expected shape"),
         ({"kd": -1.0}, r"kd: has -1"),
-        ({"kd": 1e4}, r"step \[s\]: 5e-05 is unstable"),
         ({"contact_dampning": 1.0}, r"did you mean 'contact_damping'"),
         ({"target_mass": 0.0}, r"FreeMass: mass"),
         ({"viscous": 1.0}, r"no setting 'viscous'"),

@@ -227,7 +227,9 @@ def test_a_blow_has_three_phases_and_a_summary(blow: tuple[Robot, Scene, Simulat
         assert out["zmp_margin_m"][name] == pytest.approx(inside[phase == k].min(), abs=1e-12)
         ratio = np.abs(sim.demand[phase == k]) / robot.torque_limit
         assert out["torque_ratio"][name] == pytest.approx(ratio.max())
-    assert out["min_normal_force_N"] == pytest.approx(sim.sole_normal.min())
+    for k, sole in enumerate(sim.soles):
+        for i, name in enumerate(names):
+            assert out["sole_force_N"][sole][name] == pytest.approx(sim.sole_normal[phase == i, k].min())
     np.testing.assert_allclose(sim.sole_normal.sum(axis=1), sim.ground[:, 2], rtol=1e-9)  # level soles
     assert out["sole_slip_mm"] == pytest.approx(1e3 * sim.slip.max())
     assert out["sole_lift_mm"] == pytest.approx(1e3 * sim.lift.max())

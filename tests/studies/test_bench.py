@@ -158,7 +158,7 @@ def test_truth_has_a_row_for_every_problem_file(tmp_path: Path) -> None:
         assert row["status"] == "solved" and row["impulse_planned_Ns"] == IMPULSE
         assert row["impulse_error_pct"] == pytest.approx(1.0)  # as the made-up replay has it
         assert row["replay_impulse_error_pct"] == pytest.approx(1.0)
-        assert {"zmp_margin_m", "torque_ratio", "min_normal_force_N", "replay_slip_mm"} <= row.keys()
+        assert {"zmp_margin_m", "torque_ratio", "force_held", "cop_planned", "replay_slip_mm"} <= row.keys()
         assert "standing" in row
 
 

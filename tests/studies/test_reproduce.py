@@ -212,7 +212,7 @@ def test_table2_and_fig7_have_every_model_beside_the_papers_numbers(small: list[
     assert abs(sdc["impulse_error_pct"]) < 2 < abs(point["impulse_error_pct"])
     assert numbers["worst"][2]["worst_impulse_error_pct"] == abs(sdc["impulse_error_pct"])
     assert numbers["forms"][0]["relative_difference"] < 1e-9
-    assert numbers["reference"][0]["last_halving_changed_Ns"] < 1e-5
+    assert numbers["reference"][0]["tighter_tolerance_changed_Ns"] < 1e-5
     json.dumps(dict(numbers))
     # the same collisions, as a picture
     report = fig7.run(quiet, fidelities=SHORT)

@@ -44,6 +44,8 @@ def test_the_abort_motion_goes_on_from_coasting_and_comes_to_rest(punch: Solutio
     hit = punch.trajectory
     before, after = np.flatnonzero(hit.phase == 1)[-1], np.flatnonzero(hit.phase == 2)[0]
     assert np.abs(hit.v[after] - hit.v[before]).max() > 0.3
+    # where coasting ends, the soles press as the program has it: within their limits
+    np.testing.assert_allclose(missed.sole_wrench[last], punch.plan.coast_wrench, atol=0.1)
     np.testing.assert_allclose(missed.v[missed.time >= missed.end], 0.0, atol=1e-12)
     # its feed-forward balances gravity and motion under the wrenches that it assumes
     data, k = model.createData(), (first + len(missed.time)) // 2

@@ -97,10 +97,12 @@ def off(solution: Solution) -> float:
 def test_the_estimate_is_the_true_error(functions: None) -> None:
     for elements in (COARSE, halved(COARSE)):
         solution = planner.solve(problem(collision_elements=elements), refine=False)
-        assert solution.status is Status.SOLVED and solution.elements == ()
+        assert solution.status.usable and solution.elements == ()
         assert solution.contact_error_pct == pytest.approx(off(solution), rel=0.3, abs=0.02)
         if elements == COARSE:
             assert abs(off(solution)) > 1.0
+            assert solution.status is Status.ACCEPTABLE  # not refined, it says that it is not what it says
+            assert solution.summary()["caution"] in solution.result.message
 
 
 def test_a_coarse_contact_gets_finer_elements_until_it_is_right(functions: None) -> None:
@@ -138,15 +140,15 @@ def test_each_scenario_counts(transcription: Transcription) -> None:
 
 @pytest.mark.parametrize("factor", [0.95, 1.05, 2.0])
 def test_a_contact_that_ends_at_another_time(transcription: Transcription, factor: float) -> None:
-    """A little early or late is told as the impulse until the force is zero; much later as parting within."""
+    """It ends where the force is zero, whatever a plan says; the impulse that was planned is right."""
     t = changed(transcription, collision_elements=((0.25,) * 4, (0.25,) * 4), collision_stages=3)
     x = solve_sqp(t.program, first_iterate(t)).x
     assert isinstance(t.expected, Collision)
     last = t.expected.T[-1].index(0)
     x[last] *= factor
     error = contact_error(t, x)
-    assert error is not None and error.missed == (factor == 2.0)
-    assert abs(error.pct) < 0.2 or (np.isinf(error.pct) and error.missed)
+    assert error is not None and not error.missed
+    assert abs(error.pct) < 0.2
 
 
 def test_an_impact_in_no_time_has_no_elements(transcription: Transcription) -> None:

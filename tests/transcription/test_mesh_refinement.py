@@ -15,6 +15,7 @@ from support.term_cases import MILD
 from impactopt.bodies.shapes import Obstacle, TargetBody
 from impactopt.errors import InputError
 from impactopt.kinematics.splines import CubicSpline
+from impactopt.kinematics.statics import static_wrenches
 from impactopt.planning import planner, rounds
 from impactopt.problem.objectives import (
     OBJECTIVES,
@@ -44,6 +45,7 @@ from impactopt.solvers.sqp import solve_sqp
 from impactopt.transcription import mesh_refinement as between
 from impactopt.transcription.mesh_refinement import NO_MORE, MoreNodes, nodes_to_add
 from impactopt.transcription.plan import Plan
+from impactopt.transcription.reference import complete_reference
 from impactopt.transcription.start import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription
 
@@ -69,14 +71,24 @@ def with_term(plan: Plan, term: Any) -> Plan:
     return dataclasses.replace(plan, problem=dataclasses.replace(plan.problem, terms=(term,)))
 
 
+def middles_of(nodes: Array, at: Array) -> tuple[float, ...]:
+    """Middles of the intervals between nodes in which places lie."""
+    first = np.searchsorted(nodes, at, side="right") - 1
+    return tuple(middles(nodes)[np.unique(np.minimum(first, len(nodes) - 2))])
+
+
+def each_millisecond(curve: CubicSpline) -> Array:
+    return np.linspace(0.0, 1.0, round(curve.duration / 1e-3) + 1)
+
+
 @pytest.mark.parametrize("fraction", [0.05, 0.1, 1.0])
 def test_torques_between_nodes_by_inverse_dynamics(arm_plan: Planned, fraction: float) -> None:
     plan = with_term(arm_plan.plan, TorqueLimit(fraction=fraction))
     limit, expected = plan.problem.robot.torque_limit, []
     for curve, nodes in ((plan.swing, plan.swing_nodes), (plan.follow, plan.follow_nodes)):
-        at = middles(nodes)
+        at = each_millisecond(curve)
         ratio = np.array([np.abs(tau / limit).max() for _, tau in forces(plan, curve, at)])
-        expected.append(tuple(at[ratio > 1.2 * fraction]))
+        expected.append(middles_of(nodes, at[ratio > 1.2 * fraction]))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(between, "_SHARE", 0.0)
         patch.setattr(between, "_TORQUE", 0.2 * fraction)
@@ -85,30 +97,59 @@ def test_torques_between_nodes_by_inverse_dynamics(arm_plan: Planned, fraction: 
     assert nodes_to_add(plan, NO_MORE) == NO_MORE  # half of the room up to all that there is
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.02, 0.08])
-def test_the_zmp_between_nodes_by_inverse_dynamics(biped_plan: Planned, margin: float) -> None:
-    plan = with_term(biped_plan.plan, ContactWrenchCone(margin=margin))
-    expected = []
-    for curve, nodes in ((plan.swing, plan.swing_nodes), (plan.follow, plan.follow_nodes)):
-        at, zmps = middles(nodes), []
-        for q, tau in forces(plan, curve, at):
-            place = pin.SE3(pin.Quaternion(q[3:7]).toRotationMatrix(), q[:3])
-            f = place.act(pin.Force(tau[:6]))  # about the world's origin
-            zmps.append([-f.angular[1] / f.linear[2], f.angular[0] / f.linear[2]])
-        inside = distance_inside(plan.polygon, np.array(zmps))
-        expected.append(set(at[inside < min(margin / 2, margin - 1e-3)]))
-    found = nodes_to_add(plan, NO_MORE)
-    assert expected[0] <= set(found.swing) and expected[1] <= set(found.follow)
-    if margin == 0.08:
+def sole_wrenches(plan: Plan, phase: int) -> Array:
+    """(k, soles, 6) in the soles' frames, at the instants of a phase: what each leg's torques leave to it."""
+    c, ref, model = plan.coordinates, plan.trajectory(), plan.problem.robot.model
+    data, at = model.createData(), ref.phase == phase
+    out = []
+    for q, v, a, torque in zip(ref.q[at], ref.v[at], ref.a[at], ref.torque[at], strict=True):
+        lacking = pin.rnea(model, data, q, v, a)[c.base :] - torque
+        jac = [pin.computeFrameJacobian(model, data, q, model.getFrameId(leg.frame)) for leg in c.legs]
+        own = [(c.base + leg.joints, j) for leg, j in zip(c.legs, jac, strict=True)]
+        out.append([np.linalg.solve(j[:, k].T, lacking[k - c.base]) for k, j in own])
+    return np.array(out)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.02, 0.04])
+def test_each_sole_between_nodes_by_its_legs_torques(biped_plan: Planned, margin: float) -> None:
+    """Also where the ZMP of both is well inside their hull."""
+    plan = with_term(biped_plan.plan, ContactWrenchCone(margin=margin, minimum_force=0.0, friction=5.0))
+    soles, expected = plan.coordinates.soles, []
+    for phase, curve, nodes in ((0, plan.swing, plan.swing_nodes), (2, plan.follow, plan.follow_nodes)):
+        wrench = sole_wrenches(plan, phase)[: len(each_millisecond(curve))]
+        cop = np.stack([-wrench[..., 4], wrench[..., 3]], axis=-1) / wrench[..., 2:3]
+        inside = np.array([distance_inside(sole.polygon, cop[:, k]) for k, sole in enumerate(soles)])
+        out = inside.min(axis=0) < min(margin / 2, margin - 1e-3)
+        expected.append(middles_of(nodes, each_millisecond(curve)[out]))
+    assert nodes_to_add(plan, NO_MORE) == MoreNodes(*expected)
+    if margin == 0.04:
         assert expected[0] or expected[1]
     known = MoreNodes(swing=(0.123,), follow=(0.456,))
-    assert nodes_to_add(plan, known).total == found.total + 2
+    assert nodes_to_add(plan, known).total == sum(map(len, expected)) + 2
+
+
+def test_a_correction_between_nodes_is_shared_as_the_load_is(biped_plan: Planned) -> None:
+    """A sole that bears a tenth takes less of what is lacking, and its centre of pressure stays."""
+    plan = biped_plan.plan
+    c = plan.coordinates
+    y, legs = c.split(plan.problem.start_posture)
+    still, wrench = np.zeros((1, len(y))), static_wrenches(c, y, legs)[None]
+    even = complete_reference(plan.problem, y[None], still, still, wrench, legs).sole_wrench
+    moved, lean = even.copy(), np.array([0.0, 0.0, 0.8 * even[0, 8]])
+    one, other = (leg.placement for leg in c.legs)  # level soles, side by side
+    moved[0, 2], moved[0, 8] = even[0, 2] + lean[2], even[0, 8] - lean[2]
+    moved[0, 3:6] -= one.rotation.T @ np.cross(one.translation - other.translation, lean)
+    short = 0.97 * moved
+    found = complete_reference(plan.problem, y[None], still, still, short, legs).sole_wrench
+    gain = (found - short)[0, 2::6]
+    assert 0 < gain[1] < 0.5 * gain[0]  # in even parts they are the same
+    np.testing.assert_allclose(found[0, 9:11] / found[0, 8], moved[0, 9:11] / moved[0, 8], atol=5e-3)
 
 
 def test_legs_between_nodes_are_no_faster_than_they_may_be(biped_plan: Planned) -> None:
     """Their rates follow from the soles', so no control point bounds them."""
     plan = biped_plan.plan
-    c, robot, places = plan.coordinates, plan.problem.robot, middles(plan.follow_nodes)
+    c, robot, places = plan.coordinates, plan.problem.robot, each_millisecond(plan.follow)
     legs, fastest = c.split(plan.problem.start_posture)[1], []
     for y, yd, ydd in zip(*plan.follow.sample(places * plan.follow.duration), strict=True):
         legs = c.solve_legs(y, legs)
@@ -117,7 +158,7 @@ def test_legs_between_nodes_are_no_faster_than_they_may_be(biped_plan: Planned) 
     limit[c.dependent] = np.sort(fastest)[-2] * 1.001
     slow = dataclasses.replace(plan.problem, robot=dataclasses.replace(robot, velocity_limit=limit))
     found = nodes_to_add(dataclasses.replace(plan, problem=slow), NO_MORE)
-    assert found.follow == (places[int(np.argmax(fastest))],)
+    assert found.follow == middles_of(plan.follow_nodes, places[[int(np.argmax(fastest))]])
 
 
 def finer(t: Transcription) -> Transcription:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.rooms import FILES, imports, room, rooms_imported
-from support.small_plans import arm_problem, changed, transcribed
+from support.small_plans import Planned, arm_problem, changed, transcribed
 
 from impactopt.contact import FreeMass
 from impactopt.files.problem_file import load_problem
@@ -17,13 +18,15 @@ from impactopt.planning.keeping_apart import Margins, Watch
 from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
-from impactopt.problem.terms import GearLoad, Slide, TargetSpeed
+from impactopt.problem.terms import ContactWrenchCone, GearLoad, Slide, TargetSpeed
 from impactopt.robots.parts import SoftGrip
+from impactopt.transcription.plan import Trajectory
 from impactopt.transcription.start import first_iterate
 from impactopt.transcription.statement import statement_of
 from impactopt.transcription.transcription import Transcription, block_functions
 from impactopt.verification.kkt import lagrangian_gradient
 from impactopt.verification.program import Program
+from impactopt.verification.recorded import off_in_record
 from impactopt.verification.variables import Variables
 from impactopt.verification.verdict import claims_of
 
@@ -163,3 +166,19 @@ def test_of_a_tool_in_a_soft_grip() -> None:
 def test_of_effort() -> None:
     p = load_problem(PROBLEMS / "arm_planar.toml")
     check_rows(_drawn(dataclasses.replace(p, objectives=(*p.objectives, Effort(weight=0.02)))))
+
+
+def test_half_of_each_soles_margin_is_kept_in_the_reference(biped_plan: Planned) -> None:
+    """By the wrenches that the legs' torques leave to the soles, as the plan says."""
+    plan, t = biped_plan.plan, biped_plan.transcription
+    arrays = {f"reference_{f.name}": getattr(biped_plan.trajectory, f.name) for f in fields(Trajectory)}
+    margins = plan.sole_margins(biped_plan.trajectory)["sole_cop_margin_mm"].values()
+    kept = 1e-3 * min(phases[name] for phases in margins for name in ("swing", "follow"))
+    for half, short in ((kept + 3e-3, 3e-3), (kept - 1e-3, 0.0)):
+        cone = ContactWrenchCone(margin=2 * half, minimum_force=0.0)
+        program, v = second(changed(t, terms=(cone,)), biped_plan.result.x)
+        off = {found.name: found.amount for found in off_in_record(program, v, arrays, {})}
+        assert max(off["reference margin of a sole's centre of pressure"], 0.0) == pytest.approx(
+            short, abs=1e-6
+        )
+        assert off["reference normal force of a sole"] < 0

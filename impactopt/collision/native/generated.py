@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -157,4 +158,8 @@ def c_code(name: str, functions: list[Any]) -> str:
     generator = ca.CodeGenerator(f"{name}.c", {"with_header": False})
     for function in functions:
         generator.add(function)
-    return f"#undef CASADI_PREFIX\n{generator.dump()}\n"
+    # its helpers too: several such files go into one library
+    static = re.sub(
+        r"^(casadi_real|casadi_int|void|int) casadi_", r"static \g<0>", generator.dump(), flags=re.M
+    )
+    return f"#undef CASADI_PREFIX\n{static}\n"

@@ -196,8 +196,9 @@ static void find_event(const Data *d, const Instant *now, const Series *s, const
 #if SWITCHES
   FOR(k, SWITCHES) {
     hull(switching->terms[k], b);
-    const double side = b[0] != 0.0 ? b[0] : b[1];
-    look_at(b, side < 0.0 ? -1.0 : 1.0, 0.0, OF_SWITCH, k, e);
+    if (b[0] != 0.0) look_at(b, b[0] < 0.0 ? -1.0 : 1.0, 0.0, OF_SWITCH, k, e);
+    /* a tie: the target goes by the piece that zero belongs to, which may not be the one that comes */
+    else FOR(i, TERMS) if (b[i] != 0.0) *e = (Event){.at = 0.0, .kind = OF_SWITCH, .number = k};
   }
 #endif
 }

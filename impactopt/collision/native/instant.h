@@ -143,8 +143,21 @@ static void no_number(const Data *d, State *y, Instant *now) {
   now->contact = 1;
 }
 
+/* whether hand and target, which neither approach nor part, are about to approach */
+static int closing(const Data *d, const State *y, const Instant *now) {
+  vec u[V];
+  double rates[NZ1], then[NZ1], force;
+  force = call(contact_force, &y->penetration, &now->rate, d->law);
+  const double *in[] = {y->target, &force, d->target};
+  double *out[] = {rates};
+  target_rates(in, out, 0, 0, 0);
+  FOR(i, NZ) then[i] = y->target[i] + 1e-9 * rates[i];
+  const double gained = (call(target_velocity, then, d->target, 0) - now->target_speed) / 1e-9;
+  return velocity(d, now->net, force, 1.0, u) > gained;
+}
+
 /* phase: contact is over when, in restitution, no force is left */
 INLINE void judge(const Data *d, const State *y, Instant *now) {
-  now->compressing = now->rate > 0.0;
+  now->compressing = now->rate > 0.0 || (now->rate == 0.0 && closing(d, y, now));
   now->contact = now->compressing || call(left_force, &y->penetration, &now->rate, d->law) > 0.0;
 }

@@ -34,10 +34,7 @@ EXPORT int NAME(const double **arg, double **res, Int *iw, double *w, int mem) {
     /* a collision's work is what every room begins with */
     if (!((const Work *)room)->frozen.spoiled) return 0;
   }
-  FOR(k, N_OUT) {
-    if (!res[k]) continue;
-    FOR(i, SHAPES_OUT[k][0] * SHAPES_OUT[k][1]) res[k][i] = __builtin_nan("");
-  }
+  no_numbers(res);
   return 0;
 }
 EXPORT void OF_NAME(incref)(void) {}

@@ -70,9 +70,7 @@ def native_collision(collision: SteppedModel, outputs: tuple[str, ...], *, every
     """
     code = _code(collision, "collision", outputs, every)
     return NativeCode(
-        name="collision",
-        code=code,
-        graph=lambda: _guarded(collision, collision_graph(collision, outputs, every=every, as_compiled=True)),
+        name="collision", code=code, graph=lambda: _guarded(collision, _over(collision, outputs, every))
     )
 
 
@@ -123,6 +121,18 @@ def native_differences(
 
     code = _code(collision, "collision_differences", outputs, every, by)
     return NativeCode(name="collision_differences", code=code, graph=none)
+
+
+def _over(collision: SteppedModel, outputs: tuple[str, ...], every: int) -> ca.Function:
+    """The graph, without numbers where the contact is not over and no output says so, as C code has it."""
+    named = outputs if {"separated", "duration"} & {*outputs} else (*outputs, "separated")
+    graph = collision_graph(collision, named, every=every, as_compiled=True)
+    if named is outputs:
+        return graph
+    inputs = [ca.MX.sym(graph.name_in(k), graph.sparsity_in(k)) for k in range(graph.n_in())]
+    *out, separated = graph.call(inputs)
+    out = [ca.if_else(separated, x, np.nan) for x in out]
+    return ca.Function(graph.name(), inputs, out, graph.name_in(), [*outputs])
 
 
 def _guarded(collision: SteppedModel, graph: ca.Function) -> ca.Function:

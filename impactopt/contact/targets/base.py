@@ -121,6 +121,20 @@ class Target(Described, ABC):
         """Expressions of order 1 that are not negative while a phase lasts: one, or none."""
         return []
 
+    def reserve(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
+        """Expressions of order 1 that are not negative where a phase ends, so that a blow which is a little
+        weaker comes to its end too: one, or none.
+        """
+        return []
+
+    def margin(self, phase: int, place: float) -> float:
+        """How far `invariant` stays from zero at a place in a phase, 0 where it begins and 1 where it ends.
+
+        So that an event which ends a phase is the first of its kind, and not one that a small error brings
+        earlier.
+        """
+        return 0.0
+
     def result(self, state: Any, parameters: Parameters | None = None) -> list[Any]:
         """What the blow has done to the target, from the state at separation; named by `results`."""
         return []
@@ -158,6 +172,7 @@ class Target(Described, ABC):
                 *rates,
                 *([self.guard(state, force, ca.SX.sym("T"), k, numbers)] if k < len(self.guards) else []),
                 *self.invariant(state, force, k, numbers),
+                *self.reserve(state, force, k, numbers),
             ]
         made = [f"{name}: {text_of(expressions)}" for name, expressions in parts.items()]
         return (*made, f"results: {', '.join(self.results)}")

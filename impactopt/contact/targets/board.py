@@ -11,6 +11,9 @@ from impactopt.contact.targets.base import Target
 
 __all__ = ["Board"]
 
+MARGIN = 0.1  # of the breaking force where the board is touched; none where it breaks
+RESERVE = 0.02  # of the deflection at the break
+
 
 @dataclass(frozen=True, kw_only=True)
 class Board(Target):
@@ -73,6 +76,23 @@ class Board(Target):
     ) -> list[Any]:
         """Before the break the spring's force is below the breaking force."""
         return [] if phase else [-self.guard(state, force, 0.0, phase, parameters)]
+
+    def reserve(self, state: Any, force: Any, phase: int, parameters: Parameters | None = None) -> list[Any]:
+        """Under the force at the break, a board that did not break would swing on by a share of its
+        deflection: v^2 / (2 |dv/dt|) >= RESERVE F / k, where it slows down.
+        """
+        if phase:
+            return []
+        p = self.parameters if parameters is None else parameters
+        F, v = p["breaking_force"], state[0]
+        slows = 1.0 + (p["damping"] * v - force) / F
+        return [p["stiffness"] * p["mass"] * v**2 / F**2 - 2.0 * RESERVE * slows]
+
+    def margin(self, phase: int, place: float) -> float:
+        """A board that only just holds may break, so an earlier peak of its swing keeps off the break, and
+        the break is come to with a speed.
+        """
+        return MARGIN * (1.0 - place) if phase == 0 else 0.0
 
     def _beyond(self, state: Any, p: Parameters) -> Any:
         return state[1] - p["breaking_force"] / p["stiffness"]

@@ -12,26 +12,34 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.contact.laws import SpringDamper
+from impactopt.contact.targets import FreeMass
 from impactopt.errors import InputError
 from impactopt.files.draft.aim import WAYS, Arm, aims, ready
-from impactopt.files.draft.guesses import DOUBT, ROTOR
+from impactopt.files.draft.guesses import DOUBT
 from impactopt.files.draft.limbs import renumbered
 from impactopt.files.draft.postures import half_sitting, rested
 from impactopt.files.draft.robot import Drafted, draft_robot
-from impactopt.files.draft.soles import find_soles, find_striker, sides
+from impactopt.files.draft.soles import find_soles, sides
+from impactopt.files.draft.strikers import find_striker
+from impactopt.files.draft.strong import Strong, duration, strongest
 from impactopt.files.problem_file.describing import comment_at
 from impactopt.files.problem_file.reading import problem_file_from_data
 from impactopt.files.problem_file.robot_writing import sole_data, striker_data
 from impactopt.files.problem_file.toml import Place, plain_value, write_toml
 from impactopt.problem.doubts import hopeless
+from impactopt.problem.plausibility import far_shapes
 from impactopt.robots.inertias import REPAIRED
 from impactopt.robots.parts import Sole, Striker
 from impactopt.robots.robot import Robot
+from impactopt.robots.rotors import USUAL_ROTOR
 
 __all__ = ["Draft", "draft_problem"]
 
 Array = NDArray[np.float64]
 TRIED = 8  # targets
+STIFFNESS, DAMPING = 1e4, 300.0  # [N/m], [N s/m] of a drafted contact
+SWING, FOLLOW = (0.5, 1.2), (0.6, 1.5)  # [s] of fast robots
 START = "ready"
 
 
@@ -43,17 +51,17 @@ class Draft:
     said: tuple[str, ...]
 
 
-def draft_problem(path: Path, *, folder: Path, mjcf: bool = False) -> Draft:
+def draft_problem(path: Path, *, folder: Path, mjcf: bool = False, bolted: bool = False) -> Draft:
     """The text of a problem file for the robot of a URDF, or an MJCF.
 
-    folder : that the file is to be in.
+    folder : that the file is to be in.  bolted : to the ground, even if the robot has legs.
 
     Raises
     ------
     InputError : the file cannot be read; the robot is none that can be planned for, with the reason; no
         posture or no target is found.
     """
-    drafted = draft_robot(path, mjcf=mjcf)
+    drafted = draft_robot(path, mjcf=mjcf, bolted=bolted)
     model, forward = drafted.robot.model, np.array(WAYS[0])
     soles: list[Sole] = []
     if drafted.legs:
@@ -63,10 +71,37 @@ def draft_problem(path: Path, *, folder: Path, mjcf: bool = False) -> Draft:
     legs = tuple(renumbered(leg, model, robot.model) for leg in drafted.legs)
     arms = [replace(arm, limb=renumbered(arm.limb, model, robot.model)) for arm in arms]
     q = half_sitting(robot, legs, soles, forward) if soles else rested(robot)
-    q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
-    data = _data(drafted, robot, soles, strikers, q, folder)
-    data = _aimed(data, robot, arms[0], q, way, folder)
-    return Draft(text=_text(data, drafted, robot), said=tuple(_said(data, drafted, robot)))
+    strong = None if soles else _strong(drafted, robot, arms[0], q)
+    if strong is None:
+        q, way = ready(robot, arms, q, ways=WAYS[:1] if soles else WAYS)
+        data = _data(drafted, robot, soles, strikers, q, folder)
+        data = _aimed(data, robot, arms[0], aims(robot, arms[0], q, way), way, folder)
+    else:
+        data = _data(drafted, robot, soles, strikers, strong.start, folder)
+        way = robot.joint_positions(strong.contact) - robot.joint_positions(strong.start)
+        for phase, usual in (("swing", SWING), ("follow", FOLLOW)):
+            data[phase]["duration_s"] = duration(robot, way, usual)
+        data = _aimed(data, robot, arms[0], iter([strong.point]), strong.normal, folder)
+    said = [*_said(data, drafted, robot), *([_told_strike(strong)] if strong else [])]
+    return Draft(text=_text(data, drafted, robot), said=tuple(said))
+
+
+def _strong(drafted: Drafted, robot: Robot, arm: Arm, q: Array) -> Strong | None:
+    """The hardest blow that is found for an arm on a fixed base."""
+    target = FreeMass(mass=_target_mass(robot))
+    return strongest(robot, arm, q, law=SpringDamper(stiffness=STIFFNESS, damping=DAMPING), target=target)
+
+
+def _told_strike(strong: Strong) -> str:
+    normal = ", ".join(f"{x:g}" for x in strong.normal)
+    return (
+        f"the drafted blow, along [{normal}], is the hardest of the strikes tried: {strong.impulse:.3g} N s"
+    )
+
+
+def _target_mass(robot: Robot) -> float:
+    mass = sum(float(body.mass) for body in robot.model.inertias)
+    return float(f"{np.clip(0.06 * mass, 0.5, 5.0):.1g}")
 
 
 def _arms(drafted: Drafted) -> tuple[list[Arm], list[Striker]]:
@@ -111,10 +146,10 @@ def _data(
     data: dict[str, Any] = {
         "problem": {"name": f"first strike of {robot.name}", "start": START},
         "robot": keys,
-        "target": {"mass_kg": float(f"{np.clip(0.06 * mass, 0.5, 5.0):.1g}")},
-        "contact": {"stiffness_N_m": 1e4, "damping_N_s_m": 300.0},
-        "swing": {"duration_s": [0.5, 1.2], "intervals": 16 if soles else 12},
-        "follow": {"duration_s": [0.6, 1.5], "intervals": 14 if soles else 10},
+        "target": {"mass_kg": _target_mass(robot)},
+        "contact": {"stiffness_N_m": STIFFNESS, "damping_N_s_m": DAMPING},
+        "swing": {"duration_s": list(SWING), "intervals": 16 if soles else 12},
+        "follow": {"duration_s": list(FOLLOW), "intervals": 14 if soles else 10},
     }
     if soles:
         part = mass / 90.0  # bounds that fit TALOS, which has 90 kg on soles 12 cm wide
@@ -132,7 +167,7 @@ def _data(
 
 
 def _aimed(
-    data: dict[str, Any], robot: Robot, arm: Arm, q: Array, way: Array, folder: Path
+    data: dict[str, Any], robot: Robot, arm: Arm, points: Iterator[Array], way: Array, folder: Path
 ) -> dict[str, Any]:
     """The data with a target that check finds no fault with.
 
@@ -141,7 +176,7 @@ def _aimed(
     InputError : there is none; with what was wrong with the first.
     """
     first = ""
-    for k, point in enumerate(aims(robot, arm, q, way)):
+    for k, point in enumerate(points):
         if k == TRIED:
             break
         problem = {"striker": arm.name, "point_m": point.tolist(), "normal": (way + 0.0).tolist()}
@@ -162,7 +197,7 @@ def _aimed(
 
 def _text(data: dict[str, Any], drafted: Drafted, robot: Robot) -> str:
     guessed = {
-        "armature_kg_m2": f"{DOUBT}: {1e3 * ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
+        "armature_kg_m2": f"{DOUBT}: {1e3 * USUAL_ROTOR:g} g m2 a N m of torque; give rotor inertia x gear^2",
         "torque_limit_N_m": f"{DOUBT}: from what gravity can ask; the file has none",
         "velocity_limit_rad_s": f"{DOUBT}; the file has none",
         "soles": "found in the feet's collision shapes: the part within 5 mm of the ground",
@@ -223,6 +258,8 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
     stands = "on two legs" if drafted.legs else "on a fixed base"
     joints, striker = robot.n - int(robot.hinges.sum()), data["problem"]["striker"]
     yield f"{robot.name}: {joints} joints, {stands}; {striker!r} strikes"
+    if drafted.freed:
+        yield "the MJCF has no free joint: it stands on its two legs here; --bolted leaves it bolted"
     across = [sole["name"] for sole in data["robot"].get("soles", ()) if _wide(sole["polygon_m"])]
     if across:
         yield f"soles that are longer across than ahead: {', '.join(across)}; look at the feet's shapes"
@@ -232,8 +269,10 @@ def _said(data: Mapping[str, Any], drafted: Drafted, robot: Robot) -> Iterator[s
                 f"five joints hold sole {sole.name!r}: the foot may turn on it about {sole.hinge}, by "
                 f"{sole.hinge_range:g} rad, and it bears no moment about that axis"
             )
+    yield from far_shapes(robot)
     if drafted.locked:
         yield f"locked: {'; '.join(_reasons(drafted.locked))}"
+    yield from robot.source.notes if robot.source is not None else ()
     for key, what in (
         ("armature_kg_m2", "rotor inertias"),
         ("torque_limit_N_m", "torque limits"),

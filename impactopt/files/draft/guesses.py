@@ -9,11 +9,10 @@ import numpy as np
 import pinocchio as pin
 
 from impactopt.robots.build import effort_limit, is_floating, joint_names, velocity_limit
+from impactopt.robots.rotors import USUAL_ROTOR
 
 __all__ = ["Drives", "guess_drives"]
 
-# Robots with public rotors have 0.0002 s2 (G1: gears of 14 to 22) to 0.003 s2 (arms: 160) x torque limit
-ROTOR = 1e-3  # [s2] armature over torque limit
 LEAST = {True: 1e-3, False: 0.05}  # armature: [kg m2] of a hinge, [kg] of a slide
 SPEED = {True: 3.0, False: 0.3}  # [rad/s], [m/s]
 WEIGHT = 3.0  # torque limit over the largest that gravity asks for
@@ -60,7 +59,7 @@ def guess_drives(model: pin.Model, known: Mapping[str, float], carrying: Collect
         elif speed[k] > FAST:
             out.said.append(f"velocity limit of {joint}, {speed[k]:g} rad/s: hard to believe")
         if model.armature[base + k] == 0:
-            out.armature[joint] = _rounded(max(ROTOR * limit, LEAST[turns]))
+            out.armature[joint] = _rounded(max(USUAL_ROTOR * limit, LEAST[turns]))
     return out
 
 

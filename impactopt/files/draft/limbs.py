@@ -70,6 +70,8 @@ def to_lock(model: pin.Model) -> dict[str, str]:
             if joint.nq != 1
             else (model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q])
         )
+        if low > high:
+            continue  # crossed limits are a mistake of the file, which the robot's checks tell
         if not low < high:
             out[name] = "no range"
         elif _WHEELS.search(name) or (joint.nq == 2 and model.parents[j] < first and not children[j]):

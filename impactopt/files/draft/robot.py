@@ -15,11 +15,13 @@ from impactopt.bodies.pieces import Piece, pieces_of
 from impactopt.errors import InputError
 from impactopt.files.draft.guesses import Drives, guess_drives
 from impactopt.files.draft.limbs import Limb, arms_of, legs_of, to_lock, toes, unshared
-from impactopt.robots.build import is_floating, lock_joints, read_urdf
+from impactopt.robots.build import is_floating, lock_joints
 from impactopt.robots.checks import LEG
+from impactopt.robots.description import Description, Tie
 from impactopt.robots.inertias import REPAIRED, check_inertias
-from impactopt.robots.mjcf import Mjcf, read_mjcf
+from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.robot import Robot
+from impactopt.robots.urdf import read_urdf
 
 __all__ = ["Drafted", "draft_robot"]
 
@@ -49,23 +51,33 @@ class Drafted:
         """Whether it is of an MJCF."""
         return self.robot.mjcf is not None
 
+    @property
+    def freed(self) -> bool:
+        """Whether it stands, and its MJCF has no free joint."""
+        return self.mjcf and self.robot.floating and not is_floating(read_mjcf(self.path).model)
+
     def made(self, **more: Any) -> Robot:
         """The robot anew, with more options."""
         make = Robot.from_mjcf if self.mjcf else Robot.from_urdf
         return make(self.path, inertias=REPAIRED, **{**self.options, **more})
 
 
-def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
+def draft_robot(path: Path, *, mjcf: bool = False, bolted: bool = False) -> Drafted:
     """The robot of a file, on two legs if it has them, else bolted to the ground.
+
+    bolted : to the ground, even if it has legs.
 
     Raises
     ------
-    InputError : it cannot be read; it has legs that no plan can hold, with the reason; nothing can strike.
+    InputError : it cannot be read; it has legs that no plan can hold, with the reason; its root has no mass,
+        and legs bear it; nothing can strike.
     """
-    first = _read(path, mjcf, None if mjcf else True)
+    first = _floating(path, mjcf, bolted)
     locked = _locked(first)
-    floats = is_floating(first.model)
+    floats = is_floating(first.model) and float(first.model.inertias[1].mass) > 0
     found = _made(path, mjcf, floats, locked)
+    if is_floating(first.model) and not floats:
+        _check_bolted(first, found)
     legs = legs_of(found.robot.model, found.pieces) if floats else ()
     if legs:
         _check_legs(found.robot, legs)
@@ -83,15 +95,48 @@ def draft_robot(path: Path, *, mjcf: bool = False) -> Drafted:
     return replace(found, legs=legs, arms=arms)
 
 
-def _read(path: Path, mjcf: bool, floating: bool | None) -> Mjcf:
+def _floating(path: Path, mjcf: bool, bolted: bool) -> Description:
+    """The robot with a free-flyer at its root, if it may have one.
+
+    Many an MJCF of a humanoid has no free joint, so that a scene can place it.
+    """
+    if bolted or not mjcf:
+        return _read(path, mjcf, not bolted)
+    read = read_mjcf(path)
+    if is_floating(read.model):
+        return read
+    try:
+        return read_mjcf(path, floating=True)
+    except InputError:  # several bodies on the ground
+        return read
+
+
+def _check_bolted(first: Description, found: Drafted) -> None:
+    """InputError if a robot stands on legs that has a free-flyer in `first`, and none in `found`, as its root
+    has no mass.
+    """
+    model = lock_joints(first.model, found.options["locked"])
+    if legs_of(model, {joint + 1: pieces for joint, pieces in found.pieces.items()}):
+        raise InputError(
+            f"{found.path}: the root link has no mass, and the robot stands on legs; give it an "
+            "<inertial>, or bolt it to the ground (--bolted)"
+        )
+
+
+def _read(path: Path, mjcf: bool, floating: bool | None) -> Description:
     if mjcf:
         return read_mjcf(path, floating=floating)
-    return Mjcf(model=read_urdf(path, None, floating=bool(floating), repaired=True))
+    return read_urdf(path, floating=bool(floating), repaired=True)
 
 
-def _locked(read: Mjcf) -> dict[str, str]:
+def _locked(read: Description) -> dict[str, str]:
+    """Joints that no plan should move, or that follow others: an own reason for each kind."""
     out = to_lock(read.model)
-    return out | {one: f"follows {other}" for one, other in read.coupled if not {one, other} & out.keys()}
+    for tie in read.ties:
+        if tie.follower and tie.follower not in out:
+            others = [joint for joint in tie.joints if joint != tie.follower]
+            out[tie.follower] = f"{tie.follower} follows {others[0]}" if others else f"{tie.follower} is held"
+    return out
 
 
 def _made(
@@ -99,6 +144,9 @@ def _made(
 ) -> Drafted:
     read = _read(path, mjcf, floating)
     angles = {joint: _rest(read.model, joint) for joint in locked}
+    for tie in read.ties:
+        if tie.follower in locked:
+            angles[tie.follower] = _followed(read.model, tie, angles)
     model = lock_joints(read.model, angles)
     drives = guess_drives(model, read.torque, carrying)
     wrong: tuple[str, ...] = ()
@@ -139,6 +187,26 @@ def _rest(model: pin.Model, name: str) -> float:
         return 0.0
     low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
     return float(np.clip(0.0, low, high)) if low <= high else 0.0
+
+
+def _followed(model: pin.Model, tie: Tie, angles: Mapping[str, float]) -> float:
+    """The angle of a joint that follows another one: where that is locked, or bent by a quarter of its range.
+
+    An arm of which a follower is locked straight reaches little.
+    """
+    follower = model.joints[model.getJointId(tie.follower)]
+    leader = next((joint for joint in tie.joints if joint != tie.follower), None)
+    angle = 0.0 if leader is None else angles.get(leader, _bent(model, leader))
+    low, high = (model.lowerPositionLimit[follower.idx_q], model.upperPositionLimit[follower.idx_q])
+    followed = float(np.polynomial.polynomial.polyval(angle, tie.follows))
+    return float(np.clip(followed, low, high)) if follower.nq == 1 and low <= high else followed
+
+
+def _bent(model: pin.Model, name: str) -> float:
+    if not model.existJointName(name) or (joint := model.joints[model.getJointId(name)]).nq != 1:
+        return 0.0
+    low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+    return float(low + 0.25 * (high - low)) if np.isfinite([low, high]).all() else 0.0
 
 
 def _check_legs(robot: Robot, legs: tuple[Limb, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Soles and striking points, found in the shapes of the links that end a limb."""
+"""Soles, found in the shapes of the links that end legs; sides of limbs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from scipy.spatial import ConvexHull
 from impactopt.bodies.pieces import Piece
 from impactopt.errors import InputError
 from impactopt.files.draft.limbs import Limb, unshared
+from impactopt.files.draft.strikers import first_link
 from impactopt.robots.checks import LEG
-from impactopt.robots.parts import Sole, Striker
+from impactopt.robots.parts import Sole
 
-__all__ = ["find_soles", "find_striker", "sides"]
+__all__ = ["find_soles", "sides"]
 
 Array = NDArray[np.float64]
 SLICE = 0.005  # [m] of a foot above its lowest point, that stands on the ground
@@ -27,7 +28,6 @@ AHEAD = 0.01  # [m] of a foot's middle ahead of its ankle that says which way is
 BENDS = 0.2  # [rad] of a knee's range more to one side than to the other, twice
 NEAR, FAR, DRAWN = 0.4, 0.3, 40  # [rad] about zero, [m]: postures in which axes of hinges are compared
 HELD = 5e-3  # of a leg with a hinge: its Jacobian's least singular value, moments by FAR, at least
-STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
 
 
 def find_soles(
@@ -70,7 +70,7 @@ def find_soles(
                 f"the foot at joint {str(model.names[leg.tip])!r} has no flat face of {1e4 * SMALLEST:g} cm2 "
                 "to stand on: point feet and round ones cannot be held as soles"
             )
-        parent, above = _body_of(model, leg.tip)
+        parent, above = first_link(model, leg.tip)
         soles.append(
             Sole(
                 name=name,
@@ -133,34 +133,11 @@ def _hinge(model: pin.Model, leg: Limb, own: Sequence[int], place: Any) -> str:
     return best
 
 
-def find_striker(
-    model: pin.Model, limb: Limb, name: str, pieces: Mapping[int, tuple[Piece, ...]]
-) -> tuple[Striker, Array]:
-    """The end of a limb, on its axis, and the way (3,) in which the limb's last link points there."""
-    parent, above = _body_of(model, limb.tip)
-    points = [p.vertices for p in pieces.get(limb.tip, ())]
-    frames = [f.placement.translation for f in model.frames if f.parentJoint == limb.tip]
-    middle = np.mean([(p.max(axis=0) + p.min(axis=0)) / 2 for p in points], axis=0) if points else np.zeros(3)
-    axis = middle if np.linalg.norm(middle) > AHEAD else np.array(max(frames, key=np.linalg.norm))
-    if np.linalg.norm(axis) < 1e-6:  # nothing sticks out: on as the link before does
-        axis = model.jointPlacements[limb.tip].actInv(np.zeros(3)) * -1.0
-    if np.linalg.norm(axis) < 1e-6:
-        axis = np.array([0.0, 0.0, 1.0])
-    axis = _unit(axis)
-    k = int(np.argmax(np.abs(axis)))
-    if abs(axis[k]) > STRAIGHT:
-        axis = np.eye(3)[k] * np.sign(axis[k])
-    everything = np.concatenate([*points, np.array(frames).reshape(-1, 3)])
-    point = axis * max(float((everything @ axis).max()), 0.0)
-    local = np.round(above.actInv(point), 4) + 0.0
-    return Striker(name=name, frame=parent, point=local), axis
-
-
 def sides(model: pin.Model, tips: Sequence[int]) -> list[str]:
     """Names for limbs: "left" and "right" where two are on both sides of the middle, else their links'."""
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
-    links = [_body_of(model, tip)[0] for tip in tips]
+    links = [first_link(model, tip)[0] for tip in tips]
     if len(tips) != 2:
         return links
     words = [_side(link) for link in links]
@@ -212,14 +189,6 @@ def _polygon(corners: Array) -> Array | None:
     x, y = points.T
     area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
     return np.round(points, 4) + 0.0 if area > SMALLEST else None
-
-
-def _body_of(model: pin.Model, joint: int) -> tuple[str, Any]:
-    """The first link that a joint moves, and its placement."""
-    for frame in model.frames:
-        if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
-            return str(frame.name), frame.placement
-    return str(model.names[joint]), pin.SE3.Identity()
 
 
 def _neat(place: Any) -> Any:

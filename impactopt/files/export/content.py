@@ -22,6 +22,7 @@ from impactopt.files.output import plain
 from impactopt.files.replay import Planned
 from impactopt.problem.problem import ImpactProblem
 from impactopt.robots.robot import Robot
+from impactopt.simulation.touch import parts_from
 from impactopt.solvers.program import Status
 
 __all__ = ["Export", "body_name", "check_export", "export_of", "joint_order"]
@@ -37,8 +38,8 @@ class Export:
 
     planned : the plan, its problem and its references.  joints : names, in the order of all columns.
     order (n,) : where these are in the robot's own arrays.  rate [Hz].
-    motion : as planned.  missed : if nothing is hit, on the same time axis; it leaves the other one where its
-    contact ends.  None where the plan has no abort motion.
+    motion : as planned.  missed : if nothing is hit, on the same time axis: both coast from contact on, one
+    until its contact ends, the other until the abort motion begins.  None where the plan has none.
     """
 
     planned: Planned
@@ -92,7 +93,11 @@ class Export:
                 "end_s": self.motion.end,
                 "missed": None
                 if self.missed is None
-                else {"from_s": self.missed.contact_end, "end_s": self.missed.end},
+                else {
+                    "from_s": parts_from(self.motion, self.missed),
+                    "abort_s": self.missed.contact_end,
+                    "end_s": self.missed.end,
+                },
                 "target": {
                     "point_m": p.point,
                     "normal": p.normal,

@@ -12,7 +12,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from impactopt.bodies.clearance import GROUND
 from impactopt.bodies.shapes import face_axes
 from impactopt.bodies.solids import Solid, joined, simplified
 from impactopt.bodies.visuals import visuals_of
@@ -81,7 +80,9 @@ def write(export: Export, directory: Path) -> None:
 def _write_scene(export: Export, directory: Path) -> None:
     p, mujoco, step = export.problem, mujoco_module(), _step(export)
     striker = p.robot.striker(p.striker).model_frame
-    spec, bodies = robot_on_floor(p.robot, (striker,), Perturbation(), MujocoOptions(step=step))
+    spec, bodies = robot_on_floor(
+        p.robot, (striker,), Perturbation(), MujocoOptions(step=step), p.ground_height
+    )
     spec.modelname, spec.meshdir = p.name or p.robot.name, MESHES
     _draw_robot(mujoco, spec, bodies, export, directory / MESHES)
     _add_target(mujoco, spec, p, step)
@@ -176,7 +177,7 @@ def _add_target(mujoco: Any, spec: Any, p: ImpactProblem, step: float) -> None:
 def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
     """What holds the target and what stands about, light, and a grid on the floor."""
     for k, solid in enumerate(p.world):
-        if k != GROUND and not (solid.core or (solid.of_target and solid.moves)):
+        if not (solid.ground or solid.core or (solid.of_target and solid.moves)):
             shape = primitive(mujoco, solid)
             spec.worldbody.add_geom(name=f"{solid.name} {k}", rgba=OTHER, **shape, **_seen_only())
     spec.worldbody.add_light(pos=[1.0, -2.0, 5.0], dir=[-0.2, 0.4, -1.0], castshadow=True)
@@ -201,7 +202,10 @@ def _add_world(mujoco: Any, spec: Any, p: ImpactProblem) -> None:
     )
     grid = spec.add_material(name="grid", texrepeat=[2, 2], texuniform=True)
     grid.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
-    spec.geom("floor").material = "grid"
+    if p.ground_height is not None:
+        spec.geom("floor").material = "grid"
+    else:
+        spec.geom("floor").rgba = [0.0, 0.0, 0.0, 0.0]
 
 
 def _add_actuators(mujoco: Any, spec: Any, export: Export) -> None:

@@ -26,7 +26,7 @@ from impactopt.files.problem_file.values import (
     Vector,
 )
 from impactopt.robots.actuators import Actuator
-from impactopt.robots.build import add_frame, check_count, lock_joints, read_urdf
+from impactopt.robots.build import add_frame, check_count, lock_joints
 from impactopt.robots.checks import check_legs
 from impactopt.robots.gains import GainFactor, scaled_gains
 from impactopt.robots.hinges import hinged
@@ -34,6 +34,7 @@ from impactopt.robots.mjcf import read_mjcf
 from impactopt.robots.parts import SoftGrip
 from impactopt.robots.presets import load_robot
 from impactopt.robots.robot import Robot, Sole, Striker, Tool
+from impactopt.robots.urdf import read_urdf
 
 
 class SoleSection(Section):
@@ -259,7 +260,8 @@ class RobotSection(Section):
         locked = self.locked or {}
         if "urdf" in self.model_fields_set:
             floating = self.floating if "floating" in self.model_fields_set else True
-            return lock_joints(read_urdf(folder / self.urdf, None, floating=floating, repaired=True), locked)
+            read = read_urdf(folder / self.urdf, floating=floating, repaired=True)
+            return lock_joints(read.model, locked)
         if "mjcf" in self.model_fields_set:
             return lock_joints(read_mjcf(folder / self.mjcf, floating=self.floating).model, locked)
         raise InputError("a preset")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from impactopt.bodies.shapes import Obstacle
+from impactopt.bodies.shapes import Ground, Obstacle
 from impactopt.errors import InputError
 from impactopt.files.problem_file.contacts import Contact, Target
 from impactopt.files.problem_file.described import section_of
@@ -39,7 +39,7 @@ from impactopt.files.problem_file.values import (
     UnitVector,
     Vector,
 )
-from impactopt.kinematics.stance import BothSoles, FixedBase, OneSole, Stance
+from impactopt.kinematics.stance import BothSoles, FixedBase, Free, OneSole, Stance
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.problem.scenario import Scenario
 from impactopt.problem.second import SecondStriker
@@ -86,7 +86,11 @@ class SecondSection(Section):
 class StanceSection(Section):
     """The soles that are held, and the hands that hold on."""
 
-    soles: str = Field(default="both", description='"both", or the name of the sole that is held')
+    soles: str = Field(
+        default="both",
+        description='"both", or the name of the sole that is held; "none": the robot floats freely, in '
+        "`impactopt collide` and sweeps of collisions",
+    )
     hands: HandNames = Field(
         default=[],
         description="strikers that hold on, each to where it is in the start posture; see [terms.grip]",
@@ -143,6 +147,7 @@ class CollisionSection(Section):
 
 ScenarioSection: Any = section_of(Scenario)
 ObstacleSection: Any = section_of(Obstacle)
+GroundSection: Any = section_of(Ground)
 ControllerSection: Any = section_of(ControllerSettings)
 
 
@@ -172,6 +177,7 @@ class File(Section):
     collision: CollisionSection = optional("")
     scenarios: list[ScenarioSection] = optional("")
     obstacles: list[ObstacleSection] = optional("")
+    ground: GroundSection = optional("")
     objectives: ObjectiveSections = optional("")
     objective: ObjectiveSection = optional("")
     terms: TermSections = optional("")
@@ -207,6 +213,12 @@ class File(Section):
         soles = self.stance.soles if self.stance else "both"
         hands = tuple(self.stance.hands) if self.stance else ()
         stance: Stance = BothSoles(hands=hands) if soles == "both" else OneSole(soles, hands=hands)
+        if soles == "none":
+            if hands:
+                raise InputError(
+                    "[stance]: a robot that floats freely holds on with no hand: leave hands out"
+                )
+            stance = Free()
         if not robot.floating:
             if self.stance:
                 raise InputError(f"robot {robot.name!r} has a fixed base: leave [stance] out")
@@ -249,6 +261,8 @@ class File(Section):
             out["body"] = self.target.body.build()
         if self.obstacles is not None:
             out["obstacles"] = tuple(obstacle.build() for obstacle in self.obstacles)
+        if self.ground is not None:
+            out["ground"] = self.ground.build()
         if self.scenarios is not None:
             out["scenarios"] = tuple(scenario.build() for scenario in self.scenarios)
         for name, section in (("terms", self.terms), ("objectives", self.objectives)):

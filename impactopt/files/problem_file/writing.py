@@ -22,6 +22,7 @@ from impactopt.files.problem_file.sections import (
     CollisionSection,
     File,
     FollowSection,
+    GroundSection,
     ObjectiveSection,
     ObstacleSection,
     ProblemSection,
@@ -114,6 +115,8 @@ def problem_data(problem: ImpactProblem, *, folder: str | os.PathLike[str] = "."
     if problem.body != TargetBody():
         data["target"]["body"] = _section(Body, problem.body)
     data["obstacles"] = [_section(ObstacleSection, obstacle) for obstacle in problem.obstacles]
+    if problem.ground is not None:
+        data["ground"] = {"height_m": 0.0} | _section(GroundSection, problem.ground)
     order = ["problem", *(name for name in File.model_fields if name != "problem")]
     return {name: data[name] for name in order if data.get(name)}
 

@@ -82,7 +82,7 @@ class View {
     this.bodies = header.bodies.map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
     this.world = header.world.map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
     this.hulls = (header.hulls ?? []).map((b) => ({ ...b, buffer: this.buffer(packedSolid(b, arrays)) }));
-    this.floor = this.buffer(flatPolygon([[-4, -4], [4, -4], [4, 4], [-4, 4]], 0));
+    this.floor = this.buffer(flatPolygon([[-4, -4], [4, -4], [4, 4], [-4, 4]], header.floor ?? 0));
     this.soles = header.soles.map((name) => this.buffer(outline(name, 0.002)));
     if (header.legged) {
       this.area = this.buffer(flatPolygon(corners("ground_polygon"), 0.001));
@@ -239,7 +239,7 @@ class View {
     gl.uniform3f(this.at.eye, ...eye);
 
     gl.depthMask(false);
-    this.put(this.floor, still, themeColour("muted"), 2, 0.75);
+    if (header.floor !== null) this.put(this.floor, still, themeColour("muted"), 2, 0.75);
     if (header.legged && shown.polygon) {
       this.put(this.area, still, themeColour("polygon"), 1, 0.22);
       this.put(this.edge, still, themeColour("polygon"), 1, 0.9);

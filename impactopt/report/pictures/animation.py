@@ -22,6 +22,7 @@ from impactopt.errors import InputError
 from impactopt.files.output import write_file
 from impactopt.files.replay import Replay
 from impactopt.report.pictures.style import BLACK, BLUE, GREEN, PHASES, RIGHT, STYLE, VERMILION, Array
+from impactopt.robots.sole_margins import BEARS, weight_of
 from impactopt.simulation import scene_of
 from impactopt.simulation.result import centre_of_pressure
 
@@ -99,7 +100,7 @@ class _Drawing:
             for s, m in zip(self.robot.soles, frames, strict=True)
         ]
         cops, ground = sim.sole_cop()[k], sim.sole_ground[k]
-        loaded = np.isfinite(sim.cop_margin[k])
+        loaded = sim.sole_normal[k] >= BEARS * weight_of(self.robot)
         feet = [
             (np.array([*cop, 0.0]), self.per_newton * wrench[:3])
             for cop, wrench, bears in zip(cops, ground, loaded, strict=True)

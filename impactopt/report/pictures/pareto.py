@@ -64,7 +64,7 @@ def pareto_picture(rows: Sequence[Row]) -> Picture:
         axes.set_title(robot, loc="left")
         axes.set_xlabel("time of a collision [us]")
         axes.set_ylim(bottom=_LEAST)
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{'< ' * (y <= _LEAST)}{y:g}"))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{'< ' if y <= _LEAST else ''}{y:g}"))
     panels[0].set_ylabel("impulse error against full dynamics [%]")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=6.5)
     return figure

@@ -23,6 +23,7 @@ from impactopt.report.pictures.style import (
     styled,
     title,
 )
+from impactopt.robots.sole_margins import BEARS
 
 SOLE_COLOURS = (BLUE, VERMILION)
 PHASE_COLOURS = (ORANGE, BLACK, GREEN)
@@ -82,7 +83,8 @@ def _centres(figure: Picture, axes: Any, a: Any) -> None:
             ha="center",
             fontsize=6.5,
         )
-        loaded = np.isfinite(a["replayed_cop_margin"][:, k])
+        normal = a["replayed_sole_ground"][:, :, 2]
+        loaded = normal[:, k] >= BEARS * np.median(normal.sum(axis=1))  # for most of it at rest
         for which, colour in enumerate(PHASE_COLOURS):
             keep = loaded & (phase == which)
             points: Array = zmp(a["replayed_sole_ground"][keep, k])

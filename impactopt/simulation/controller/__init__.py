@@ -8,6 +8,7 @@
 * recovery.py   how it comes to rest after the blow
 * held.py       accelerations and sole wrenches as functions of the torques
 * cones.py      what wrenches soles can have, and where they are pressed
+* clearance.py  near bodies slow down before they touch
 * tasks.py      squared errors, weighed against each other
 * quadratic.py  its QP in OSQP, in place
 * whole_body.py the controller

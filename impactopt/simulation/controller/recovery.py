@@ -98,7 +98,7 @@ def _clear_part(model: Any, reference: Any, scene: Scene, shift: Array) -> float
 def _capture_point(model: Any, data: Any, q: Array, v: Array) -> Array:
     """(2,) [m] on the ground."""
     com = pin.centerOfMass(model, data, q, v)
-    return np.asarray(com[:2] + data.vcom[0][:2] * np.sqrt(com[2] / 9.81))
+    return np.asarray(com[:2] + data.vcom[0][:2] * np.sqrt(com[2] / np.linalg.norm(model.gravity.linear)))
 
 
 def _inside(scene: Scene, com: Array, margin: float) -> Array:

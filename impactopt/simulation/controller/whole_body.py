@@ -13,6 +13,7 @@ from scipy.linalg.lapack import dgesv
 
 from impactopt.robots.robot import Robot
 from impactopt.simulation.controller.aim import Aim
+from impactopt.simulation.controller.clearance import MOST, Clearance
 from impactopt.simulation.controller.cones import Cones
 from impactopt.simulation.controller.estimate import StateEstimate
 from impactopt.simulation.controller.held import HeldDynamics
@@ -33,7 +34,8 @@ FILTER = 3e-3  # [s] of the hand's force
 TOUCH = 20.0  # [N] that the hand feels as a touch
 LEVER = 0.1  # [m] by which moments of a sole are compared with its forces
 EFFORT = 1e-3  # weight of torques over their limits in the recovery, which has no feed-forward
-PRICE, SQUARE = 1e3, 1e3  # of leaving the cones, over the robot's weight: linear, and of its square
+FAST = 10.0  # [m/s^2] by which clearance constraints are scaled
+PRICE, SQUARE = 1e3, 1e3  # of leaving the cones, over the robot's weight, and those: linear, and of squares
 
 
 class WholeBodyController:
@@ -68,9 +70,11 @@ class WholeBodyController:
         self.balances = robot.floating and soles > 0
         self.cones = Cones(scene.corners, settings, n, self.weight)
         self.tasks = Tasks(n, robot.nv + 3 * len(scene.strikers) + 6 * self.balances + 6 * held)
-        self.qp = TorqueQP(n + 1, self.cones.m, iterations=settings.iterations)
-        self.low, self.high = -np.ones(n + 1), np.ones(n + 1)
-        self.low[n], self.high[n] = 0.0, 1e3
+        self.clearance = Clearance(robot.model, scene.solids, period=settings.period)
+        # torques over their limits, and two slacks: of the cones, and of clearance constraints
+        self.qp = TorqueQP(n + 2, self.cones.m + MOST, iterations=settings.iterations)
+        self.low, self.high = -np.ones(n + 2), np.ones(n + 2)
+        self.low[n:], self.high[n:] = 0.0, 1e3
         # of a wrench's parts over the weight, and of rates of momentum
         self.share = np.tile(np.repeat([1.0, 1.0 / LEVER], 3), held) / self.weight
         self.moves = np.repeat([settings.com, settings.angular_momentum], 3)
@@ -80,6 +84,7 @@ class WholeBodyController:
         stands = robot.floating and bool(scene.soles) and settings.follow == "recover"
         recovery = Recovery(robot, reference, scene, settings) if stands else None
         self.target = Target(robot, reference, scene.strikers, spread=settings.spreads, recovery=recovery)
+        self.of_blow = self.target
         self.estimate = StateEstimate(robot, scene.soles, q0)
         self.loads, self.points = np.ones(soles), np.zeros((soles, 3))
         self.acceleration = np.zeros(robot.nv)
@@ -90,9 +95,11 @@ class WholeBodyController:
         self.sprung = bool(robot.sprung.any())
         self.steered: Array = np.append(np.ones(robot.nv - robot.n), 1.0 - self.passive)
 
-    def miss(self, reference: Any) -> None:
-        """What it tracks from now on, as it has hit nothing."""
-        self.target = Target(self.robot, reference, self.scene.strikers, spread=False)
+    def follow(self, missed: Any | None) -> None:
+        """Track from now on the plan's blow (None), or the reference of a robot that hits nothing."""
+        self.target = self.of_blow
+        if missed is not None:
+            self.target = Target(self.robot, missed, self.scene.strikers, spread=False)
 
     def torque(self, t: float, angles: Array, v: Array, rotation: Array, forces: Array) -> Array:
         """Torque demand (n,) [N m] at a time [s], from what the sensors make of the true state."""
@@ -109,7 +116,7 @@ class WholeBodyController:
         if self.undriven:
             angles = self.robot.joint_positions(q)
             self.held.pulled(self.passive, self.springs(angles, rates[-self.n :]))
-        x = self._solve(t, q, rates, aim)[:-1]
+        x = self._solve(t, q, rates, aim)[: self.n]
         torque = self.limit * x
         # what is expected until the next sample: accelerations, and where the soles are pressed
         self.acceleration = self.held.A @ torque + self.held.a0
@@ -147,13 +154,20 @@ class WholeBodyController:
                 spread = lift / self.share**2
                 now, goal = held.b0, spread.T @ dgesv(spread @ lift.T, rate)[2]
             tasks.add(s.wrench, self.share[:, None] * B, self.share * (now - goal))
-        P, g = np.zeros((n + 1, n + 1)), np.zeros(n + 1)
+        P, g = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
         P[:n, :n], g[:n] = tasks.sums()
         effort = s.blow if struck else (EFFORT if recovers else s.torque)
-        P.flat[: n * (n + 1) : n + 2] += effort
+        P.flat[: n * (n + 2) : n + 3] += effort
         g[:n] -= effort * feed
-        P[n, n], g[n] = SQUARE, PRICE
-        C, c = self.cones.look(held.places, B, held.b0)
+        P.flat[n * (n + 3) :: n + 3], g[n:] = SQUARE, PRICE
+        m = self.cones.m
+        C, c = np.zeros((m + MOST, n + 2)), np.full(m + MOST, -1.0)  # what there is no pair for holds
+        C[:m, : n + 1], c[:m] = self.cones.look(held.places, B, held.b0)
+        if recovers or self.target.bounced:  # up to the blow the plan keeps bodies apart, at speed
+            rows, least = self.clearance.constraints(held.data)
+            its = slice(m, m + len(least))
+            C[its, :n], C[its, n + 1] = rows @ A / FAST, 1.0
+            c[its] = (least - rows @ held.a0) / FAST
         begun = time.process_time()
         x = self.qp.solve(P, g, C, c, self.low, self.high)
         self.seconds.append(time.process_time() - begun)
@@ -188,7 +202,7 @@ class WholeBodyController:
         for k, place in enumerate(held.places):
             lift[3:, 6 * k : 6 * k + 3] = pin.skew((place.translation - com) / mass)
         # the divergent component of motion: com + rate / omega
-        gain, omega = s.capture_gain, math.sqrt(9.81 / max(com[2], 0.1))
+        gain, omega = s.capture_gain, math.sqrt(np.linalg.norm(self.gravity) / max(com[2], 0.1))
         error = Ag @ lag
         if recovers:  # the centre of mass has an aim of its own, the joints' motion does not bring it there
             error[:3] = mass * aim.com[1] - data.hg.linear

@@ -1,11 +1,11 @@
-"""What the reference models share: gains, friction, step, and the search for a step that is short enough."""
+"""What the reference models share: gains, friction, tolerance, and the search for what meets it."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,43 +16,43 @@ from impactopt.collision.result import Collision
 from impactopt.collision.settings import Settings, no_bend, servo_settings
 from impactopt.errors import InputError, check_array
 from impactopt.robots.robot import Robot
-from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.forces import Forces
 
 __all__ = ["ReferenceModel", "converge"]
 
 Array = NDArray[np.float64]
-_MOST_HALVINGS = 8
+Outcome = TypeVar("Outcome", bound="_HasImpulse")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceModel(CollisionModel):
-    """A collision with nothing frozen, integrated in steps of a given length.
+    """A collision with nothing frozen, integrated until its impulse is known within a tolerance.
 
     Attributes
     ----------
     friction : of the joints.
     kp, kd : (n) or (n, n) gains in place of the robot's.
-    step : [s] of the integration.
+    step : [s] the longest.
+    tolerance : relative, of the impulse.
     """
-
-    # step times the fastest rate, up to which its integrator is stable
-    _stable: ClassVar[float]
 
     friction: JointFriction | None = None
     kp: ArrayLike | None = None
     kd: ArrayLike | None = None
     step: float = 5e-5
+    tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not check_array("step [s]", self.step, ()) > 0:
-            raise InputError(f"step [s]: {self.step:g}; give a number > 0")
+        _positive("step [s]", self.step)
+        _positive("tolerance", self.tolerance)
         self._settings(self.kp, self.kd)
 
     @abstractmethod
-    def _run(self, step: float, q: Array, v: Array, forces: Forces, normal: Array) -> Collision:
-        """The collision in steps of that length [s], from checked numbers."""
+    def _controlled(
+        self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
+    ) -> tuple[Collision, float]:
+        """(the collision, what is not known of its impulse [N s]), from checked numbers."""
 
     def collide(
         self,
@@ -70,10 +70,11 @@ class ReferenceModel(CollisionModel):
 
         Raises
         ------
-        InputError : wrong shapes or NaN; torque missing; unknown overrides; a step too long for the servo's
-            fastest mode; a contact that does not end.
+        InputError : wrong shapes or NaN; torque missing; unknown overrides; a contact that does not end; an
+            impulse that is not found within the tolerance.
         """
-        return self._collide(self.step, q, v, torque, require_separation, overrides)
+        given: dict[str, Any] = {"require_separation": require_separation, **overrides}
+        return self.converged(q, v, torque, **given)[0]
 
     def converged(
         self,
@@ -81,39 +82,26 @@ class ReferenceModel(CollisionModel):
         v: ArrayLike,
         torque: ArrayLike | None = None,
         *,
-        tolerance: float = 1e-6,
+        tolerance: float | None = None,
         require_separation: bool = True,
-        **overrides: ArrayLike,
+        **overrides: Any,
     ) -> tuple[Collision, float]:
-        """(the collision with its step halved until halving changes the impulse by less than `tolerance`,
-        relative; the last change [N s]).
+        """(the collision as `collide` gives it; what its impulse changed by when it was integrated more
+        exactly [N s]).
+
+        tolerance : relative, of the impulse; None: the model's.
 
         Raises
         ------
-        InputError : as of `collide`; no convergence after eight halvings.
+        InputError : as of `collide`.
         """
-
-        def at(step: float) -> Collision:
-            return self._collide(step, q, v, torque, require_separation, overrides)
-
-        return converge(self.step, at, tolerance)
-
-    def _collide(
-        self,
-        step: float,
-        q: ArrayLike,
-        v: ArrayLike,
-        torque: ArrayLike | None,
-        require_separation: bool,
-        overrides: Mapping[str, ArrayLike],
-    ) -> Collision:
+        tolerance = _positive("tolerance", self.tolerance if tolerance is None else tolerance)
         q, v = self.robot.check_configuration(q), self.robot.check_velocity(v)
         forces, normal = self._forces(v, torque, overrides)
-        self._check_step(step, q, v, forces, normal)
-        result = self._run(step, q, v, forces, normal)
+        result, change = self._controlled(q, v, forces, normal, tolerance)
         if require_separation:
             self.check_separation(result)
-        return result
+        return result, change
 
     @property
     def _held(self) -> tuple[Robot, tuple[str, ...], Array, str]:
@@ -121,14 +109,6 @@ class ReferenceModel(CollisionModel):
         robot, held_by = self.robot, self.held_by
         striker = robot.striker(self.striker).model_frame
         return robot, held_by.constraint_frames(robot), held_by.compliance, striker
-
-    def _check_step(self, step: float, q: Array, v: Array, forces: Forces, normal: Array) -> None:
-        """InputError for a step beyond what the servo and the friction's band allow."""
-        body = DenseBody(*self._held, normal)
-        body.look(q, v)
-        damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
-        rate = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
-        self.check_step(step, self._stable / rate if rate > 0 else np.inf)
 
     # ------------------------------------------------------------ numbers
     def _settings(self, kp: ArrayLike | None, kd: ArrayLike | None) -> Settings:
@@ -175,32 +155,44 @@ class ReferenceModel(CollisionModel):
         return forces, values["normal"]
 
 
-def converge(
-    step: float,
-    at: Callable[[float], Collision],
-    tolerance: float,
-    better: Callable[[Collision, Collision], Collision] | None = None,
-) -> tuple[Collision, float]:
-    """(result, last change of its impulse [N s]) with the step halved until that is within a tolerance.
+def _positive(name: str, value: float) -> float:
+    """A number above zero, or InputError."""
+    if not check_array(name, value, ()) > 0:
+        raise InputError(f"{name}: {value:g}; give a number > 0")
+    return float(value)
 
-    step : [s] the longest.
-    at : the collision in such steps.
-    better : makes the result of collisions with a step and with twice that step; None: the first of them.
+
+class _HasImpulse(Protocol):
+    @property
+    def impulse(self) -> float: ...
+
+
+def converge(
+    at: Callable[[int], Outcome],
+    tolerance: float,
+    *,
+    levels: int,
+    better: Callable[[Outcome, Outcome], Outcome] | None = None,
+) -> tuple[Outcome, float]:
+    """(outcome, what its impulse has changed by at last [N s]), when that is within a relative tolerance.
+
+    at : the outcome of a level, which is more exact each time.
+    levels : the most of them.
+    better : makes an outcome of those of a level and of the one before; None: the first of them.
     """
-    if not check_array("tolerance", tolerance, ()) > 0:
-        raise InputError(f"tolerance: {tolerance:g}; give a number > 0")
-    runs: list[Collision] = [at(step)]
-    found: list[Collision] = []
+    runs = [at(0)]
+    found = [] if better else runs
     change = np.inf
-    for _ in range(_MOST_HALVINGS):
-        step /= 2
-        runs.append(at(step))
-        found = runs if better is None else [*found, better(runs[-1], runs[-2])]
+    for level in range(1, levels):
+        runs.append(at(level))
+        if better:
+            found = [*found, better(runs[-1], runs[-2])]
         if len(found) > 1:
             change = abs(found[-1].impulse - found[-2].impulse)
         if change <= tolerance * abs(found[-1].impulse):
             return found[-1], float(change)
     raise InputError(
-        f"tolerance: {tolerance:g} is not met with steps of {step:.2g} s (the last halving changed the "
-        f"impulse by {change:.2g} N s): raise it"
+        f"tolerance: {tolerance:g} is not met, the last time the impulse changed by {change:.2g} of "
+        f"{found[-1].impulse:.4g} N s: raise it; or the collision hangs on a hair, as where contact nearly "
+        "ends, or a board nearly breaks"
     )

@@ -10,7 +10,7 @@ from impactopt.errors import InputError, check_array
 from impactopt.kinematics.closing import base_motion
 from impactopt.kinematics.coordinates import StanceCoordinates
 
-__all__ = ["coasting_reference"]
+__all__ = ["coasting_reference", "independent_rates"]
 
 Array = NDArray[np.float64]
 _NODES = 3 * REFERENCE_ORDER
@@ -51,7 +51,7 @@ def coasting_reference(
     if not c.legs:
         return no_bend(robot.n)
     y, legs = c.split(q)
-    rates, shortest = _rates(c, y, v), until / 2
+    rates, shortest = independent_rates(c, y, v), until / 2
     _, start, bend = c.complete_motion(y, rates, np.zeros(c.ny), c.solve_legs(y, legs))
     orders = np.arange(2, REFERENCE_ORDER + 1)
     while True:
@@ -73,7 +73,7 @@ def coasting_reference(
     return {"reference": reference, "reference_until": np.array(until)}
 
 
-def _rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
+def independent_rates(c: StanceCoordinates, y: Array, v: Array) -> Array:
     """ydot (ny) of a Pinocchio velocity."""
     rates, b = np.zeros(c.ny), c.base
     if b:

@@ -86,11 +86,20 @@ class Forces:
         """Force [N] of one branch of the law."""
         return float(self.law.branch(penetration, rate, compressing, self.law_numbers))
 
-    def target_rates(self, state: Array, force: float) -> list[Any]:
-        return self.target.derivative(state, force, self.target_numbers)
+    def contact_slopes(
+        self, penetration: float, rate: float, compressing: bool, way: float, speed: float
+    ) -> tuple[float, float]:
+        """Stiffness [N/m] and damping [N s/m] of one branch of the law, by differences of that size."""
+        here = self.contact(penetration, rate, compressing)
+        deeper = self.contact(penetration + way, rate, compressing)
+        faster = self.contact(penetration, rate + speed, compressing)
+        return (deeper - here) / way, (faster - here) / speed
 
     def switches(self, state: Array, force: float) -> Array:
         return np.array(self.target.switches(state, force, self.target_numbers), dtype=float)
+
+    def target_rates(self, state: Array, force: float) -> list[Any]:
+        return self.target.derivative(state, force, self.target_numbers)
 
     # ------------------------------------------------------------ phases
     def phase(self, demand: Array, velocity: Array, penetration: float, rate: float, target: Array) -> Phase:

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impactopt.robots.names import reduced
 from impactopt.robots.robot import Robot
 
 
@@ -40,7 +41,7 @@ class Meshes:
         folders = [str(folder) for folder in Path(str(robot.urdf)).resolve().parents]
         geometry = pin.buildGeomFromUrdf(full, robot.urdf, pin.COLLISION, package_dirs=folders)
         locked = [full.getJointId(name) for name in full.names if name not in set(robot.model.names)]
-        model, geometry = pin.buildReducedModel(full, geometry, locked, pin.neutral(full))
+        model, geometry = reduced(full, locked, pin.neutral(full), geometry)
         geometry.addAllCollisionPairs()
         return model, geometry
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from math import sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from impactopt.collision.result import Collision
 from impactopt.errors import InputError
@@ -21,15 +21,18 @@ from impactopt.simulation.mujoco_world import (
     robot_bodies,
     spec_of,
 )
+from impactopt.simulation.pinocchio_robot import DenseBody
 from impactopt.simulation.reference.base import ReferenceModel, converge
 from impactopt.simulation.reference.forces import Forces, Phase
-from impactopt.simulation.reference.motion import Instant
+from impactopt.simulation.reference.motion import Instant, Scales, contact_scales
 from impactopt.simulation.reference.record import collision_from
 
 __all__ = ["HeldRobot", "MujocoDynamics", "march"]
 
 Array = NDArray[np.float64]
 _RECORD = 5e-5  # [s] between instants that are kept
+# step times the contact's fastest rate, with which it begins; times they are halved; steps of a run
+_RESOLVED, _LEVELS, _MOST_STEPS = 0.02, 9, 300_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,23 +41,27 @@ class MujocoDynamics(ReferenceModel):
 
     The held frames are welded to the world, as hard as MuJoCo lets them be: their time constant is two steps,
     so that they get rigid as the step goes to zero. Servo, friction and contact act as applied forces, in
-    MuJoCo's semi-implicit Euler steps. All this is of first order in the step; `converged` extrapolates.
-    The contact's end is found to within a step.
+    MuJoCo's semi-implicit Euler steps. All this is of first order in the step: steps that resolve the servo
+    and the contact are halved until impulse, energy and velocity, extrapolated to steps without length from
+    the two shortest, are found. The histories, and the rest, are those of the shortest steps. The contact's
+    end is found to within a step.
 
     Attributes
     ----------
     friction : of the joints.
     kp, kd : (n) or (n, n) gains in place of the robot's.
-    step : [s] of the integration.
+    step : [s] the longest that it begins with.
+    tolerance : relative, of the impulse.
 
     Raises
     ------
     InputError : as of `CollisionModel`; MuJoCo is not installed; a virtual base, which this has not; gains of
-        a wrong shape or sign; a step that is not positive; in `collide`, a motion that diverges.
+        a wrong shape or sign; a step or a tolerance that is not positive; in `collide`, a contact that takes
+        too many steps.
     """
 
     step: float = 4e-5
-    _stable: ClassVar[float] = 1.8  # of the semi-implicit Euler method: 2
+    tolerance: float = 1e-5
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,46 +72,46 @@ class MujocoDynamics(ReferenceModel):
                 "without base_mass and base_inertia"
             )
 
-    def converged(
-        self,
-        q: ArrayLike,
-        v: ArrayLike,
-        torque: ArrayLike | None = None,
-        *,
-        tolerance: float = 1e-4,
-        require_separation: bool = True,
-        **overrides: ArrayLike,
+    def _controlled(
+        self, q: Array, v: Array, forces: Forces, normal: Array, tolerance: float
     ) -> tuple[Collision, float]:
-        """(the collision with impulse, energy and velocity extrapolated to steps without length, from the two
-        shortest; what the last halving has changed in this impulse [N s]).
+        body = DenseBody(*self._held, normal)
+        rate = body.look(q, v) - forces.target_speed(np.zeros(forces.target.n_states))
+        scales = contact_scales(body, forces, rate, self.horizon)
+        damping = np.diag(forces.kd) if forces.kd.ndim == 1 else forces.kd
+        fastest = body.fastest_rate(damping + np.diag(forces.viscous + forces.coulomb / forces.transition))
+        step = min(self.step, 1 / fastest) if fastest > 0 else self.step
+        first = None
+        while first is None:
+            try:
+                first = self._run(step, q, v, forces, normal, scales)
+            except _NotResolved as contact:
+                step = min(step / 2, _RESOLVED / contact.rate)
+        coarse = first
 
-        Steps are halved until that is less than `tolerance`, relative. The histories, and the rest, are
-        those of the shortest steps.
+        def at(level: int) -> Collision:
+            return self._run(step / 2**level, q, v, forces, normal) if level else coarse
 
-        Raises
-        ------
-        InputError : as of `collide`; no convergence after eight halvings.
-        """
+        return converge(at, tolerance, levels=_LEVELS, better=_extrapolated)
 
-        def extrapolated(fine: Collision, coarse: Collision) -> Collision:
-            return replace(
-                fine,
-                impulse=2 * fine.impulse - coarse.impulse,
-                energy=2 * fine.energy - coarse.energy,
-                velocity=2 * fine.velocity - coarse.velocity,
-            )
-
-        def at(step: float) -> Collision:
-            return self._collide(step, q, v, torque, require_separation, overrides)
-
-        return converge(self.step, at, tolerance, extrapolated)
-
-    def _run(self, step: float, q: Array, v: Array, forces: Forces, normal: Array) -> Collision:
+    def _run(
+        self, step: float, q: Array, v: Array, forces: Forces, normal: Array, scales: Scales | None = None
+    ) -> Collision:
         robot, frames, _, striker = self._held
         with no_log_file():
             world = HeldRobot(robot, frames, striker, step)
             world.start(q, v)
-            return march(world, forces, normal, self.horizon, len(self.held_by.sole_names(robot)))
+            soles = len(self.held_by.sole_names(robot))
+            return march(world, forces, normal, self.horizon, soles, scales)
+
+
+def _extrapolated(fine: Collision, coarse: Collision) -> Collision:
+    return replace(
+        fine,
+        impulse=2 * fine.impulse - coarse.impulse,
+        energy=2 * fine.energy - coarse.energy,
+        velocity=2 * fine.velocity - coarse.velocity,
+    )
 
 
 class HeldRobot(MujocoRobot):
@@ -135,7 +142,26 @@ class HeldRobot(MujocoRobot):
         return found.ravel(), places
 
 
-def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles: int) -> Collision:
+class _NotResolved(Exception):
+    """Steps are too long for the contact, which changes at a rate of [1/s]."""
+
+    def __init__(self, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+
+
+def march(
+    world: HeldRobot,
+    forces: Forces,
+    normal: Array,
+    horizon: float,
+    soles: int,
+    scales: Scales | None = None,
+) -> Collision:
+    """The collision in the world's steps.
+
+    scales : of the contact; None: steps that do not resolve it are taken as they are.
+    """
     data, step = world.data, world.step
     every = max(1, round(_RECORD / step))
     instants: list[Instant] = []
@@ -150,6 +176,12 @@ def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles
             start = float(normal @ world.places()[0])
         if not np.isfinite(data.qacc_warmstart).all() or not np.isfinite(speed):
             raise InputError(f"step [s]: {step:g} is unstable here; give MujocoDynamics a shorter one")
+        if k > _MOST_STEPS:
+            raise InputError(
+                f"the contact is too fast to follow in MuJoCo: it takes steps of {step:.2g} s, and is not "
+                f"over after {_MOST_STEPS} of them; give a softer law or a heavier target, or take "
+                "FullDynamics"
+            )
         time, velocity = k * step, data.qvel[world.dof].copy()
         target_speed = forces.target_speed(target)
         rate = speed - target_speed
@@ -157,8 +189,13 @@ def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles
         demand = forces.demand(time, data.qpos[world.place] - angles, velocity)
         phase: Phase = forces.phase(demand, velocity, depth, rate, target)
         force = forces.contact(depth, rate, phase.compressing) if phase.touching else 0.0
+        if scales is not None and phase.touching:
+            fastest = _fastest(forces, depth, rate, phase.compressing, scales)
+            if fastest * step > 2 * _RESOLVED:
+                raise _NotResolved(fastest)
         torque = forces.torque(demand, phase)
-        ends = not phase.touching or time >= horizon * (1 - 1e-9)
+        # hand and target that neither approach nor part: the next step decides
+        ends = (not phase.touching and (k > 0 or rate != 0)) or time >= horizon * (1 - 1e-9)
         if ends:
             end = world.state()
         world.apply(torque - forces.friction(velocity, phase), force)
@@ -168,8 +205,15 @@ def march(world: HeldRobot, forces: Forces, normal: Array, horizon: float, soles
             held = world.wrenches()
             instants.append(Instant(time, force, depth, speed, target_speed, velocity, torque, demand, *held))
         if ends:
-            return collision_from(instants, *end, impulse, target, soles, forces, not phase.touching)
+            return collision_from(instants, *end, impulse, peak, target, soles, forces, not phase.touching)
         impulse += step * force
         target = target + step * np.array(forces.target_rates(target, force), dtype=float)
         travel += step * forces.target_speed(target)
         k += 1
+
+
+def _fastest(forces: Forces, depth: float, rate: float, compressing: bool, scales: Scales) -> float:
+    """[1/s] of the contact's spring and damper, hand and target being free."""
+    way, speed = 1e-3 * scales.time * scales.speed, 1e-3 * scales.speed
+    stiffness, damping = forces.contact_slopes(depth, rate, compressing, way, speed)
+    return max(sqrt(max(stiffness, 0.0) * scales.mobility), abs(damping) * scales.mobility)

@@ -52,7 +52,7 @@ def poses_of(problem: ImpactProblem, reference: Trajectory) -> Poses:
     # the first of two instants at the same time is the one before the reference jumps
     chosen = np.searchsorted(reference.time, wanted - 1e-9).clip(0, len(reference.time) - 1)
     at_contact = reference.q[chosen[BEFORE - 1]]
-    names, seen = problem.strikers, [b for b in problem.world[1:] if not b.core]  # the first is the ground
+    names, seen = problem.strikers, [b for b in problem.world if not (b.core or b.ground)]
     links = [_links(robot, names, reference.q[k]) for k in chosen]
     strikes = {j for name in names for j in robot.model.supports[_striker(robot, name).parentJoint]}
     moved = [j in strikes for _, j in _bones(robot)]

@@ -22,12 +22,16 @@ def collision_from(
     configuration: Array,
     velocity: Array,
     impulse: float,
+    peak: float,
     target: Array,
     soles: int,
     forces: Forces,
     separated: bool,
 ) -> Collision:
-    """The result of a collision with that end; the first `soles` of the held frames are soles."""
+    """The result of a collision with that end, and that largest force [N].
+
+    soles : how many of the held frames, the first, are soles.
+    """
     columns: dict[str, Any] = {
         name: np.array([getattr(i, name) for i in instants]) for name in Instant._fields
     }
@@ -44,7 +48,7 @@ def collision_from(
     at_rest = np.zeros(kind.n_states)
     return Collision(
         impulse=impulse,
-        peak_force=float(columns["force"].max()),
+        peak_force=peak,
         duration=instants[-1].time,
         energy=float(kind.energy(target, numbers) - kind.energy(at_rest, numbers)),
         separated=separated,

@@ -3,7 +3,7 @@
 Collisions of the right hand, drawn on each robot: joints off the legs within 0.5 rad of half-sitting, 0.2 to
 3 m/s, gains x 0.1 to 10, every law and target of the package, stiffness of 1e3 to 1e9 N/m, targets of 0.1 to
 2 times the effective mass; feed-forward that holds the robot's velocities. Only contacts that end count. The
-truth is full dynamics by Pinocchio's own constrained dynamics, with steps halved until the impulse stands
+truth is full dynamics by Pinocchio's own constrained dynamics, with tolerances tightened until it stands
 still.
 
 Of each number of freezes: the true error of the impulse as quantiles over contact time, and how often it is
@@ -55,7 +55,6 @@ KINDS: dict[str, tuple[Any, Any]] = {
 # two of five are the common pair
 _ORDER = (*KINDS, "spring, mass", "spring, mass", "spring, mass")
 _TRIES = 60
-_FIRST_STEP, _SHORTER = 4e-4, 6  # [s] of the reference, and how often it is halved to be stable
 _TOLERANCE = 2e-5  # relative, of its impulse
 
 
@@ -168,7 +167,7 @@ def judge(robot: Robot, case: Drawn, freezes: Sequence[int] = FREEZES) -> dict[s
         if not np.isfinite(found["impulse"][0]):
             return None
         said[str(n)] = {name: x[0].item() for name, x in found.items()}
-    truth = _truth(robot, case, said[str(freezes[0])]["duration"])
+    truth = _truth(robot, case)
     if truth is None:
         return None
     impulse, duration = truth
@@ -183,27 +182,14 @@ def judge(robot: Robot, case: Drawn, freezes: Sequence[int] = FREEZES) -> dict[s
     return {"kind": case.kind, "duration_s": duration, "impulse_Ns": impulse, "freezes": errors}
 
 
-def _truth(robot: Robot, case: Drawn, lasts: float) -> tuple[float, float] | None:
-    """Impulse [N s] and duration [s] of a contact that lasts about so long [s]."""
-    step = min(_FIRST_STEP, max(lasts, 1e-6) / 20)
-    for _ in range(_SHORTER):
-        model = FullDynamics(**_options(robot, case.kind), step=step, form="pinocchio")
-        options: dict[str, Any] = {"tolerance": _TOLERANCE, "require_separation": False, **case.settings}
-        given = {name: x for name, x in options.items() if name != "tolerance"}
-        try:
-            if not model.collide(case.q, case.v, case.torque, **given).separated:
-                return None  # halving steps of a contact without end takes minutes
-            found, _change = model.converged(case.q, case.v, case.torque, **options)
-        except InputError:  # too long for the servo or for the contact
-            step /= 4
-            continue
-        if not found.separated or not found.impulse > 0:
-            return None
-        # the first steps have to see the contact's own course, not jump over it
-        if found.duration > 10 * step:
-            return found.impulse, found.duration
-        step = min(step / 4, found.duration / 20)
-    return None
+def _truth(robot: Robot, case: Drawn) -> tuple[float, float] | None:
+    """Impulse [N s] and duration [s] by full dynamics; None: no contact that ends."""
+    model = FullDynamics(**_options(robot, case.kind), tolerance=_TOLERANCE, form="pinocchio")
+    try:
+        found = model.collide(case.q, case.v, case.torque, require_separation=False, **case.settings)
+    except InputError:
+        return None
+    return (found.impulse, found.duration) if found.separated and found.impulse > 0 else None
 
 
 # ---------------------------------------------------------------- the bench

@@ -29,7 +29,7 @@ FREEZES = (0, 1, 2, 4, 8, 16)
 LAW = SpringDamper(stiffness=1e4, damping=300.0)  # the paper's
 STRIKER, NORMAL = "right_hand", (1.0, 0.0, 0.0)
 HORIZON = 0.2  # [s]
-STEP = 1e-4  # [s] that the reference's halving begins with
+STEP = 1e-4  # [s] between instants of the reference
 
 
 @dataclass(frozen=True, kw_only=True)

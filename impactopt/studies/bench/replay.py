@@ -35,7 +35,10 @@ OTHERS: dict[str, dict[str, Any]] = {
     "tolerance 1e-8": {"tolerance": 1e-8},
     "tolerance 1e-6": {"tolerance": 1e-6},
     f"floor time {500 * FLOOR:g} ms": {"perturbation": Perturbation(floor_time=FLOOR / 2)},
-    f"floor time {2000 * FLOOR:g} ms": {"perturbation": Perturbation(floor_time=2 * FLOOR)},
+    **{
+        f"floor time {1e3 * times * FLOOR:g} ms": {"perturbation": Perturbation(floor_time=times * FLOOR)}
+        for times in (1.5, 2.0, 2.5)
+    },
     "servo every 1 ms": {"perturbation": Perturbation(period=1e-3)},
     "friction 0.6": {"perturbation": Perturbation(friction=0.6)},
 }
@@ -62,8 +65,9 @@ def run(say: Say, *, file: Path = DEMO, steps: tuple[float, ...] = STEPS) -> Rep
         found = _replay(solution, say, step=STEP, **options)
         if isinstance(default, Simulation):
             others.append(row({"step": STEP, "setting": name}, found, default))
-    title = f"{file}: changes from the replay with the smallest step"
-    other = f"changes from the replay with a step of {STEP:g} s and default settings"
+    plan = f"{file}, planned {solution.impulse:.3f} N s"
+    title = f"{plan}: changes from the replay with the smallest step"
+    other = f"{plan}: changes from the replay with a step of {STEP:g} s and default settings"
     tables = (
         columns_table(title, (("step [s]", "step", "g"), *COLUMNS), rows),
         columns_table(other, (("setting", "setting", 0), *COLUMNS), others),

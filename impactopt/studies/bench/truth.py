@@ -1,14 +1,14 @@
 """Is what is planned what happens? Punches, planned and then replayed with held soles and with free ones.
 
 One row a problem: how the solver ended; from the replay with held soles (Pinocchio) the impulse's error, the
-least ZMP margin, the largest torque demand over limit and the least normal force of a sole; from the replay
-with free soles (MuJoCo) the impulse's error, slip, lift in the collision, and whether the robot stands at the
-end. What fails stays in.
+least ZMP margin, what each sole by itself keeps of the margins asked of it, and the largest torque demand
+over limit; from the replay with free soles (MuJoCo) the impulse's error, each sole's least margin and force,
+slip, lift in the collision, and whether the robot stands at the end. What fails stays in.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from impactopt.planning.planner import solve
 from impactopt.planning.solution import Solution
 from impactopt.problem.problem import ImpactProblem, Phase
 from impactopt.robots.presets import talos
+from impactopt.simulation.perturbation import Perturbation
 from impactopt.simulation.reference.meshes import Meshes
 from impactopt.studies.bench.planning import DEMO, solved
 from impactopt.studies.report import Report, Say, columns_table
@@ -53,10 +54,13 @@ HELD = (
     ("N s", "impulse_planned_Ns", 2),
     ("error %", "impulse_error_pct", 2),
     ("ZMP mm", "zmp_margin_mm", 1),
+    ("CoP planned", "cop_planned", 2),
+    ("held", "cop_held", 2),
     ("torque", "torque_ratio", 2),
     ("gear planned", "gear_planned", 2),
     ("gear", "gear_held", 2),
-    ("force N", "min_normal_force_N", 0),
+    ("force planned", "force_planned", 2),
+    ("held", "force_held", 2),
     ("apart mm", "clearance_mm", 1),
     ("touches", "touches", 0),
     ("in meshes", "mesh_touches", 0),
@@ -65,12 +69,28 @@ FREE = (
     ("problem", "problem", 0),
     ("error %", "replay_impulse_error_pct", 2),
     ("gear", "gear_free", 2),
+    ("CoP mm", "cop_free_mm", 1),
+    ("force N", "force_free_N", 0),
     ("slip mm", "replay_slip_mm", 1),
     ("lift mm", "replay_lift_collision_mm", 2),
     ("apart mm", "replay_clearance_mm", 1),
     ("touches", "replay_touches", 0),
     ("in meshes", "replay_mesh_touches", 0),
     ("stands", "standing", 0),
+)
+
+
+MISSED = (
+    ("problem", "problem", 0),
+    ("torque planned", "missed_torque_planned", 2),
+    ("torque", "missed_torque", 2),
+    ("gear", "missed_gear", 2),
+    ("CoP mm", "missed_cop_mm", 1),
+    ("force N", "missed_force_N", 0),
+    ("slip mm", "missed_slip_mm", 1),
+    ("apart mm", "missed_clearance_mm", 1),
+    ("touches", "missed_touches", 0),
+    ("stands", "missed_standing", 0),
 )
 
 
@@ -87,6 +107,9 @@ def run(say: Say, *, folder: Path = DEMO.parent, controller: str = "servo") -> R
     tables = (
         columns_table("planned, and replayed on held soles", HELD, shown),
         columns_table("replayed on free soles", FREE, shown),
+        columns_table(
+            "with the target missing, on free soles", MISSED, [r for r in shown if "missed_standing" in r]
+        ),
     )
     return Report(name="truth", numbers={"rows": rows, "controller": controller}, tables=tables)
 
@@ -120,6 +143,11 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
     clearance_mm, touches : of the plan and its replay on held soles; replay_... : on free ones.
     mesh_touches : pairs that are in each other by the exact meshes of the robot's URDF, looked at every
     millisecond of the plan, the missed blow and the replay (None: it has no meshes).
+    cop_planned, cop_held, force_planned, force_held : least that a sole keeps of the margin of its centre of
+    pressure and of its normal force, over what is asked of it, in the plan (its missed blow included) and in
+    its replay on held soles; cop_free_mm, force_free_N : least on free ones.  soles : all of these numbers,
+    by sole and phase.
+    missed_... : of the replay on free soles where the target is missing.
     gear_planned, gear_held, gear_free : load of the worst gear over its torque limit, None without armature.
     """
     out: dict[str, Any] = {"problem": name}
@@ -130,7 +158,7 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         out["impulse_planned_Ns"] = solution.impulse
         replay = solution.validate()
         told = solution.summary(replay)
-        held = told["simulated"]
+        held = _with_missed(told["simulated"], solution)
         out |= {
             "clearance_mm": _least(told["clearance_mm"], held["clearance_mm"]),
             "touches": len([*told["contacts_besides"], *(held["contacts_besides"] or ())]),
@@ -140,7 +168,9 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
             "torque_ratio": max(held["torque_ratio"].values()),
             "gear_planned": told.get("gear_ratio"),
             "gear_held": held.get("gear_ratio"),
-            "min_normal_force_N": held.get("min_normal_force_N"),
+            **_kept(told, told, "planned"),
+            **_kept(held, told, "held"),
+            "soles": {name: _soles(found) for name, found in (("planned", told), ("held", held))},
         }
     except InputError as error:
         out["status"] = out.get("status", "error")
@@ -149,11 +179,16 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         return out
     try:
         replay = solution.validate(engine="mujoco", controller=controller)
-        free = solution.summary(replay)["simulated"]
+        free = _with_missed(
+            solution.summary(replay)["simulated"], solution, engine="mujoco", controller=controller
+        )
     except InputError as error:
         out |= {"standing": None, "reason": str(error)}
         return out
+    out["soles"]["free"] = _soles(free)
     out |= {
+        "cop_free_mm": _least_of(free.get("sole_cop_margin_mm")),
+        "force_free_N": _least_of(free.get("sole_force_N")),
         "replay_impulse_error_pct": free["impulse_error_pct"],
         "gear_free": free.get("gear_ratio"),
         "replay_slip_mm": free.get("sole_slip_mm"),
@@ -164,7 +199,68 @@ def row(name: str, plan: Callable[[], Solution], say: Say, controller: str = "se
         "standing": free["standing"],
         "reason": free["reason"],
     }
-    return out
+    return out | _missed(solution, controller)
+
+
+def _missed(solution: Solution, controller: str) -> dict[str, Any]:
+    """The replay on free soles where the target is missing, of a plan that has a motion for that."""
+    if solution.plan.abort is None:
+        return {}
+    try:
+        replay = solution.validate(
+            engine="mujoco", controller=controller, perturbation=Perturbation(missing=True)
+        )
+    except InputError as error:
+        return {"missed_standing": None, "missed_reason": str(error)}
+    free = solution.summary(replay)["simulated"]
+    return {
+        "missed_torque_planned": solution.margins()["torque_ratio"].get("missed"),
+        "missed_torque": max(free["torque_ratio"].values()),
+        "missed_gear": free.get("gear_ratio"),
+        "missed_cop_mm": _least_of(free.get("sole_cop_margin_mm")),
+        "missed_force_N": _least_of(free.get("sole_force_N")),
+        "missed_slip_mm": free.get("sole_slip_mm"),
+        "missed_clearance_mm": free["clearance_mm"],
+        "missed_touches": len(free["contacts_besides"] or ()),
+        "missed_standing": free["standing"],
+        "missed_reason": free["reason"],
+    }
+
+
+def _with_missed(found: dict[str, Any], solution: Solution, **options: Any) -> dict[str, Any]:
+    """A replay's numbers with those of the soles in a replay of the missed blow, if the plan has one."""
+    if solution.plan.abort is None:
+        return found
+    miss = solution.summary(solution.validate(missing=True, **options))["simulated"]
+    for key in ("sole_cop_margin_mm", "sole_force_N"):
+        for sole, phases in (miss.get(key) or {}).items():
+            found[key][sole] |= {phase: kept for phase, kept in phases.items() if phase == "missed"}
+    return found
+
+
+def _soles(found: Mapping[str, Any]) -> dict[str, Any]:
+    """What a summary says of each sole by itself."""
+    return {key: value for key, value in found.items() if key.startswith(("sole_cop_margin", "sole_force"))}
+
+
+def _least_of(soles: Mapping[str, Mapping[str, float]] | None) -> float | None:
+    return _least(*(kept for phases in (soles or {}).values() for kept in phases.values()))
+
+
+def _kept(found: Mapping[str, Any], told: Mapping[str, Any], name: str) -> dict[str, float | None]:
+    """Least share of what is asked of a sole; a centre of pressure of which nothing is asked is left out."""
+    asked, force = told.get("sole_cop_margin_asked_mm") or {}, told.get("sole_force_asked_N")
+    shares = [
+        kept / asked[phase]
+        for phases in (found.get("sole_cop_margin_mm") or {}).values()
+        for phase, kept in phases.items()
+        if asked.get(phase)
+    ]
+    least = _least_of(found.get("sole_force_N"))
+    return {
+        f"cop_{name}": _least(*shares),
+        f"force_{name}": least / force if force and least is not None else None,
+    }
 
 
 def _planned(solution: Solution) -> list[Array]:

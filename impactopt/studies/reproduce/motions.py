@@ -94,6 +94,6 @@ def motions(robots: Sequence[str], say: Say) -> Iterator[tuple[str, list[Case]]]
 
 
 def reference(case: Case, *, form: str = "lagrange") -> tuple[Collision, float]:
-    """(the motion in full dynamics, the impulse's change by the last halving of the step [N s])."""
+    """(the motion in full dynamics, what a tighter tolerance has changed in its impulse [N s])."""
     model = FullDynamics(**setting(case.robot), step=STEP, form=form)
     return model.converged(case.q, case.v, case.torque, require_separation=False)

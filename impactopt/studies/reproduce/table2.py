@@ -133,7 +133,7 @@ def _reference_row(robot: str, case: Case, true: Collision, change: float) -> di
         "f_max_openhrp3_N": openhrp3.f_max if openhrp3 else None,
         "duration_s": true.duration,
         "separated": true.separated,
-        "last_halving_changed_Ns": change,
+        "tighter_tolerance_changed_Ns": change,
     }
 
 

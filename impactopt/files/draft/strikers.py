@@ -1,0 +1,115 @@
+"""Striking points, found at the ends of limbs: by tool frames, else by the shapes of the last links."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.pieces import Piece, inertia_box
+from impactopt.bodies.plausible import is_far
+from impactopt.files.draft.limbs import Limb
+from impactopt.robots.parts import Striker
+
+__all__ = ["find_striker", "first_link"]
+
+Array = NDArray[np.float64]
+# the conventions of ROS-Industrial (tool0), of makers and of MuJoCo's menagerie (sites), the surest first
+_TOOLS = tuple(
+    re.compile(pattern, re.IGNORECASE)
+    for pattern in (
+        r"(^|_)tcp($|_)",
+        r"^tool0$|(?<!ft)(^|_)tool(_?(0|tip|frame|point|center|centre|link))?$",
+        r"link_eef$|(^|_)eef?(_?(link|frame|site|tip))?$|end_?effector",
+        r"grip_?site|gripper_?(frame|tip|cent(er|re))|pinch|attachment_?site|(^|_)grasp",
+    )
+)
+APART = 0.01  # [m] two places are apart, and a shape's middle is ahead of its joint
+SHORT = 0.06  # [m] a link so short at most, as a flange is, never folds back over the link before it
+ROLLS = np.cos(np.radians(25))  # least cosine between a joint's axis and what turns about it
+STRAIGHT = np.cos(np.radians(20))  # least cosine for a limb that points along an axis of its link
+
+
+def find_striker(
+    model: pin.Model, limb: Limb, name: str, pieces: Mapping[int, tuple[Piece, ...]]
+) -> tuple[Striker, Array]:
+    """The end of a limb, and the direction (3,) in which its last link points there, in that joint's frame.
+
+    A frame that is named as tools are is on the axis of the striking point; else the middle of the last
+    link's shapes is. The point is where these end, away from the arm. In place of shapes that are far from
+    their link there is the box of its inertia.
+    """
+    own = pieces.get(limb.tip, ())
+    points = [p.vertices for p in own if not is_far(model, p, own)]
+    if own and not points:
+        points = [inertia_box(model.inertias[limb.tip]).vertices]
+    away, tool = _away(model, limb), _tool(model, limb.tip)
+    if tool is not None:
+        place = tool.placement
+        axes = np.column_stack([place.rotation, -place.rotation])
+        beyond = place.translation + away * APART  # a frame at the joint itself: on as the arm goes
+        axis = axes[:, int(np.argmax(axes.T @ (beyond if np.linalg.norm(beyond) > 3 * APART else away)))]
+        ahead = max([float(((p - place.translation) @ axis).max()) for p in points], default=0.0)
+        local = place.rotation.T @ (axis * max(ahead, 0.0))
+        return Striker(name=name, frame=str(tool.name), point=np.round(local, 4) + 0.0), axis
+    parent, above = first_link(model, limb.tip)
+    frames = [f.placement.translation for f in model.frames if f.parentJoint == limb.tip]
+    axis = _axis(model, limb, points, frames, away)
+    everything = np.concatenate([*points, np.array(frames).reshape(-1, 3)])
+    point = axis * max(float((everything @ axis).max()), 0.0)
+    return Striker(name=name, frame=parent, point=np.round(above.actInv(point), 4) + 0.0), axis
+
+
+def first_link(model: pin.Model, joint: int) -> tuple[str, pin.SE3]:
+    """The first link that a joint moves, and its placement."""
+    for frame in model.frames:
+        if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
+            return str(frame.name), frame.placement
+    return str(model.names[joint]), pin.SE3.Identity()
+
+
+def _tool(model: pin.Model, joint: int) -> pin.Frame | None:
+    """The frame of a tool that a joint moves, the surest; None: there is none."""
+    kinds = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)
+    own = [f for f in model.frames if f.parentJoint == joint and f.type in kinds]
+    return next((f for pattern in _TOOLS for f in own if pattern.search(str(f.name))), None)
+
+
+def _away(model: pin.Model, limb: Limb) -> Array:
+    """The direction (3,) from the arm to its last joint, in that joint's frame, where the arm is straight."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, pin.neutral(model))
+    tip = data.oMi[limb.tip]
+    for joint in reversed(limb.path[:-1]):
+        step = tip.translation - data.oMi[joint].translation
+        if np.linalg.norm(step) > APART:
+            return np.asarray(tip.rotation.T @ step / np.linalg.norm(step))
+    return np.array([0.0, 0.0, 1.0])
+
+
+def _axis(
+    model: pin.Model, limb: Limb, points: Sequence[Array], frames: Sequence[Array], away: Array
+) -> Array:
+    """The direction (3,) in which a last link points."""
+    middle = np.mean([(p.max(axis=0) + p.min(axis=0)) / 2 for p in points], axis=0) if points else np.zeros(3)
+    axis = middle if np.linalg.norm(middle) > APART else np.array(max(frames, key=np.linalg.norm))
+    size = float(np.linalg.norm(axis))
+    if size < 1e-6:  # nothing sticks out: on as the link before does
+        return away
+    axis = axis / size
+    turns = _turning_axis(model, limb.tip)
+    backwards = float(axis @ away) < -STRAIGHT
+    if backwards and (size < SHORT or abs(float(axis @ turns)) > ROLLS):
+        axis = -axis  # the link ends at its joint, and its shapes are behind that
+    k = int(np.argmax(np.abs(axis)))
+    return np.eye(3)[k] * np.sign(axis[k]) if abs(axis[k]) > STRAIGHT else np.asarray(axis)
+
+
+def _turning_axis(model: pin.Model, joint: int) -> Array:
+    """(3,) of a joint that turns, in its frame; zero of one that slides."""
+    data = model.createData()
+    jac = pin.computeJointJacobian(model, data, pin.neutral(model), joint)
+    return np.array(jac[3:, model.joints[joint].idx_v]).reshape(3)

@@ -1,0 +1,140 @@
+"""Where a bolted arm is strong: blows estimated in many postures, the best of them solved as strikes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impactopt.bodies.clearance import Places
+from impactopt.errors import InputError
+from impactopt.files.draft.aim import LOWEST, Arm
+from impactopt.kinematics.stance import FixedBase
+from impactopt.kinematics.striking_point import striking_point
+from impactopt.planning.strike import optimize_strike
+from impactopt.problem.doubts import hopeless
+from impactopt.problem.problem import ImpactProblem
+from impactopt.problem.strength import Blow, Strength, drawn_blows
+from impactopt.robots.robot import Robot
+
+__all__ = ["Strong", "duration", "strongest"]
+
+Array = NDArray[np.float64]
+STRIKES, LOOKED_AT = 4, 60  # blows that are solved as strikes; estimated ones that are looked at for them
+ALIKE = 0.2  # of the reach: how far apart points with one normal are
+# [s] that joints at their contact speed need from the start to contact; and [rad], [m] that the one which
+# moves farthest goes there, between these
+RUN, BACK = 0.7, (0.35, 0.9)
+SHORTER = (1.0, 0.75, 0.55, 0.4)  # of that way, where joints or bodies leave no more
+BEHIND = 0.06  # [m] of the start behind the target's plane at least
+PARTS = (0.8, 3.0)  # of the time that joints need for their way: shortest and longest duration
+SECONDS = 10.0  # [s] of a strike
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Strong:
+    """A drafted blow: configurations (nq,) to start from and at contact, point (3,) [m], normal (3,), and the
+    impulse of its strike [N s].
+    """
+
+    start: Array
+    contact: Array
+    point: Array
+    normal: Array
+    impulse: float
+
+
+def strongest(robot: Robot, arm: Arm, q: Array, **given: Any) -> Strong | None:
+    """The best strike of the blows that are estimated best; None: check finds a fault with all of them.
+
+    q (nq,) : what does not strike stays as in it.  given : law, target and terms, as of `ImpactProblem`.
+    """
+    strength = Strength(robot=robot, striker=arm.name, law=given["law"], target=given["target"])
+    best: Strong | None = None
+    for problem, blow in _sound(robot, arm, strength, q, given):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a strike that fails is no candidate
+            solved = optimize_strike(problem, time_limit=SECONDS)
+        if not solved.status.usable or (best is not None and solved.impulse <= best.impulse):
+            continue
+        best = Strong(
+            start=problem.start_posture,
+            contact=blow.q,
+            point=problem.point,
+            normal=problem.normal,
+            impulse=solved.impulse,
+        )
+    return best
+
+
+def duration(robot: Robot, way: Array, usual: tuple[float, float]) -> list[float]:
+    """[shortest, longest] [s] of a phase in which joints go a way (n,) [rad] there, or back and there.
+
+    The usual times are those of fast robots. Slow joints need the way over their largest speed at least;
+    thrice that leaves room to wind up, and no more than a spline of few intervals can follow.
+    """
+    needed = float(np.max(np.abs(way) / robot.velocity_limit))
+    return [max(short, float(f"{part * needed:.2g}")) for short, part in zip(usual, PARTS, strict=True)]
+
+
+def _sound(
+    robot: Robot, arm: Arm, strength: Strength, q: Array, given: Mapping[str, Any]
+) -> Iterator[tuple[ImpactProblem, Blow]]:
+    """Problems of the best estimated blows, unlike each other, that check finds no fault with."""
+    blows = [blow for blow in drawn_blows(strength, q) if blow.point[2] > LOWEST / 2]
+    reach = max((float(np.linalg.norm(blow.point)) for blow in blows), default=0.0)
+    taken: list[Blow] = []
+    for blow in blows[:LOOKED_AT]:
+        near = [b for b in taken if b.normal @ blow.normal > 0.9]
+        if any(np.linalg.norm(b.point - blow.point) < ALIKE * reach for b in near):
+            continue
+        problem = _problem(robot, arm, blow, given)
+        if problem is None:
+            continue
+        taken.append(blow)
+        yield problem, blow
+        if len(taken) == STRIKES:
+            return
+
+
+def _problem(robot: Robot, arm: Arm, blow: Blow, given: Mapping[str, Any]) -> ImpactProblem | None:
+    """A blow's problem, from a start on the way that it comes; None: there is a fault in it."""
+    point = np.round(blow.point, 3) + 0.0
+    size = float(np.abs(blow.v).max())
+    way = blow.v / size * float(np.clip(RUN * size, *BACK))
+    for part in SHORTER:
+        start = np.array(pin.integrate(robot.model, blow.q, -part * way))
+        angles = robot.joint_positions(start)
+        edge = 0.02 * np.minimum(robot.upper - robot.lower, 1.0)
+        inside = np.all(angles > robot.lower + edge) and np.all(angles < robot.upper - edge)
+        at = striking_point(robot, arm.name, start)
+        if not inside or blow.normal @ (point - at) < BEHIND or at[2] < LOWEST / 2:
+            continue
+        try:
+            problem = ImpactProblem(
+                robot=robot,
+                striker=arm.name,
+                point=point,
+                normal=blow.normal,
+                stance=FixedBase(),
+                start=start,
+                **given,
+            )
+            touches = _touches(problem, start, blow.q)
+        except InputError:
+            continue
+        if not touches and not hopeless(problem):
+            return problem
+    return None
+
+
+def _touches(problem: ImpactProblem, *postures: Array) -> bool:
+    """Whether bodies touch in one of these configurations (nq,), before contact."""
+    none: Array = np.zeros(len(postures))
+    at = Places.of(problem.robot, np.array(postures), none, none.astype(np.intp))
+    return bool(problem.bodies.survey(none + np.arange(len(postures)), at).touches)

@@ -1,0 +1,202 @@
+"""The check of a plan's contact: integrated once more from the state at contact, with its events.
+
+A program has one branch of each force in each phase, and events where its phases end. What it cannot know is
+whether they come there first: whether a board has broken before, a nail starts again, bodies have parted in
+between. So what is solved is followed in full dynamics, by the engine of replays, from its own state at
+contact and under its own reference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impactopt.errors import InputError
+from impactopt.planning.multistart import VIOLATED
+from impactopt.problem.problem import ImpactProblem
+from impactopt.simulation.pinocchio_engine import Followed, follow_contact
+from impactopt.simulation.reference.coasting import independent_rates
+from impactopt.simulation.scene import scene_of
+from impactopt.solvers.program import SolverResult, Status
+from impactopt.transcription.plan import Plan, Trajectory
+from impactopt.transcription.planned_strike import PlannedStrike
+
+__all__ = ["AGREED", "ContactReplay", "ModelError", "PlannedContact", "checked"]
+
+Array = NDArray[np.float64]
+AGREED, REFUTED = 1.0, 5.0  # [%] of the impulse: a plan that is off by more is not solved; is none
+_STEP, _STEPS = 2e-4, 60  # [s] at most; of the planned contact, at least
+_LONGER, _LONGEST = 1.5, 4.0  # than the planned contact, so that one that comes back, or goes on, is seen
+_SAMPLED = 1e-3  # [s] of a coasting reference
+_WORTH = 1e-3  # of the planned contact's duration: a gap that is told
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelError:
+    """How far a model of the collision is from full dynamics, at a plan's state at contact.
+
+    impulse_pct : [%], positive where it promises too much.  zmp_mm : largest distance; None where one of them
+    has no ZMP.
+    """
+
+    impulse_pct: float
+    zmp_mm: float | None
+
+    def __str__(self) -> str:
+        zmp = "" if self.zmp_mm is None else f", ZMP off by {self.zmp_mm:.2g} mm"
+        return f"impulse {self.impulse_pct:+.2g} %{zmp}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactReplay:
+    """A planned contact in full dynamics, from the plan's state at contact.
+
+    planned, impulse [N s] : to the target, as planned and as it is.  peak [N] : largest force.  outcome : of
+    the target, by name and unit.  contact [s] : from the first touch to the end of the last.  events [s] :
+    since contact, when the target has switched, such as a board that breaks.  partings : how often striker
+    and target part and meet again.
+    guards : names of the target's events, in their order.  known [%] : what of `impulse_pct` is told as the
+    error of the model of the collision.
+    """
+
+    planned: float
+    impulse: float
+    peak: float
+    outcome: dict[str, float]
+    contact: float
+    events: tuple[float, ...]
+    partings: int
+    guards: tuple[str, ...]
+    known: float = 0.0
+
+    @property
+    def impulse_pct(self) -> float:
+        """Planned impulse over that in full dynamics, less one [%]: positive where a plan promises too
+        much.
+        """
+        return 100 * (self.planned / self.impulse - 1) if self.impulse > 0 else np.inf
+
+    @property
+    def off(self) -> float:
+        """[%] of the impulse that nothing else tells."""
+        return abs(self.impulse_pct - self.known)
+
+    def __str__(self) -> str:
+        """What a plan leaves out."""
+        off = f"its impulse is {self.impulse:.4g} N s, {self.planned:.4g} N s as planned"
+        if self.partings:
+            times = "once" if self.partings == 1 else f"{self.partings} times"
+            return (
+                f"striker and target part and meet again {times} within the blow, which is planned as one "
+                f"contact: {off}, and the largest force is {self.peak:.0f} N, whatever is planned"
+            )
+        names = [self.guards[k % len(self.guards)] for k in range(len(self.events))] if self.guards else []
+        told = [f"{name} at {1e3 * t:.3g} ms" for name, t in zip(names, self.events, strict=False)]
+        when = f" (the target's events: {', '.join(told)})" if told else ""
+        return (
+            "the contact, followed in full dynamics from the plan's state at contact, lasts "
+            f"{1e3 * self.contact:.3g} ms{when}: {off}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedContact:
+    """The contact of a plan or a strike, with what comes of it in full dynamics once that is asked for.
+
+    model_error : estimated one of the model of the collision; None where nothing is frozen in it.
+    """
+
+    problem: ImpactProblem
+    planned: Plan | PlannedStrike
+    model_error: ModelError | None = None
+
+    @cached_property
+    def reference(self) -> Trajectory:
+        """The servo's; of a strike, one that coasts."""
+        if isinstance(self.planned, Plan):
+            return self.planned.trajectory()
+        return _coasting(self.problem, self.planned)
+
+    @cached_property
+    def replay(self) -> ContactReplay | None:
+        """None of an impact without duration, and where the motion cannot be followed."""
+        problem, planned = self.problem, self.planned
+        duration = planned.compression + planned.restitution
+        if not problem.lasts or not duration > 0:
+            return None
+        try:
+            found = follow_contact(
+                problem.robot,
+                self.reference,
+                scene_of(problem),
+                step=min(_STEP, duration / _STEPS),
+                # a strike has no motion that takes the striker away
+                until=duration * (_LONGER if isinstance(planned, Plan) else 1.0),
+                longest=_LONGEST * duration,
+            )
+        except InputError:  # legs that do not reach
+            return None
+        known = 0.0 if self.model_error is None else self.model_error.impulse_pct
+        return _told(problem, planned, found, known)
+
+
+def _told(
+    problem: ImpactProblem, planned: Plan | PlannedStrike, found: Followed, known: float
+) -> ContactReplay:
+    duration = planned.compression + planned.restitution
+    gaps = [after[0] - before[1] for before, after in pairwise(found.touches)]
+    return ContactReplay(
+        planned=planned.impulse,
+        impulse=found.impulse,
+        peak=found.peak,
+        outcome=found.outcome,
+        contact=found.touches[-1][1] - found.touches[0][0] if found.touches else 0.0,
+        events=found.events,
+        partings=sum(gap > _WORTH * duration for gap in gaps),
+        guards=problem.target.guards,
+        known=known,
+    )
+
+
+def checked(result: SolverResult, replay: ContactReplay | None) -> SolverResult:
+    """A result whose contact is what it says, as it is; else not a solved one, or none at all."""
+    if replay is None or not result.status.usable or replay.off <= AGREED:
+        return result
+    off, message = replay.off, f"The planned contact is off by {replay.off:.2g} %: {replay}."
+    if off <= REFUTED:
+        return replace(result, status=Status.ACCEPTABLE, message=message)
+    worst = max(result.max_violation, min(off / 100, 1.0), 2 * VIOLATED)
+    return replace(result, status=Status.FAILED, max_violation=worst, message=message)
+
+
+def _coasting(problem: ImpactProblem, strike: PlannedStrike) -> Trajectory:
+    """The reference of a strike: it goes on at the rates at contact, as a plan's does while contact lasts.
+
+    Raises
+    ------
+    InputError : legs that do not reach.
+    """
+    c, longest = problem.coordinates, _LONGEST * (strike.compression + strike.restitution)
+    y, legs = c.split(strike.posture)
+    rates, still = independent_rates(c, y, strike.velocity), np.zeros(c.ny)
+    times, rows = np.linspace(0.0, longest, max(2, round(longest / _SAMPLED) + 1)), []
+    for t in times:
+        legs = c.solve_legs(y + rates * t, legs)
+        rows.append(c.complete_motion(y + rates * t, rates, still, legs))
+    q, v, a = (np.array(column) for column in zip(*[rows[0], *rows], strict=True))
+    return Trajectory(
+        time=np.concatenate([[0.0], times]),
+        phase=np.array([0] + [1] * len(times)),
+        q=q,
+        v=v,
+        a=a,
+        torque=np.tile(strike.torque, (len(times) + 1, 1)),
+        ground=np.tile(strike.ground, (len(times) + 1, 1)),
+        contact_start=0.0,
+        contact_end=longest,
+        end=longest,
+    )

@@ -1,0 +1,115 @@
+"""Plausibility of a robot's numbers: what is sound by itself, and hard to believe."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from impactopt.bodies.pieces import pieces_of
+from impactopt.bodies.plausible import distance_to_link, is_far, size_of
+from impactopt.robots.robot import Robot
+from impactopt.robots.rotors import HEAVIEST_ROTOR, LIGHTEST_ROTOR
+
+__all__ = ["doubts", "far_shapes", "giant_soles"]
+
+GIANT = 3.0  # of a leg's length: no sole is so long
+ALIKE = 0.2  # of a sole's length or width, by which left and right may differ
+
+
+def doubts(robot: Robot) -> list[str]:
+    """Numbers of a robot that a plan depends on and that are missing, or hard to believe."""
+    return [*_without_armature(robot), *_armatures(robot), *_sides(robot), *far_shapes(robot)]
+
+
+def giant_soles(robot: Robot) -> Iterator[str]:
+    """Soles that are longer than any leg could carry, as of millimetres taken for metres."""
+    for sole in robot.soles:
+        size = float(np.ptp(sole.polygon, axis=0).max())
+        chain = robot.model.supports[_parent(robot, sole.frame)]
+        leg = sum(float(np.linalg.norm(robot.model.jointPlacements[j].translation)) for j in list(chain)[2:])
+        leg = max(leg, 1e-3)
+        if size > GIANT * leg:
+            yield (
+                f"sole {sole.name!r} is {size:.3g} m long, on a leg of {leg:.2g} m: are its "
+                "corners in millimetres? Give them in metres"
+            )
+
+
+def _without_armature(robot: Robot) -> Iterator[str]:
+    driven = zip(robot.joint_names, robot.armature, robot.passive, strict=True)
+    without = [joint for joint, a, passive in driven if a == 0 and not passive]
+    if without:
+        every = len(without) == robot.n - np.sum(robot.passive)
+        which = "no joint has" if every else f"{', '.join(without)}: no"
+        yield (
+            f"{which} armature: without the rotors' inertia (x gear ratio^2) a geared robot is planned too "
+            "light and hits too softly, and what its gears bear is not known; give `[robot] armature_kg_m2`, "
+            "by joint"
+        )
+
+
+def _armatures(robot: Robot) -> Iterator[str]:
+    """Armatures that belong to no motor of such a torque."""
+    share = robot.armature / robot.torque_limit
+    for wrong, bound, what, end in (
+        ((share > 0) & (share < LIGHTEST_ROTOR), LIGHTEST_ROTOR, "small", "least"),
+        (share > HEAVIEST_ROTOR, HEAVIEST_ROTOR, "large", "most"),
+    ):
+        names = [
+            name for name, doubtful in zip(robot.joint_names, wrong & ~robot.passive, strict=True) if doubtful
+        ]
+        if names:
+            k = robot.joint_index(names[0])
+            armature, torque = robot.armature[k], robot.torque_limit[k]
+            yield (
+                f"armature of {_counted(names)}: {armature:.2g} kg m2 is hard to believe of a drive of "
+                f"{torque:.3g} N m, too {what}; {bound * torque:.2g} kg m2 is the {end} (rotor inertia "
+                "x gear ratio^2)"
+            )
+
+
+def _sides(robot: Robot) -> Iterator[str]:
+    """Soles on the other side than their names say, and soles of a pair that are not alike."""
+    names = {sole.name.lower(): sole for sole in robot.soles}
+    left = next((sole for name, sole in names.items() if "left" in name), None)
+    right = next((sole for name, sole in names.items() if "right" in name), None)
+    if left is None or right is None:
+        return
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    one, other = (data.oMf[model.getFrameId(sole.frame)] for sole in (left, right))
+    if float(other.actInv(one.translation)[1]) < 0:
+        yield (
+            f"sole {left.name!r} is to the right of {right.name!r}, seen along the soles' x: are their "
+            "frames swapped, or does x point backwards?"
+        )
+    size, same = np.ptp(left.polygon, axis=0), np.ptp(right.polygon, axis=0)
+    if np.any(np.abs(size - same) > ALIKE * np.maximum(size, same)):
+        yield (f"soles {left.name!r} and {right.name!r} are not alike: {_times(size)} and {_times(same)}")
+
+
+def far_shapes(robot: Robot) -> Iterator[str]:
+    """Shapes far from the link that has them."""
+    pieces = pieces_of(robot)[0]
+    for piece in pieces:
+        beside = [other for other in pieces if other.joint == piece.joint]
+        if is_far(robot.model, piece, beside):
+            yield (
+                f"a shape of link {piece.link!r}, {size_of(piece):.2g} m large, is "
+                f"{distance_to_link(robot.model, piece, beside):.2g} m away from the link's joint, mass "
+                "and frames: correct its <origin>"
+            )
+
+
+def _counted(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more joints"
+
+
+def _times(size: np.ndarray) -> str:
+    return " x ".join(f"{x:.3g}" for x in size) + " m"
+
+
+def _parent(robot: Robot, frame: str) -> int:
+    return int(robot.model.frames[robot.model.getFrameId(frame)].parentJoint)

@@ -1,0 +1,115 @@
+"""`Description`: what a URDF or an MJCF says of a robot, and what of it no plan can have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from os import PathLike, fspath
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from impactopt.errors import Mistakes
+from impactopt.robots.build import joint_names, lock_joints
+from impactopt.robots.inertias import REPAIRED, check_choice, repair_inertias
+from impactopt.robots.parts import Source, Striker
+
+__all__ = ["Description", "Tie", "between"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tie:
+    """Forces or constraints between joints, or on one, that a plan does not have.
+
+    joints : by name.  free : how many of them may move all the same; the others have to be locked.
+    text : of a message; begins with the thing and its name.  mend : another one than to lock.
+    follower : the joint that a draft locks, "" if none is meant; follows : a polynomial of the other
+        joint's angle [rad], the lowest coefficient first, which is the follower's.
+    """
+
+    text: str
+    joints: tuple[str, ...]
+    free: int = 1
+    mend: str = ""
+    follower: str = ""
+    follows: tuple[float, ...] = (0.0,)
+
+    def broken(self, joints: tuple[str, ...]) -> str:
+        """The mistake of a robot whose joints these are; "" if there is none."""
+        left = [joint for joint in self.joints if joint in joints]
+        if len(left) <= self.free:
+            return ""
+        which = "it" if len(left) == 1 else "one of them" if self.free else f"all of {', '.join(left)}"
+        return f"{self.text}; {self.mend and f'{self.mend}, or '}lock {which} (`locked`)"
+
+
+@dataclass(kw_only=True)
+class Description:
+    """A robot in a file.
+
+    kind : "URDF" or "MJCF".
+    model : with its armature, friction, limits and gravity, and named configurations; a frame of type BODY
+        for each link or body, and an OP_FRAME for each site, by their names.
+    kp, kd, torque : by joint, what its actuators say.
+    sites : names of those on links that move.
+    ties : what no plan has, unless joints are locked.
+    notes : what was left out or taken otherwise than the file says, in words.
+    """
+
+    kind: str
+    model: pin.Model
+    kp: dict[str, float] = field(default_factory=dict)
+    kd: dict[str, float] = field(default_factory=dict)
+    torque: dict[str, float] = field(default_factory=dict)
+    sites: list[str] = field(default_factory=list)
+    ties: list[Tie] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def options(self, model: pin.Model, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Options of `Robot.from_model` for a model with some of these joints, under those that are given.
+
+        Raises
+        ------
+        InputError : joints are left whose ties a plan does not have.
+        """
+        joints, found = joint_names(model), Mistakes()
+        found.found += [f"{self.kind}: {mistake}" for tie in self.ties if (mistake := tie.broken(joints))]
+        found.raise_if_any(f"the {self.kind}")
+        out = dict(given)
+        for key, numbers in (("kp", self.kp), ("kd", self.kd), ("torque_limit", self.torque)):
+            own = {joint: value for joint, value in numbers.items() if joint in joints}
+            if own and isinstance(given.get(key, {}), Mapping):
+                out[key] = {**own, **given.get(key, {})}
+        named = {striker.name for striker in given.get("strikers", ())}
+        sites = [Striker(name=s, frame=s, point=np.zeros(3)) for s in self.sites if s not in named]
+        return {**out, "strikers": [*sites, *given.get("strikers", ())]}
+
+    def made(
+        self, path: str | PathLike[str], given: Mapping[str, Any], options: Mapping[str, Any]
+    ) -> tuple[pin.Model, dict[str, Any], Source]:
+        """The model without locked joints, all options of `Robot.from_model` for it, and its source.
+
+        given : name, locked and inertias, as of `Robot.from_urdf`, and what is recorded beside them.
+        options : of `Robot.from_model`, that were given.
+        """
+        check_choice(given["inertias"])
+        model, kind = lock_joints(self.model, given["locked"]), self.kind.lower()
+        repairs = tuple(repair_inertias(model)) if given["inertias"] == REPAIRED else ()
+        every = {"name": given["name"] or model.name, kind: path, **self.options(model, options)}
+        notes = (*self.notes, *self._approximated(joint_names(model)))
+        own: dict[str, Any] = {kind: fspath(path), "options": {**given, **options}}
+        return model, every, Source(repairs=repairs, notes=notes, **own)
+
+    def _approximated(self, joints: tuple[str, ...]) -> Iterator[str]:
+        for tie in self.ties:
+            left = [joint for joint in tie.joints if joint in joints]
+            if left and len(left) < len(tie.joints):
+                locked = ", ".join(repr(joint) for joint in tie.joints if joint not in joints)
+                yield f"{tie.text}; {locked} is locked, and does not move with {', '.join(map(repr, left))}"
+
+
+def between(model: pin.Model, one: int, other: int) -> tuple[str, ...]:
+    """Names of the joints on the way in the tree from one joint of a model to another."""
+    a, b = (list(model.supports[joint]) for joint in (one, other))
+    return tuple(str(model.names[j]) for j in sorted(set(a) ^ set(b)) if model.joints[j].nv == 1)

@@ -1,0 +1,199 @@
+"""From a URDF to a `pin.Model`, and what else the file says of a robot.
+
+Pinocchio reads links and joints. It says nothing of <mimic>, of Gazebo's extensions and of <transmission>:
+what of these changes the dynamics becomes a tie or a note of the `Description`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+from typing import Any
+from xml.dom import expatbuilder
+from xml.parsers.expat import ExpatError
+
+import numpy as np
+import pinocchio as pin
+
+from impactopt.errors import InputError, Mistakes
+from impactopt.robots.build import existing
+from impactopt.robots.checks import HEAVIEST
+from impactopt.robots.description import Description, Tie, between
+
+__all__ = ["read_urdf"]
+
+# [kg m2] of moments of inertia, and relative: decimals are rounded, and antennas are guessed
+_ROUNDED = 1e-6
+
+
+def read_urdf(
+    path: str | PathLike[str],
+    srdf: str | PathLike[str] | None = None,
+    *,
+    floating: bool,
+    repaired: bool = False,
+) -> Description:
+    """The robot of a URDF, with an SRDF's reference configurations and rotors (as armature).
+
+    repaired : moments of inertia that no link can have are let through, as they are to be repaired.
+
+    Raises
+    ------
+    InputError : the file cannot be read; links that no matter is made of.
+    """
+    urdf = existing(path, "URDF")
+    joints = (pin.JointModelFreeFlyer(),) if floating else ()
+    root = _parsed(urdf)
+    if any(tag.tagName.startswith("xacro:") for tag in root.getElementsByTagName("*")):
+        raise InputError(
+            f"URDF {urdf} is written in xacro, which makes a URDF of it: run `xacro {Path(urdf).name} > "
+            "robot.urdf`, and give that"
+        )
+    try:
+        model = pin.buildModelFromUrdf(urdf, *joints)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"URDF {urdf}: {error}; the URDF parser's own messages are above") from error
+    _check_links(root, urdf, moments=not repaired)
+    if srdf is not None:
+        file = existing(srdf, "SRDF")
+        try:
+            pin.loadReferenceConfigurations(model, file, False)
+            pin.loadRotorParameters(model, file, False)
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"SRDF {file}: {error}") from error
+    out = Description(kind="URDF", model=model)
+    out.ties += [*_mimics(root, model), *_of_gazebo(root, model)]
+    out.notes += [*_weightless(root), *_rotors(root)]
+    return out
+
+
+def _parsed(urdf: str) -> Any:
+    try:
+        # robots have tags of others with prefixes that no one declares: no trouble of theirs
+        return expatbuilder.parse(urdf, namespaces=False).documentElement
+    except ExpatError as error:
+        raise InputError(f"URDF {urdf} is not well-formed XML: {error}; correct it there") from error
+
+
+def _mimics(root: Any, model: pin.Model) -> Iterator[Tie]:
+    """Joints that follow others."""
+    for joint in _children(root, "joint"):
+        name = joint.getAttribute("name")
+        for mimic in _children(joint, "mimic"):
+            other = mimic.getAttribute("joint")
+            if model.existJointName(name):
+                yield Tie(
+                    text=f"joint {name!r} follows {other!r} by <mimic>",
+                    joints=(name, other),
+                    follower=name,
+                    follows=(
+                        _urdf_number(mimic.getAttribute("offset")),
+                        _urdf_number(mimic.getAttribute("multiplier") or "1"),
+                    ),
+                )
+
+
+def _of_gazebo(root: Any, model: pin.Model) -> Iterator[Tie]:
+    """Springs on joints and closed loops, which Gazebo has and URDF has not."""
+    for gazebo in _children(root, "gazebo"):
+        name = gazebo.getAttribute("reference")
+        if model.existJointName(name) and any(_numbers(gazebo, "springStiffness")):
+            text = f"joint {name!r} has a spring, Gazebo's <springStiffness>, which no plan has"
+            yield Tie(text=text, joints=(name,), free=0, mend="take it out")
+        for loop in _children(gazebo, "joint"):
+            ends = [_text(end) for tag in ("parent", "child") for end in _children(loop, tag)]
+            frames = [
+                model.getFrameId(end, pin.FrameType.BODY)
+                for end in ends
+                if model.existFrame(end, pin.FrameType.BODY)
+            ]
+            if len(frames) == 2:
+                one, other = (int(model.frames[i].parentJoint) for i in frames)
+                text = (
+                    f"Gazebo's <joint> {loop.getAttribute('name')!r} closes a loop, and robots here are trees"
+                )
+                yield Tie(text=text, joints=between(model, one, other), free=0, mend="take it out")
+
+
+def _weightless(root: Any) -> Iterator[str]:
+    """Links with mass on which Gazebo's gravity does not act."""
+    heavy = {link.getAttribute("name") for link in _children(root, "link") if _children(link, "inertial")}
+    names = []
+    for gazebo in _children(root, "gazebo"):
+        off = [_text(tag) in ("false", "0") for tag in _children(gazebo, "gravity")]
+        off += [_text(tag) in ("true", "1") for tag in _children(gazebo, "turnGravityOff")]
+        if any(off) and gazebo.getAttribute("reference") in heavy:
+            names.append(gazebo.getAttribute("reference"))
+    if names:
+        yield f"links without gravity in Gazebo have their weight here: {_listed(names)}"
+
+
+def _rotors(root: Any) -> Iterator[str]:
+    """Rotors' inertia in <transmission>, for which there are several dialects."""
+    names = [
+        joint.getAttribute("name")
+        for transmission in _children(root, "transmission")
+        if any("inertia" in tag.tagName.lower() for tag in transmission.getElementsByTagName("*"))
+        for joint in _children(transmission, "joint")
+    ]
+    if names:
+        yield f"rotors' inertia in <transmission> is left out, of {_listed(names)}; give `armature`"
+
+
+def _check_links(root: Any, urdf: str, *, moments: bool) -> None:
+    """InputError with all links that no matter is made of: what is fixed to another hides it in their sum.
+
+    Links without mass or inertia, as frames are, are none's trouble.
+    """
+    found = Mistakes()
+    for link in _children(root, "link"):
+        given = _children(link, "inertial")
+        masses = [mass for part in given for mass in _children(part, "mass")]
+        inertias = [inertia for part in given for inertia in _children(part, "inertia")]
+        if not masses or not inertias:
+            continue
+        keys = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        entries = [_urdf_number(inertias[0].getAttribute(key)) for key in keys]
+        m, (xx, yy, zz, xy, xz, yz) = _urdf_number(masses[0].getAttribute("value")), entries
+        where = f"URDF {urdf}: the <inertial> of link {link.getAttribute('name')!r}"
+        numbers = np.array([m, *entries])
+        if not np.isfinite(numbers).all() or m < 0 or np.abs(numbers).max() > HEAVIEST:
+            found.found.append(
+                f"{where} has mass {m:g} kg and moments {xx:g}, {yy:g}, {zz:g} kg m2; give numbers from 0 to "
+                f"{HEAVIEST:g}"
+            )
+            continue
+        least = float(np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))[0])
+        if moments and least < -_ROUNDED * max(1.0, float(np.abs(numbers[1:]).max())):
+            found.found.append(
+                f"{where} has a principal moment of inertia of {least:.3g} kg m2; correct its <inertia>, "
+                'which is about the centre of mass, or take inertias="repaired"'
+            )
+    found.raise_if_any(f"URDF {urdf}")
+
+
+def _children(element: Any, tag: str) -> list[Any]:
+    return [child for child in element.childNodes if getattr(child, "tagName", None) == tag]
+
+
+def _urdf_number(text: str) -> float:
+    """A number of a URDF; 0 for what its parser, which has read it before, has taken for none."""
+    try:
+        return float(text or 0.0)
+    except ValueError:
+        return 0.0
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _text(element: Any) -> str:
+    """What is in an element, or its attribute `link`, in which Gazebo's loops name theirs."""
+    words = "".join(child.data for child in element.childNodes if child.nodeType == child.TEXT_NODE)
+    return str(element.getAttribute("link") or words).strip()
+
+
+def _numbers(element: Any, tag: str) -> list[float]:
+    return [_urdf_number(_text(child)) for child in _children(element, tag)]

@@ -1,0 +1,140 @@
+"""An infeasible problem names the bound that has to move: moved there, it is solved."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impactopt import (
+    FreeMass,
+    ImpactProblem,
+    Impulse,
+    Nail,
+    NotSolvedWarning,
+    Phase,
+    Solution,
+    Status,
+    TorqueLimit,
+    load_problem,
+    solve,
+)
+from impactopt.planning.stopping import stopping
+from impactopt.problem.doubts import too_weak
+
+
+@pytest.fixture(scope="module")
+def arm() -> ImpactProblem:
+    return load_problem("arm_planar")
+
+
+def unsolved(problem: ImpactProblem) -> Solution:
+    with pytest.warns(NotSolvedWarning, match="not solved, so its numbers are those of no plan: Infeasible"):
+        solution = solve(problem)
+    assert solution.status is Status.INFEASIBLE
+    return solution
+
+
+def changes(arm: ImpactProblem) -> dict[str, tuple[ImpactProblem, str]]:
+    law = dataclasses.replace(arm.law, stiffness=3.9e4)
+    wood = Nail(mass=0.05, resistance=800.0, hardening=1e4)
+    few = dataclasses.replace(arm.swing, duration=2.09)
+    return {
+        "hard wood": (dataclasses.replace(arm, target=wood), "gears"),
+        "short swing": (dataclasses.replace(arm, swing=Phase(duration=0.02)), "time"),
+        "long swing": (dataclasses.replace(arm, swing=Phase(duration=50.0)), "time"),
+        "soft contact": (dataclasses.replace(arm, law=law, swing=few), "a soft contact"),
+    }
+
+
+@pytest.mark.parametrize("name", ["hard wood", "short swing", "long swing", "soft contact"])
+def test_the_bound_that_is_named_is_the_one_that_has_to_move(arm: ImpactProblem, name: str) -> None:
+    problem, first = changes(arm)[name]
+    solution = unsolved(problem)
+    assert solution.causes
+    cause = solution.causes[0]
+    assert cause.first == first
+    assert solution.result.message.startswith(f"Infeasible: {first}. {cause.text} would do")
+    assert cause.problem is not None
+    assert solve(cause.problem).status.usable
+
+
+def test_no_less_would_do(arm: ImpactProblem) -> None:
+    """The swing of the message is the shortest there is, within a few per cent."""
+    problem = dataclasses.replace(load_problem("punch_infeasible"))
+    named = unsolved(problem).causes[0].problem
+    assert named is not None
+    shortest = named.swing.duration[1]
+    assert shortest > problem.swing.duration[1]
+    shorter = dataclasses.replace(problem, swing=dataclasses.replace(problem.swing, duration=0.93 * shortest))
+    unsolved(shorter)
+
+
+def test_the_robots_own_weight(arm: ImpactProblem) -> None:
+    robot, q = arm.robot, arm.start_posture
+    bears = np.abs(pin.rnea(robot.model, robot.model.createData(), q, np.zeros(3), np.zeros(3)))
+    share = bears / robot.torque_limit
+    k = int(share.argmax())
+    for more, told in ((1.01, ""), (0.99, f"{robot.joint_names[k]} bears {share[k]:.3g} of its limit")):
+        terms = (*arm.terms, TorqueLimit(fraction=more * share[k]))
+        text = too_weak(dataclasses.replace(arm, terms=terms))
+        assert told in text
+        assert bool(text) == bool(told)
+
+
+def test_a_window_that_takes_nearly_all_is_told(arm: ImpactProblem) -> None:
+    """Half a period of 1 kg on 1e3 N/m takes 99 ms: in 15 ms a phase there is no blow worth its name."""
+    law = dataclasses.replace(arm.law, stiffness=1e3, damping=0.0)
+    problem = dataclasses.replace(arm, target=FreeMass(mass=1.0), law=law, objectives=(Impulse(),))
+    narrow = solve(dataclasses.replace(problem, contact_duration=(0.0, 0.015)))
+    assert narrow.status.usable
+    assert "[collision] duration_s leaves it, 15 ms" in narrow.window
+    assert narrow.window in narrow.summary()["caution"]
+    wide = solve(dataclasses.replace(problem, contact_duration=(0.0, 0.2)))
+    assert wide.window == ""
+    assert wide.impulse > 10 * narrow.impulse
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Both signals raise KeyboardInterrupt, as in commands; a shell's background job ignores the first."""
+    before = {n: signal.signal(n, signal.default_int_handler) for n in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    assert all(signal.getsignal(n) is signal.default_int_handler for n in before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures("handlers")
+def test_a_signal_between_two_solves_keeps_the_plan(arm: ImpactProblem, number: signal.Signals) -> None:
+    """Here while the program gets rows for gears: the plan before is there, and is not lost."""
+
+    def report(text: str) -> None:
+        if "rows of gear load" in text:
+            signal.raise_signal(number)
+
+    harder = dataclasses.replace(arm, target=Nail(mass=0.05, resistance=800.0, hardening=1e4))
+    with pytest.warns(NotSolvedWarning):
+        solution = solve(harder, report=report)
+    assert solution.status is Status.INTERRUPTED
+    assert solution.result.iterations > 10
+    assert solution.plan.impulse > 1.0
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_second_signal_ends_at_once() -> None:
+    with stopping() as stop:
+        stop.armed = True
+        signal.raise_signal(signal.SIGINT)
+        assert stop.asked
+        with stopping() as inner:
+            assert inner is stop
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    with stopping(), pytest.raises(KeyboardInterrupt):  # nothing is there yet
+        signal.raise_signal(signal.SIGINT)

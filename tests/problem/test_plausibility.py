@@ -1,0 +1,76 @@
+"""Numbers of robots that are sound by themselves and hard to believe are told, or refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.small_plans import biped_problem
+from support.small_robots import biped
+from typer.testing import CliRunner
+
+from impactopt import Robot, arm7, load_problem, planar_arm
+from impactopt.cli.app import app
+from impactopt.files.problem_file import write_problem
+from impactopt.problem.doubts import hopeless
+from impactopt.problem.plausibility import doubts
+
+
+def _with_soles(robot: Robot, **changes: dict[str, object]) -> Robot:
+    soles = [dataclasses.replace(s, **changes.get(s.name, changes.get("each", {}))) for s in robot.soles]
+    return dataclasses.replace(robot, soles=tuple(soles))
+
+
+def _with_armature(robot: Robot, value: float) -> Robot:
+    model = robot.model.copy()
+    model.armature = np.concatenate([np.zeros(robot.nv - robot.n), np.full(robot.n, value)])
+    return dataclasses.replace(robot, model=model, kp=0.01 * robot.kp, kd=0.01 * robot.kd)
+
+
+def test_robots_of_the_package_are_believed() -> None:
+    for robot in (biped(), planar_arm(), arm7()):
+        assert [text for text in doubts(robot) if "no joint has armature" not in text] == []
+
+
+@pytest.mark.parametrize(("value", "word"), [(1e-5, "too small"), (100.0, "too large")])
+def test_armatures_that_no_drive_has_are_doubted(value: float, word: str) -> None:
+    robot = _with_armature(arm7(), value)
+    (told,) = doubts(robot)
+    assert word in told and f"{value:.2g} kg m2" in told and "rotor inertia x gear ratio^2" in told
+
+
+def test_soles_in_millimetres_are_refused() -> None:
+    problem = biped_problem()
+    polygon = 1e3 * problem.robot.soles[0].polygon
+    wrong = _with_soles(problem.robot, each={"polygon": polygon})
+    told = hopeless(dataclasses.replace(problem, robot=wrong))
+    assert len(told) == 2 and all("are its corners in millimetres?" in text for text in told)
+    assert hopeless(problem) == []
+
+
+def test_soles_on_the_wrong_side_and_unlike_ones_are_doubted() -> None:
+    robot = biped()
+    left, right = (next(s for s in robot.soles if s.name == name) for name in ("left", "right"))
+    swapped = _with_soles(robot, left={"frame": right.frame}, right={"frame": left.frame})
+    assert any("'left' is to the right of 'right'" in text for text in doubts(swapped))
+    longer = _with_soles(robot, left={"polygon": left.polygon * [1.5, 1.0]})
+    assert any("are not alike" in text for text in doubts(longer))
+
+
+def test_torque_that_does_not_hold_the_start_is_doubted(tmp_path: Path) -> None:
+    file = tmp_path / "weak.toml"
+    text = write_problem(load_problem("arm7"))
+    assert json.loads(_checked(file, text))["doubts"] == []
+    told, *_ = json.loads(_checked(file, text, "robot.torque_limit_N_m=2.0"))["doubts"]
+    assert told.startswith("the torque limits do not hold the robot's own weight: at rest at its start")
+
+
+def _checked(file: Path, text: str, *settings: str) -> str:
+    file.write_text(text, encoding="utf-8")
+    words = [word for setting in settings for word in ("--set", setting)]
+    done = CliRunner().invoke(app, ["check", str(file), "--json", *words])
+    assert done.exit_code == 0, done.output
+    return done.stdout

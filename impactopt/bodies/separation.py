@@ -21,25 +21,25 @@ import ctypes
 import functools
 import hashlib
 import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from impactopt.bodies import separation_numpy
+from impactopt.bodies.robot_bodies import Pair, RobotBodies
+from impactopt.bodies.separation_numpy import ROUNDING
+from impactopt.bodies.world import WorldBody
 from impactopt.codegen.directory import kept
 from impactopt.codegen.library import address, native_library
-
-if TYPE_CHECKING:
-    from impactopt.bodies.clearance import Bodies, Places
 
 __all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "thinned"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-ROUNDING = 1e-3  # [m] e above
 THIN = 1e-3  # [m] by which vertices left out are outside of the hull of the others, at most
 _FEW = 12  # vertices of which none is left out
 _SIDE = 33  # numbers that the C code keeps of a pair
@@ -84,28 +84,36 @@ class Shapes:
     points (k, 3) [m] : vertices of all.  hulls (P, 4) : first vertex and number of vertices of both.
     """
 
-    def __init__(self, bodies: Bodies) -> None:
-        self._bodies = bodies
+    def __init__(
+        self,
+        links: RobotBodies,
+        world: Sequence[WorldBody],
+        pairs_of_links: Mapping[Pair, Sequence[tuple[Any, Any]]],
+        pairs_with_world: Iterable[Pair],
+    ) -> None:
+        """pairs_of_links : of two joints, with their pairs of pieces.  pairs_with_world : joint and number
+        of a body of the world.
+        """
         points, where, size = list[Array](), dict[Any, tuple[int, int]](), 0
-        world = [_corners(body.half) for body in bodies.world]
-        own = {id(piece): thinned(piece.vertices) for piece in bodies.links.pieces}
-        for key, vertices in [*own.items(), *enumerate(world)]:
+        corners = [_corners(body.half) for body in world]
+        own = {id(piece): thinned(piece.vertices) for piece in links.pieces}
+        for key, vertices in [*own.items(), *enumerate(corners)]:
             where[key if key in own else ("world", key)] = size, len(vertices)
             points.append(vertices)
             size += len(vertices)
         self.points = np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *points]))
         self._room = np.zeros(max((len(p) for p in points), default=1))
         pairs, number, hulls, balls, radius = [], [], [], [], []
-        for (a, b), pieces in bodies.pairs.items():
+        for (a, b), pieces in pairs_of_links.items():
             for k, (one, two) in enumerate(pieces):
                 pairs.append((a, b))
                 number.append(k)
                 hulls.append((*where[id(one)], *where[id(two)]))
                 balls.append((*_ball(one.vertices), *_ball(two.vertices)))
                 radius.append(0.0)
-        for j, w in bodies.world_pairs:
-            body = bodies.world[w]
-            for k, one in enumerate(bodies.links.of_joint[j]):
+        for j, w in pairs_with_world:
+            body = world[w]
+            for k, one in enumerate(links.of_joint[j]):
                 pairs.append((j, -1 - w))
                 number.append(k)
                 hulls.append((*where[id(one)], *where["world", w]))
@@ -116,24 +124,12 @@ class Shapes:
         self.hulls = np.array(hulls, dtype=np.int64).reshape(-1, 4)
         self.radius = np.array(radius, dtype=float)
         self._balls = np.array(balls, dtype=float).reshape(-1, 8)
-        up = [set(joints) for joints in bodies.robot.model.supports]
+        up = [set(joints) for joints in links.robot.model.supports]
         self.between = np.array([len(up[a] ^ up[b]) if b >= 0 else len(up) for a, b in pairs])
         self.index = {(a, b, k): n for n, ((a, b), k) in enumerate(zip(pairs, number, strict=True))}
 
     def __len__(self) -> int:
         return len(self.pairs)
-
-    def placed(self, at: Places) -> Placed:
-        """Where bodies are at these instants."""
-        bodies, k = self._bodies, len(at)
-        joints = np.concatenate([at.rotation.reshape(k, -1, 9), at.translation], axis=2)
-        world = np.zeros((k, len(bodies.world), 12))
-        present = np.zeros((k, len(bodies.world)), dtype=np.uint8)
-        for w, body in enumerate(bodies.world):
-            world[:, w, :9] = body.rotation.ravel()
-            world[:, w, 9:] = body.place + np.outer(at.travel, bodies.normal) * body.moves
-            present[:, w] = bodies.present(body, at)
-        return Placed(np.ascontiguousarray(joints), world, present)
 
     def look(self, at: Placed, within: float, ways: Array, wanted: NDArray[np.bool_]) -> Looked:
         """How far the pairs ``wanted`` (P,) are apart, exactly where that is less than ``within`` [m].

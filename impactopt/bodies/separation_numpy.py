@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from impactopt.bodies.separation import Looked, Placed, Separations, Shapes
-
-__all__ = ["look", "may_meet", "write"]
+__all__ = ["ROUNDING", "look", "may_meet", "write"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+ROUNDING = 1e-3  # [m] of supports
+_SHARP = 1 / ROUNDING
 _FLOOR = 1e-4  # least curvature of a separation along its direction's tangents
 _LONGEST, _STEPS, _TRIES = 0.5, 100, 30  # [rad] a step, and how many of them
-
-
-def _sharp() -> float:
-    from impactopt.bodies.separation import ROUNDING
-
-    return 1 / ROUNDING
 
 
 class _Support(NamedTuple):
@@ -53,7 +46,7 @@ def _gathered(points: Array, hulls: Index) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _support(vertices: Array, there: NDArray[np.bool_], u: Array) -> _Support:
-    sharp = _sharp()
+    sharp = _SHARP
     height = np.where(there, np.einsum("mki,mi->mk", vertices, u), -np.inf)
     most = height.max(axis=1)
     weight = np.exp(sharp * (height - most[:, None]))
@@ -92,7 +85,7 @@ class _Pairs:
         tangents = np.stack([x, np.cross(u, x)], axis=1)
         slope = point - b.mean
         along = np.einsum("mi,mi->m", u, slope)
-        bend = _sharp() * tangents @ (one + b.spread) @ tangents.transpose(0, 2, 1)
+        bend = _SHARP * tangents @ (one + b.spread) @ tangents.transpose(0, 2, 1)
         bend += along[:, None, None] * np.eye(2)
         separation = np.einsum("mi,mi->m", u, self.translation) - a.height - b.height
         return _Side(separation, slope, point, one, tangents, bend)
@@ -177,7 +170,7 @@ def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array
 
 
 def write(
-    of: Separations, points: Array, hulls: Index, what: int, z: Array, out: Array, factors: Array | None
+    of: Any, points: Array, hulls: Index, what: int, z: Array, out: Array, factors: Array | None
 ) -> None:
     """As `Separations.write`."""
     n = of.joints
@@ -194,10 +187,10 @@ def write(
         return
     turning = np.where(turns[:, :, None], np.cross(u[:, None], axis), 0.0)
     spread = np.einsum("mij,mkj->mki", at.spread_one, turning)
-    moved = np.concatenate([np.broadcast_to(np.eye(3), (len(z), 3, 3)), arm - _sharp() * spread], axis=1)
+    moved = np.concatenate([np.broadcast_to(np.eye(3), (len(z), 3, 3)), arm - _SHARP * spread], axis=1)
     mixed = np.einsum("mki,mli->mkl", moved, at.tangents)
     found = mixed @ _inverse(at.bend) @ mixed.transpose(0, 2, 1)
-    own = np.einsum("mki,mli->mkl", turning, arm) - _sharp() * np.einsum("mki,mli->mkl", turning, spread)
+    own = np.einsum("mki,mli->mkl", turning, arm) - _SHARP * np.einsum("mki,mli->mkl", turning, spread)
     columns, rows = np.triu_indices(n + 3)  # lower triangle, column by column
     inner = columns >= 3
     values = found[:, rows, columns]
@@ -213,7 +206,7 @@ def _relative(one: Array, two: Array) -> tuple[Array, Array]:
     return b.transpose(0, 2, 1) @ a, np.einsum("mji,mj->mi", b, one[:, 9:] - two[:, 9:])
 
 
-def _of_pairs(shapes: Shapes, at: Placed, spot: Index, pair: Index) -> tuple[Array, Array]:
+def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Array]:
     one, other = shapes.pairs[pair].T
     first = at.joints[spot, one]
     second = at.joints[spot, np.maximum(other, 0)].copy()
@@ -223,7 +216,7 @@ def _of_pairs(shapes: Shapes, at: Placed, spot: Index, pair: Index) -> tuple[Arr
 
 
 def look(
-    shapes: Shapes, at: Placed, within: float, ways: Array, wanted: NDArray[np.bool_], gaps: Array
+    shapes: Any, at: Any, within: float, ways: Array, wanted: NDArray[np.bool_], gaps: Array
 ) -> tuple[Index, Index]:
     """As `Shapes.look`: writes gaps and ways, returns what is near."""
     spot, pair = (a.ravel() for a in np.indices(gaps.shape))
@@ -259,7 +252,7 @@ def look(
 
 
 def may_meet(
-    shapes: Shapes, one: tuple[Placed, Looked], two: tuple[Placed, Looked], wanted: NDArray[np.bool_]
+    shapes: Any, one: tuple[Any, Any], two: tuple[Any, Any], wanted: NDArray[np.bool_]
 ) -> tuple[Index, Index]:
     """As `Shapes.may_meet`."""
     before, after = one[1].gaps, two[1].gaps

@@ -75,7 +75,7 @@ class Margins:
         self.wanted = np.where(own, self.own.enabled, self.world.enabled)
         self.pieces = np.where(own, self.own.margin, self.world.margin)
         ways = np.zeros((1, len(shapes), 3))
-        found = shapes.look(shapes.placed(self._start), self.most / OF_START, ways, self.wanted)
+        found = shapes.look(self.bodies.placed(self._start), self.most / OF_START, ways, self.wanted)
         least = np.where(found.gap > 0, OF_START * found.gap, found.gap - SLIP)
         self.pieces[found.pair] = np.minimum(self.pieces[found.pair], least)
 
@@ -203,7 +203,7 @@ class Watch:
         c, ny = self._t.coordinates, self._t.builder.ny
         z = (self._lift @ x + self._const).reshape(len(self._names), -1)
         q = np.array([c.join(part[:ny], part[ny:]) for part in z])
-        return self._shapes.placed(Places.of(self._t.robot, q, self._travel, self._phase))
+        return self._margins.bodies.placed(Places.of(self._t.robot, q, self._travel, self._phase))
 
     def _shapes_at(self, at: Placed, ways: Array, within: float = ENTERS) -> tuple[Placed, Looked]:
         return at, self._shapes.look(at, within, ways, self._margins.wanted)

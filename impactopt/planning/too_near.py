@@ -95,7 +95,7 @@ def _near(margins: Margins, at: Places, share: float) -> list[tuple[int, Pair, f
     """Instants and pairs that give up more than a share of their margin, and how far they are apart [m]."""
     bodies, shapes, out = margins.bodies, margins.bodies.shapes, list[tuple[int, Pair, float]]()
     ways = np.zeros((len(at), len(shapes), 3))
-    found = shapes.look(shapes.placed(at), margins.most + THIN, ways, margins.wanted)
+    found = shapes.look(bodies.placed(at), margins.most + THIN, ways, margins.wanted)
     seen = {
         (k, tuple(pair))
         for k, pair in zip(found.spot.tolist(), shapes.pairs[found.pair].tolist(), strict=True)
@@ -114,7 +114,7 @@ class _Asked:
         self._t, self._spots, self._margins, self.rows = t, spots, margins, Rows()
         shapes = margins.bodies.shapes
         ways = np.zeros((len(spots.names), len(shapes), 3))
-        self._gaps = shapes.look(shapes.placed(spots.at), np.inf, ways, margins.wanted).gaps
+        self._gaps = shapes.look(margins.bodies.placed(spots.at), np.inf, ways, margins.wanted).gaps
 
     def more(self, beside: Sequence[int], pair: Pair, apart: float) -> None:
         """Of two bodies at these places, what is missing between them [m]."""

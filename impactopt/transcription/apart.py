@@ -24,7 +24,7 @@ from impactopt.robots.robot import Robot
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, stack
-from impactopt.transcription.rows import Place, Row, millimetres
+from impactopt.transcription.rows import Index, Place, Row, millimetres
 
 TOO_NEAR = millimetres("too near")
 
@@ -58,7 +58,7 @@ class Chain:
         """Thousands of constraints have the same."""
         return np.concatenate([*map(_placement, self.places), self.turns])
 
-    def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Array, Array, Array]:
+    def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Index, Index, Array]:
         """z of a constraint's function, sums of coordinates: slots, coordinates (y, then legs) and factors,
         (k,) each.
 
@@ -303,17 +303,15 @@ def add_apart_rows(
 
 def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
     """A matrix (n, n) with room, as zeros, for what the coordinates and legs of any place couple."""
-    n = matrix.shape[0]
-    parts = [sp.coo_array(matrix)]
+    own = sp.coo_array(matrix)
+    rows, columns, values = [own.coords[0]], [own.coords[1]], [own.data]
     for _, slots in spots:
-        columns = np.unique(stack(slots).cols)
-        row, column = (a.ravel() for a in np.meshgrid(columns, columns))
-        parts.append(sp.coo_array((np.zeros(len(row)), (row, column)), shape=(n, n)))
-    row, column, values = (
-        np.concatenate([get(p) for p in parts])
-        for get in (lambda p: p.coords[0], lambda p: p.coords[1], lambda p: p.data)
-    )
-    return sp.csc_array(sp.coo_array((values, (row, column)), shape=(n, n)))
+        touched = np.unique(stack(slots).cols)
+        rows.append(np.repeat(touched, len(touched)))
+        columns.append(np.tile(touched, len(touched)))
+        values.append(np.zeros(len(touched) ** 2))
+    at = np.concatenate(rows), np.concatenate(columns)
+    return sp.csc_array(sp.coo_array((np.concatenate(values), at), shape=matrix.shape))
 
 
 def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
@@ -338,7 +336,7 @@ class _Known(NamedTuple):
     """What all constraints of two bodies share."""
 
     chain: Chain
-    pattern: tuple[Array, Array, Array]
+    pattern: tuple[Index, Index, Array]
     name: str
 
 
@@ -352,6 +350,6 @@ class _Group:
     pairs: list[int] = field(default_factory=list)
     ways: list[tuple[float, ...]] = field(default_factory=list)
     origins: list[Row] = field(default_factory=list)
-    patterns: list[tuple[Array, Array, Array]] = field(default_factory=list)
+    patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
     spots: list[int] = field(default_factory=list)
     numbers: list[Array] = field(default_factory=list)

@@ -44,7 +44,7 @@ class Scripted(Budget):
         barrier = given[0] if given else None
         self.asked.append({"given": result, "from": barrier})
         return SolverResult(
-            x=start if result is None else result.x,
+            x=start.x if isinstance(start, SolverResult) else start,
             multipliers=np.arange(1.0, program.m + 1),
             bound_multipliers=np.ones(program.n),
             objective=0.0,

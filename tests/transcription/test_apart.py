@@ -236,7 +236,7 @@ def test_constraints_are_met_at_the_start(biped_transcription: Transcription) ->
     rows = Watch(t, margins, x).rows()
     assert any(row[1:3] == pair for row in rows)
     shapes = margins.bodies.shapes
-    gaps = shapes.look(shapes.placed(at), 1.0, np.zeros((1, len(shapes), 3)), margins.wanted).gaps[0]
+    gaps = shapes.look(margins.bodies.placed(at), 1.0, np.zeros((1, len(shapes), 3)), margins.wanted).gaps[0]
     for row, held in rows.items():
         assert gaps[shapes.index[row[1:]]] > held.reach, row
 

@@ -36,12 +36,13 @@ from impactopt.bodies.world import WorldBody
 from impactopt.codegen.directory import kept
 from impactopt.codegen.library import address, native_library
 
-__all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "thinned"]
+__all__ = ["ROUNDING", "THIN", "Looked", "Placed", "Separations", "Shapes", "packed", "thinned"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 THIN = 1e-3  # [m] by which vertices left out are outside of the hull of the others, at most
 _FEW = 12  # vertices of which none is left out
+_EIGHT = 8  # vertices at once
 _SIDE = 33  # numbers that the C code keeps of a pair
 
 
@@ -81,7 +82,8 @@ class Shapes:
     number (P,) : of the two pieces among those of the same pair of bodies.
     between (P,) : joints between the two.
     radius (P,) [m] : of the second beside its vertices: a capsule's or a sphere's.
-    points (k, 3) [m] : vertices of all.  hulls (P, 4) : first vertex and number of vertices of both.
+    points (k, 3) [m], blocks (k / 8, 3, 8) : vertices of all, as of `packed`.  hulls (P, 4) : first vertex
+        and number of vertices of both.
     """
 
     def __init__(
@@ -94,15 +96,12 @@ class Shapes:
         """pairs_of_links : of two joints, with their pairs of pieces.  pairs_with_world : joint and number
         of a body of the world.
         """
-        points, where, size = list[Array](), dict[Any, tuple[int, int]](), 0
         corners = [_corners(body.half) for body in world]
         own = {id(piece): thinned(piece.vertices) for piece in links.pieces}
-        for key, vertices in [*own.items(), *enumerate(corners)]:
-            where[key if key in own else ("world", key)] = size, len(vertices)
-            points.append(vertices)
-            size += len(vertices)
-        self.points = np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *points]))
-        self._room = np.zeros(max((len(p) for p in points), default=1))
+        self.points, self.blocks, places = packed([*own.values(), *corners])
+        names: list[Any] = [*own, *(("world", w) for w in range(len(corners)))]
+        where = dict(zip(names, places, strict=True))
+        self.room = np.zeros(self.points.shape[0] + 1)
         pairs, number, hulls, balls, radius = [], [], [], [], []
         for (a, b), pieces in pairs_of_links.items():
             for k, (one, two) in enumerate(pieces):
@@ -147,10 +146,10 @@ class Shapes:
         arrays = (at.joints, at.world, self.pairs, self._balls, self.hulls, self.radius, at.present, chosen)
         n = library.look(
             *counts,
-            *map(address, (*arrays, self.points)),
+            *map(address, (*arrays, self.blocks)),
             ctypes.c_double(1 / ROUNDING),
             ctypes.c_double(within),
-            *map(address, (ways, gaps, self._room)),
+            *map(address, (ways, gaps, self.room)),
             ctypes.c_int64(len(near)),
             address(near),
         )
@@ -187,7 +186,7 @@ class Separations:
         self._shapes, self._pairs, self.joints, self.count = shapes, pairs, joints, len(pairs)
         self.numbers, self.ways = np.ascontiguousarray(numbers), np.ascontiguousarray(ways, dtype=float)
         self._hulls = np.ascontiguousarray(shapes.hulls[pairs])
-        self._known, self._room = np.zeros((self.count, _SIDE)), shapes._room
+        self._known, self._room = np.zeros((self.count, _SIDE)), shapes.room
         self.forget()
 
     def copy(self) -> Separations:
@@ -212,12 +211,26 @@ class Separations:
         library.separation(
             ctypes.c_int64(self.count),
             ctypes.c_int64(self.joints),
-            *map(address, (z, self.numbers, self._hulls, self._shapes.points)),
+            *map(address, (z, self.numbers, self._hulls, self._shapes.blocks)),
             ctypes.c_double(1 / ROUNDING),
             *map(address, (self.ways, self._known, self._seen, self._room)),
             ctypes.c_int64(what),
             *map(address, (by, out)),
         )
+
+
+def packed(hulls: Sequence[Array]) -> tuple[Array, Array, list[tuple[int, int]]]:
+    """Vertices of all hulls one after the other (k, 3), each filled up to a multiple of eight; the same eight
+    by eight, with coordinates of a kind side by side (k / 8, 3, 8); first vertex and number of each hull.
+    """
+    parts, where, size = [np.zeros((0, 3))], list[tuple[int, int]](), 0
+    for vertices in hulls:
+        where.append((size, len(vertices)))
+        more = -len(vertices) % _EIGHT
+        parts += [vertices, np.repeat(vertices[-1:], more, axis=0)]
+        size += len(vertices) + more
+    points = np.concatenate(parts)
+    return points, np.ascontiguousarray(points.reshape(-1, _EIGHT, 3).transpose(0, 2, 1)), where
 
 
 def thinned(vertices: Array) -> Array:

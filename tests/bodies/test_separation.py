@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from impactopt.bodies import separation
 from impactopt.bodies.pieces import convex
-from impactopt.bodies.separation import ROUNDING, THIN, Separations, thinned
+from impactopt.bodies.separation import ROUNDING, THIN, Separations, packed, thinned
 
 Array = NDArray[np.float64]
 N = 3  # joints of chains
@@ -25,9 +25,9 @@ class Two:
 
     def __init__(self, one: Array, two: Array) -> None:
         self.one, self.two = one, two
-        self.points = np.concatenate([one, two])
-        self.hulls = np.array([[0, len(one), len(one), len(two)]], dtype=np.int64)
-        self._room = np.zeros(len(self.points))
+        self.points, self.blocks, where = packed([one, two])
+        self.hulls = np.array([[*where[0], *where[1]]], dtype=np.int64)
+        self.room = np.zeros(len(self.points))
 
     def pair(self, turn: Array, shift: Array, way: Array | None = None, chain: Any = None) -> Separations:
         """The first so turned and shifted; chain : N placements before, and which joints turn."""

@@ -10,31 +10,46 @@
 /* of one direction: rounded support, mean and covariance of the points that carry it */
 typedef struct { double h, mean[3], cov[6]; } Support;
 
-/* of points (n, 3) in direction u; sharp: 1 / rounding */
+/* Vertices stand in blocks of EIGHT: their x, their y, their z; the last block is filled up with copies. */
+#define EIGHT 8
+#define BLOCK (3 * EIGHT)
+#define COORDINATE(p, i, k) (p)[BLOCK * ((i) / EIGHT) + EIGHT * (k) + (i) % EIGHT]
+
+/* The largest of n vertices' heights in direction u; all of them in far. */
+static inline double heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
+    double most[EIGHT], top;
+    const double x = u[0], y = u[1], z = u[2];
+    for (int j = 0; j < EIGHT; ++j) most[j] = -1e300;
+    for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT)
+        for (int j = 0; j < EIGHT; ++j) {
+            const double f = p[j] * x + p[EIGHT + j] * y + p[2 * EIGHT + j] * z;
+            far[j] = f;
+            most[j] = f > most[j] ? f : most[j];
+        }
+    top = most[0];
+    for (int j = 1; j < EIGHT; ++j) top = most[j] > top ? most[j] : top;
+    return top;
+}
+
+/* of n vertices in direction u; sharp: 1 / rounding */
 static void support(int64_t n, const double *restrict p, const double *u, double sharp, double *restrict far,
                     Support *out) {
-    double most = -1e300, sum = 0.0, m0 = 0, m1 = 0, m2 = 0;
-    for (int64_t i = 0; i < n; ++i) {
-        double f = p[3 * i] * u[0] + p[3 * i + 1] * u[1] + p[3 * i + 2] * u[2];
-        far[i] = f;
-        if (f > most) most = f;
-    }
-    double c[6] = {0};
-    const double least = most - FAR_DOWN / sharp;
+    const double most = heights(n, p, u, far), least = most - FAR_DOWN / sharp;
+    double sum = 0.0, m0 = 0, m1 = 0, m2 = 0, c[6] = {0};
     int64_t top = 0;
-    for (int64_t i = 0; i < n; ++i) if (far[i] == most) { top = i; break; }
-    const double *o = p + 3 * top;
+    while (top < n - 1 && far[top] != most) ++top;
+    const double ox = COORDINATE(p, top, 0), oy = COORDINATE(p, top, 1), oz = COORDINATE(p, top, 2);
     for (int64_t i = 0; i < n; ++i) {
         if (far[i] < least) continue;
         double e = exp(sharp * (far[i] - most));
-        double x = p[3 * i] - o[0], y = p[3 * i + 1] - o[1], z = p[3 * i + 2] - o[2];
+        double x = COORDINATE(p, i, 0) - ox, y = COORDINATE(p, i, 1) - oy, z = COORDINATE(p, i, 2) - oz;
         sum += e; m0 += e * x; m1 += e * y; m2 += e * z;
         c[0] += e * x * x; c[1] += e * x * y; c[2] += e * x * z;
         c[3] += e * y * y; c[4] += e * y * z; c[5] += e * z * z;
     }
     m0 /= sum; m1 /= sum; m2 /= sum;
     out->h = most + log(sum) / sharp;
-    out->mean[0] = o[0] + m0; out->mean[1] = o[1] + m1; out->mean[2] = o[2] + m2;
+    out->mean[0] = ox + m0; out->mean[1] = oy + m1; out->mean[2] = oz + m2;
     out->cov[0] = c[0] / sum - m0 * m0; out->cov[1] = c[1] / sum - m0 * m1; out->cov[2] = c[2] / sum - m0 * m2;
     out->cov[3] = c[3] / sum - m1 * m1; out->cov[4] = c[4] / sum - m1 * m2; out->cov[5] = c[5] / sum - m2 * m2;
 }
@@ -173,7 +188,7 @@ static void chain(int64_t n, const double *z, const double *p, double *R, double
 
 /* Separations less reach of count pairs, whose chains have n joints.
  * z (count, n + 3); p (count, 13 n + 13): chain, then reach.  hulls (count, 4): first point and number of points of
- * both; points (k, 3).  u (count, 3): directions to begin at, moved where derivatives are asked for.
+ * both, firsts multiples of EIGHT; points: blocks.  u (count, 3): directions to begin at, moved where derivatives are asked for.
  * known (count, SIDE), seen (count, n + 3): what was found last, and at which z.  far: room for the largest hull.
  * what 0: values (count,); 1: gradients (count, n + 3); 2: lam times Hessians, lower triangles by columns. */
 EXPORT void separation(int64_t count, int64_t n, const double *z, const double *p, const int64_t *hulls,
@@ -252,14 +267,6 @@ static void relative(const double *a, const double *b, double *R) {
         R[9 + i] = b[i] * d[0] + b[3 + i] * d[1] + b[6 + i] * d[2];
     }
 }
-static double plain(int64_t n, const double *restrict p, const double *u) {
-    double most = -1e300;
-    for (int64_t i = 0; i < n; ++i) {
-        double f = p[3 * i] * u[0] + p[3 * i + 1] * u[1] + p[3 * i + 2] * u[2];
-        if (f > most) most = f;
-    }
-    return most;
-}
 EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints, const double *world,
                     const int64_t *pairs, const double *balls, const int64_t *hulls, const double *extra,
                     const uint8_t *present, const uint8_t *wanted, const double *points, double sharp, double within, double *ways,
@@ -304,7 +311,7 @@ EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *jo
         const int64_t *h = hulls + 4 * i;
         double down[3] = {-u[0], -u[1], -u[2]}, local[3];
         times_t(R, down, local);
-        double rough = dot(u, R + 9) - plain(h[1], points + 3 * h[0], local) - plain(h[3], points + 3 * h[2], u) - extra[i];
+        double rough = dot(u, R + 9) - heights(h[1], points + 3 * h[0], local, far) - heights(h[3], points + 3 * h[2], u, far) - extra[i];
         rough -= 10.0 / sharp;
         if (rough > within) { *gap = rough; continue; }
         Side at;

@@ -305,6 +305,12 @@ class Bodies:
         here, there = self._transform(at, k, a), self._transform(at, k, b)
         return min(distance(one.shape, here, two.shape, there) for one, two in self._pieces(pair))
 
+    def exact_piece(self, at: Places, k: int, number: int) -> float:
+        """Distance [m] at instant k of a pair of pieces, by its number in `shapes`."""
+        (a, b), n = self.shapes.pairs[number].tolist(), int(self.shapes.number[number])
+        one, two = self._pieces((a, b))[n]
+        return distance(one.shape, self._transform(at, k, a), two.shape, self._transform(at, k, b))
+
     def closest(self, at: Places, k: int, pair: Pair) -> Closest:
         """Where the two of a pair are nearest to each other at instant k, or deepest in each other."""
         a, b = pair

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from impactopt.bodies.clearance import Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
-from impactopt.bodies.separation import Looked, Placed
+from impactopt.bodies.separation import ROUNDING, Looked, Placed
 from impactopt.planning.multistart import Budget, one_after_the_other
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
@@ -38,6 +38,7 @@ OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no 
 SLIP = (
     2e-3  # [m] that two may come nearer where they are in each other at the start, as distances are rounded
 )
+ROUNDED = 2 * np.log(2) * ROUNDING  # [m] by which the rounded distance of two edges is less than theirs
 LEAST = 0.01  # [m] a step brings bodies without a constraint no nearer, nor
 OF_GAP = 0.5  # by more than this part of their distance
 THROUGH = (
@@ -59,7 +60,7 @@ class Margins:
 
     Attributes
     ----------
-    pieces (P,) [m] : of the pairs of pieces of `Bodies.shapes`, by their rounded distance.
+    pieces (P,) [m] : of the pairs of pieces of `Bodies.shapes`, by their rounded distance, which is less.
     wanted (P,) : whether the problem asks for it.
     """
 
@@ -73,10 +74,13 @@ class Margins:
         shapes = self.bodies.shapes
         own = shapes.pairs[:, 1] >= 0
         self.wanted = np.where(own, self.own.enabled, self.world.enabled)
-        self.pieces = np.where(own, self.own.margin, self.world.margin)
+        asked = np.where(own, self.own.margin, self.world.margin)
+        self.pieces = np.maximum(asked - ROUNDED, asked / 2)
         ways = np.zeros((1, len(shapes), 3))
         found = shapes.look(self.bodies.placed(self._start), self.most / OF_START, ways, self.wanted)
-        least = np.where(found.gap > 0, OF_START * found.gap, found.gap - SLIP)
+        exact = np.array([self.bodies.exact_piece(self._start, 0, n) for n in found.pair.tolist()])
+        least = OF_START * exact - np.minimum(exact - found.gap, ROUNDED)
+        least = np.where(found.gap > 0, np.clip(least, 0.0, found.gap / 2), found.gap - SLIP)
         self.pieces[found.pair] = np.minimum(self.pieces[found.pair], least)
 
     @property

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from impactopt.bodies.fit import Planes
 from impactopt.bodies.pieces import Piece
 from impactopt.bodies.robot_bodies import Pair, RobotBodies, bodies_of, distance, transform
+from impactopt.bodies.separation import Placed, Shapes
 from impactopt.bodies.world import BEHIND, WorldBody
 from impactopt.errors import InputError
 from impactopt.robots.robot import Robot
@@ -168,6 +169,23 @@ class Bodies:
                     continue
                 self.world_pairs.append((j, w))
 
+    @cached_property
+    def shapes(self) -> Shapes:
+        """Of all pairs that are not to touch, for smooth distances."""
+        return Shapes(self.links, self.world, self.pairs, self.world_pairs)
+
+    def placed(self, at: Places) -> Placed:
+        """Where these are at k instants, for smooth distances."""
+        k = len(at)
+        joints = np.concatenate([at.rotation.reshape(k, -1, 9), at.translation], axis=2)
+        world = np.zeros((k, len(self.world), 12))
+        present = np.zeros((k, len(self.world)), dtype=np.uint8)
+        for w, body in enumerate(self.world):
+            world[:, w, :9] = body.rotation.ravel()
+            world[:, w, 9:] = body.place + np.outer(at.travel, self.normal) * body.moves
+            present[:, w] = self.present(body, at)
+        return Placed(np.ascontiguousarray(joints), world, present)
+
     def _strikes_from_inside(self, joint: int) -> bool:
         """Whether a link's body surrounds its strikers by more than a target's core is behind the face.
 
@@ -286,6 +304,12 @@ class Bodies:
         a, b = pair
         here, there = self._transform(at, k, a), self._transform(at, k, b)
         return min(distance(one.shape, here, two.shape, there) for one, two in self._pieces(pair))
+
+    def exact_piece(self, at: Places, k: int, number: int) -> float:
+        """Distance [m] at instant k of a pair of pieces, by its number in `shapes`."""
+        (a, b), n = self.shapes.pairs[number].tolist(), int(self.shapes.number[number])
+        one, two = self._pieces((a, b))[n]
+        return distance(one.shape, self._transform(at, k, a), two.shape, self._transform(at, k, b))
 
     def closest(self, at: Places, k: int, pair: Pair) -> Closest:
         """Where the two of a pair are nearest to each other at instant k, or deepest in each other."""

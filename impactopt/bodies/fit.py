@@ -71,15 +71,6 @@ class Planes:
     offset: Array
     out: float
 
-    def with_facing(self, plane: tuple[float, ...] | None) -> Array:
-        """Normals and then offsets (4 PLANES,), with a plane (4,) in place of the one most like it."""
-        normal, offset = self.normal, self.offset
-        if plane is not None:
-            k = int((normal @ np.array(plane[:3])).argmax())
-            normal, offset = normal.copy(), offset.copy()
-            normal[k], offset[k] = plane[:3], plane[3]
-        return np.concatenate([normal.ravel(), offset])
-
 
 def fill(hull: ConvexHull, points: Array) -> Spheres:
     """Spheres that cover surface points (m, 3) [m] in a hull, and stick out of it as little as may be.

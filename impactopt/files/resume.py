@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -55,17 +54,13 @@ def _program(record: Record, problem: ImpactProblem) -> Transcription | None:
 
 
 def _apart(told: list[dict[str, Any]]) -> dict[ApartRow, Held]:
-    """Rows between bodies; those for the same two at one place are told in the order of their numbers."""
-    rows: dict[ApartRow, Held] = {}
-    count: Counter[tuple[Any, ...]] = Counter()
-    for row in told:
-        same = row["place"], row["joint"], row["other"]
-        held: dict[str, Any] = {
-            key: tuple(v) if isinstance(v := row[key], list) else v for key in Held._fields
-        }
-        rows[ApartRow(*same, count[same])] = Held(**held)
-        count[same] += 1
-    return rows
+    """Constraints between bodies."""
+    return {
+        ApartRow(*(row[key] for key in ApartRow._fields)): Held(
+            tuple(row["way"]), row["reach"], row["travel"]
+        )
+        for row in told
+    }
 
 
 def _is_of(t: Transcription, record: Record) -> bool:

@@ -1,45 +1,68 @@
-"""Rows that keep a program's bodies apart: how far, where, and how each knows its two bodies."""
+"""Constraints that keep a program's bodies apart: how far, and which it has, as they enter on the way.
+
+A program begins with those of bodies that are near at its start. Others enter at the iterate at which their
+bodies come near, before these can touch: the solver leaves the program there, gets the one with them, and
+goes on at its barrier. No step goes so far that bodies without a constraint are in each other at its end, or
+on another side of each other. So a solution's bodies are on the side of each other that they began on.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.clearance import Bodies, Closest, Near, Places
-from impactopt.bodies.fit import PLANES
+from impactopt.bodies.clearance import Bodies, Places
 from impactopt.bodies.robot_bodies import Pair
+from impactopt.bodies.separation import ROUNDING, Looked, Placed
+from impactopt.planning.multistart import Budget, one_after_the_other
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
-from impactopt.transcription.apart import ROUND, ApartRow, Held
+from impactopt.solvers.program import SolverResult
+from impactopt.solvers.sqp.run import Path
+from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.at_contact import ContactProgram
+from impactopt.transcription.layout import stack
 
 Array = NDArray[np.float64]
 Rows = dict[ApartRow, Held]
+Program = TypeVar("Program", bound=ContactProgram)
 WITHIN, AFTER = 1, 2  # phases in and after contact
-NEAR = 0.15  # [m] nearer bodies get a row
+# [m] nearer bodies get a constraint: when there are to be more of them, and what asks for more
+NEAR, ENTERS = 0.1, 0.03
+# the same of links with few joints between: they are always near, and can hardly meet
+BETWEEN, NEAR_BETWEEN, ENTERS_BETWEEN = 4, 0.03, 0.015
 OF_START = 0.25  # of how far two bodies are apart at the start: a margin is no more
-BETWEEN = 4  # joints at least between two links that get a row because they are near
-EXACT = 0.05  # [m] nearer bodies get a row that knows their hulls there
-BEAD = 0.02  # [m] radius of its sphere
-DEEP = 0.02  # [m] in each other: two bodies then get rows wherever they are nearer than
-FAR = 0.6  # this [m]
-DEEPEST = 3  # spheres of a pair
-SLIP = 2e-3  # [m] that a sphere may come nearer where it is too near at the start
-PATCH, CORNERS = 0.015, 4  # [m] of a side that may come next, and how many of its corners
+SLIP = (
+    2e-3  # [m] that two may come nearer where they are in each other at the start, as distances are rounded
+)
+ROUNDED = 2 * np.log(2) * ROUNDING  # [m] by which the rounded distance of two edges is less than theirs
+LEAST = 0.01  # [m] a step brings bodies without a constraint no nearer, nor
+OF_GAP = 0.5  # by more than this part of their distance
+THROUGH = (
+    5e-3  # [m] in each other on the way, bodies that are apart before and after a step are on other sides
+)
+_HALVED = 8  # times at most that a step is
+_TIMES = 25  # that constraints enter in one solve, at most
 
 
 def same_bodies(one: ImpactProblem, other: ImpactProblem) -> bool:
-    """Whether rows between bodies mean the same in two problems."""
+    """Whether constraints between bodies mean the same in two problems."""
     if not (one.keeps_apart and other.keeps_apart) or one.robot is not other.robot:
         return False
     return [body.name for body in one.bodies.world] == [body.name for body in other.bodies.world]
 
 
 class Margins:
-    """How far each pair of a problem's bodies is to be apart [m]."""
+    """How far each pair of a problem's bodies is to be apart [m].
+
+    Attributes
+    ----------
+    pieces (P,) [m] : of the pairs of pieces of `Bodies.shapes`, by their rounded distance, which is less.
+    wanted (P,) : whether the problem asks for it.
+    """
 
     def __init__(self, problem: ImpactProblem) -> None:
         self.bodies: Bodies = problem.bodies
@@ -48,6 +71,17 @@ class Margins:
             problem.robot, problem.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp)
         )
         self._least: dict[Pair, float] = {}
+        shapes = self.bodies.shapes
+        own = shapes.pairs[:, 1] >= 0
+        self.wanted = np.where(own, self.own.enabled, self.world.enabled)
+        asked = np.where(own, self.own.margin, self.world.margin)
+        self.pieces = np.maximum(asked - ROUNDED, asked / 2)
+        ways = np.zeros((1, len(shapes), 3))
+        found = shapes.look(self.bodies.placed(self._start), self.most / OF_START, ways, self.wanted)
+        exact = np.array([self.bodies.exact_piece(self._start, 0, n) for n in found.pair.tolist()])
+        least = OF_START * exact - np.minimum(exact - found.gap, ROUNDED)
+        least = np.where(found.gap > 0, np.clip(least, 0.0, found.gap / 2), found.gap - SLIP)
+        self.pieces[found.pair] = np.minimum(self.pieces[found.pair], least)
 
     @property
     def most(self) -> float:
@@ -64,80 +98,6 @@ class Margins:
             start = self.bodies.exact(self._start, 0, pair)
             self._least[pair] = min(self.term(pair).margin, max(OF_START * start, 0.0))
         return self._least[pair]
-
-    def reach(self, sphere: int, pair: Pair) -> float:
-        """Radius and margin [m] of a sphere of a link: less where it would be too near at the start, as
-        spheres and planes are about bodies that are nearer to each other than their hulls.
-        """
-        gap = self._gaps.get((sphere, pair), FAR)
-        margin = min(self.of(pair), OF_START * gap if gap > 0 else gap - SLIP)
-        return float(self.bodies.links.radius[sphere]) + margin
-
-    @cached_property
-    def _gaps(self) -> dict[tuple[int, Pair], float]:
-        """[m] at the start, by spheres and planes."""
-        bodies, near = self.bodies, self.bodies.near(self._start, FAR)
-        of_all = zip(near.sphere, near.joint, near.other, near.gap, strict=True)
-        return {(int(s), bodies.known(int(j), int(o))): float(gap) for s, j, o, gap in of_all}
-
-    def held(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> Held:
-        """A row that knows what it keeps apart exactly as it is at instant k, where the two are nearest.
-
-        Of the one link it takes a small sphere that touches its surface there, of the other body the plane
-        that does.  more [m] : than the margin.
-        """
-        return self._held(at, k, pair, self.bodies.closest(at, k, pair), more)
-
-    def held_sphere(self, at: Places, k: int, sphere: int, pair: Pair) -> Held:
-        """A row for a sphere of a link and the planes about the other body, at instant k."""
-        centre = tuple(self.bodies.links.centre[sphere].tolist())
-        return Held(centre, self.reach(sphere, pair), None, float(at.travel[k]))
-
-    def _held(self, at: Places, k: int, pair: Pair, found: Closest, more: float) -> Held:
-        travel, away = float(at.travel[k]), -found.normal  # from the other to the one
-        (turn, shift), (facing, place) = (self.bodies.placement(at, k, body) for body in pair)
-        centre = turn.T @ (found.one + BEAD * away - shift)
-        normal, point = facing.T @ away, facing.T @ (found.other - place)
-        plane = (*normal.tolist(), float(normal @ point))
-        return Held(tuple(centre.tolist()), BEAD + self.of(pair) + more, plane, travel)
-
-    def held_around(self, at: Places, k: int, pair: Pair, more: float = 0.0) -> list[Held]:
-        """As :meth:`held`, and corners of the one link around, which come next where two flat sides slide or
-        turn.
-        """
-        found = self.bodies.closest(at, k, pair)
-        first = self._held(at, k, pair, found, more)
-        assert first.facing is not None
-        turn, _ = self.bodies.placement(at, k, pair[0])
-        facing, _ = self.bodies.placement(at, k, pair[1])
-        away = turn.T @ (facing @ np.array(first.facing[:3]))
-        corners = np.concatenate([piece.vertices for piece in found.pieces])
-        height = corners @ away
-        lowest = corners[height < height.min() + PATCH]
-        chosen: list[Array] = [np.array(first.centre) - BEAD * away]
-        while len(chosen) <= CORNERS:
-            apart = np.min([np.linalg.norm(lowest - c, axis=1) for c in chosen], axis=0)
-            if apart.max() < PATCH:
-                break
-            chosen.append(lowest[int(apart.argmax())])
-        reach = self.of(pair) + more
-        return [first, *(first._replace(centre=tuple(c.tolist()), reach=reach) for c in chosen[1:])]
-
-    def sharp(self, at: Places, k: int, pair: Pair, held: Held) -> Held:
-        """The same row, asking for what its rounding hides at instant k besides."""
-        turn, shift = self.bodies.placement(at, k, pair[0])
-        facing, place = self.bodies.placement(at, k, pair[1])
-        normal, offset = np.split(self.bodies.planes(pair[1]).with_facing(held.facing), [3 * PLANES])
-        far = normal.reshape(-1, 3) @ (facing.T @ (turn @ np.array(held.centre) + shift - place)) - offset
-        return held._replace(reach=held.reach + rounded_most(far) - float(far.max()))
-
-
-def rounded_most(far: Array) -> float:
-    """The largest of lengths (a power of two of them) [m], rounded as rows have it."""
-    while len(far) > 1:
-        one, two = far[::2], far[1::2]
-        far = (one + two + np.sqrt((one - two) ** 2 + ROUND**2)) / 2
-    return float(far[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,45 +118,168 @@ def spots_of(t: ContactProgram, x: Array) -> Spots:
     return Spots(names=tuple(s.name for s in states), time=time, at=Places.of(t.robot, q, travel, phase))
 
 
-def rows_near(t: ContactProgram, x: Array, margins: Margins, within: float = NEAR) -> Rows:
-    """Rows between all bodies that come near at solver variables (n,).
+class Watch:
+    """Which bodies of a program come near while it is solved, and how far a step may go.
 
-    Links with few joints between them are always near, and can hardly meet: they get rows only where they do.
+    Attributes
+    ----------
+    left : whether the last iterate that it was asked about lacks constraints.
+    path : where the solver was left there.
     """
-    spots = spots_of(t, x)
-    return _rows_of(margins, spots, margins.bodies.near(spots.at, within, BETWEEN).least())
 
+    def __init__(self, t: ContactProgram, margins: Margins, x: Array) -> None:
+        """x (n,) : where the solve starts; the target is where it is there."""
+        self._t, self._margins, self._shapes = t, margins, margins.bodies.shapes
+        spots = spots_of(t, x)
+        self._names, self._travel, self._phase = spots.names, spots.at.travel, spots.at.phase
+        slots = {place.name: parts for place, parts in [*t.swing_spots(), *t.follow_spots()]}
+        lift = stack([part for name in self._names for part in slots[name]])
+        self._lift, self._const = lift.matrix(t.layout.n), lift.const
+        shape = len(self._names), len(self._shapes)
+        self._ways, self._has = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
+        number = {name: k for k, name in enumerate(self._names)}
+        for row, held in t.apart_rows.items():
+            at = number[row.place], self._shapes.index[row[1:]]
+            self._has[at], self._ways[at] = True, held.way
+        close = self._shapes.between < BETWEEN
+        self._near = np.where(close, NEAR_BETWEEN, NEAR)
+        self._enters = np.where(close, ENTERS_BETWEEN, ENTERS)
+        self._x: Array | None = None
+        self._next: tuple[Array, Array, tuple[Placed, Looked]] | None = None
+        self._entered, self.left = 0, False
+        self.path: Path | None = None
+        self._go_to(x)
 
-def _rows_of(margins: Margins, spots: Spots, near: Near) -> Rows:
-    """A row for each that is near: of the hulls where they are, else of the sphere."""
-    out, bodies = dict[ApartRow, Held](), margins.bodies
-    for k, sphere, joint, other, gap in zip(
-        near.at, near.sphere, near.joint, near.other, near.gap, strict=True
-    ):
-        pair = bodies.known(int(joint), int(other))
-        if not margins.term(pair).enabled:
-            continue
-        if -DEEP < gap < EXACT:
-            out[ApartRow(spots.names[k], *pair)] = margins.held(spots.at, int(k), pair)
+    def rows(self, within: float = NEAR) -> Rows:
+        """Constraints for all that is near at the last iterate and has none; it has them from now on.
+
+        within [m] : how near; links with few joints between them by a part of it.
+        """
+        _, found = self._shapes_at(self._at, self._ways, within)
+        new = (found.gap < within / NEAR * self._near[found.pair]) & ~self._has[found.spot, found.pair]
+        out = Rows()
+        for k, n in zip(found.spot[new].tolist(), found.pair[new].tolist(), strict=True):
+            (joint, other), number = self._shapes.pairs[n].tolist(), int(self._shapes.number[n])
+            way, reach = self._ways[k, n].tolist(), float(self._margins.pieces[n])
+            out[ApartRow(self._names[k], joint, other, number)] = Held(
+                tuple(way), reach, float(self._travel[k])
+            )
+        self._has[found.spot, found.pair] |= new
+        self.left = False
+        return out
+
+    def leave(self, path: Path) -> None:
+        self.path = path
+
+    def lacks(self, x: Array) -> bool:
+        self._go_to(x)
+        self.left, self.path = False, None
+        if self._entered < _TIMES and self._bare(self._found[1], self._enters).any():
+            self._entered += 1
+            self.left = True
+        return self.left
+
+    def limit(self, x: Array, step: Array, most: float) -> float:
+        self._go_to(x)
+        here, length = self._found, most
+        for _ in range(_HALVED):
+            there = x + length * step
+            ways = self._ways.copy()
+            found = self._shapes_at(self._placed(there), ways)
+            if not self._too_near(here[1], found[1]) and not self._passes(x, step, length, here, found):
+                self._next = there, ways, found
+                break
+            length *= 0.5
+        return length
+
+    # ------------------------------------------------------------------ where bodies are
+    def _go_to(self, x: Array) -> None:
+        """Take over where bodies are at an iterate (n,), and on which side of each other."""
+        if self._x is not None and np.array_equal(self._x, x):
+            return
+        if self._next is not None and np.array_equal(self._next[0], x):
+            _, self._ways, self._found = self._next
         else:
-            row = ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))
-            out[row] = margins.held_sphere(spots.at, int(k), int(sphere), pair)
-    return out
+            self._found = self._shapes_at(self._placed(x), self._ways)
+        self._x, self._at, self._next = x.copy(), self._found[0], None
+
+    def _placed(self, x: Array) -> Placed:
+        c, ny = self._t.coordinates, self._t.builder.ny
+        z = (self._lift @ x + self._const).reshape(len(self._names), -1)
+        q = np.array([c.join(part[:ny], part[ny:]) for part in z])
+        return self._margins.bodies.placed(Places.of(self._t.robot, q, self._travel, self._phase))
+
+    def _shapes_at(self, at: Placed, ways: Array, within: float = ENTERS) -> tuple[Placed, Looked]:
+        return at, self._shapes.look(at, within, ways, self._margins.wanted)
+
+    # ------------------------------------------------------------------ what is too near
+    def _bare(self, found: Looked, within: Array | float) -> NDArray[np.bool_]:
+        """Which of those that are near are nearer than this [m], or than (P,), and have no constraint."""
+        least = np.broadcast_to(within, len(self._shapes))[found.pair]
+        return np.asarray(~self._has[found.spot, found.pair] & (found.gap < least))
+
+    def _too_near(self, before: Looked, found: Looked) -> bool:
+        """Whether a step's end has bodies without a constraint too near."""
+        fell = found.gap < OF_GAP * before.gaps[found.spot, found.pair]
+        return bool((fell & self._bare(found, LEAST)).any())
+
+    def _passes(
+        self, x: Array, step: Array, length: float, one: tuple[Placed, Looked], two: tuple[Placed, Looked]
+    ) -> bool:
+        """Whether bodies are apart before and after a step, but in each other half way."""
+        spot, pair = self._shapes.may_meet(one, two, self._margins.wanted)
+        if not len(spot):
+            return False
+        these = np.zeros(len(self._shapes), dtype=bool)
+        these[pair] = True
+        half = self._placed(x + 0.5 * length * step)
+        found = self._shapes.look(half, ENTERS, self._ways.copy(), these)
+        deep = np.where(self._has[spot, pair], -THROUGH, 0.0)
+        return bool((found.gaps[spot, pair] < deep).any())
 
 
-def rows_all_along(margins: Margins, spots: Spots, deep: Near) -> Rows:
-    """Rows for the spheres that go deepest into other bodies, at all places that are not far from there."""
-    out, bodies = dict[ApartRow, Held](), margins.bodies
-    worst: dict[Pair, set[int]] = {}
-    for n in np.argsort(deep.gap, kind="stable"):
-        chosen = worst.setdefault((int(deep.joint[n]), int(deep.other[n])), set())
-        if len(chosen) < DEEPEST:
-            chosen.add(int(deep.sphere[n]))
-    only = {bodies.known(*pair) for pair in worst}
-    near = bodies.near(spots.at, FAR, BETWEEN, only) if only else deep
-    for k, sphere, joint, other in zip(near.at, near.sphere, near.joint, near.other, strict=True):
-        if int(sphere) in worst.get((int(joint), int(other)), ()):
-            row = ApartRow(spots.names[k], int(joint), int(other), -1 - int(sphere))
-            pair = bodies.known(int(joint), int(other))
-            out[row] = margins.held_sphere(spots.at, int(k), int(sphere), pair)
-    return out
+def solved_apart(
+    budget: Budget,
+    margins: Margins | None,
+    t: Program,
+    start: Array | SolverResult,
+    barrier: float | None = None,
+    most: int | None = None,
+) -> tuple[Program, SolverResult]:
+    """A program with constraints for bodies that come near at its start and on the way to its solution, and
+    its result with the effort of all.
+
+    start, barrier, most : as of `Budget.run`; multipliers are those of ``t``.  margins : None: as it is.
+    """
+    if margins is None:
+        return t, budget.run(t.program, start, barrier, most)
+    watch = Watch(t, margins, start.x if isinstance(start, SolverResult) else start)
+    t, start = _with_more(t, watch, start)
+    result = budget.run(t.program, start, barrier, most, watch=watch)
+    # other solvers do not ask on the way
+    while watch.left or (not budget.interior and result.status.usable and watch.lacks(result.x)):
+        last, before, path = result, t, watch.path
+        t, start = _with_more(t, watch, last)
+        if path is not None:
+            path = replace(path, rows=_of_names(path.rows, before, t, np.nan))
+        new = budget.run(t.program, start, None, most, watch=watch, path=path)
+        result = one_after_the_other(last, new)
+    return t, result
+
+
+def _with_more(t: Program, watch: Watch, start: Array | SolverResult) -> tuple[Program, Array | SolverResult]:
+    """The program with what is near, and its start."""
+    rows = watch.rows()
+    if not rows:
+        return t, start
+    new = t.with_apart({**t.apart_rows, **rows})
+    if isinstance(start, SolverResult):
+        start = replace(start, multipliers=_of_names(start.multipliers, t, new, 0.0))
+    return new, start
+
+
+def _of_names(numbers: Array, old: ContactProgram, new: ContactProgram, other: float) -> Array:
+    """A program's rows' numbers (m,) for one with more constraints between bodies, whose are ``other``."""
+    own = len(numbers) - len(old.apart_rows)
+    known = dict(zip(old.apart_rows, numbers[own:].tolist(), strict=True))
+    return np.append(numbers[:own], [known.get(name, other) for name in new.apart_rows])

@@ -23,6 +23,7 @@ from impactopt.solvers.program import (
     worst_rows,
 )
 from impactopt.solvers.sqp import SQPOptions, solve_sqp
+from impactopt.solvers.sqp.run import Path, Watch
 from impactopt.transcription.start import carried_over
 
 if TYPE_CHECKING:
@@ -124,6 +125,11 @@ class Budget:
         )
 
     @property
+    def interior(self) -> bool:
+        """Whether the solver is the interior-point method."""
+        return self.solver == "sqp" and (self.options or {}).get("qp_solver", "interior") == "interior"
+
+    @property
     def left(self) -> float | None:
         """[s]; none where it has been stopped."""
         if self.stop.asked:
@@ -143,14 +149,16 @@ class Budget:
         start: Array | SolverResult,
         barrier: float | None = None,
         most: int | None = None,
-        leave: Callable[[Array], bool] | None = None,
+        watch: Watch | None = None,
+        *,
+        path: Path | None = None,
     ) -> SolverResult:
         """Let the solver work on a program in the time that is left.
 
         start : variables (n,); or a neighbouring program's result, whose multipliers "sqp" takes too.
         barrier : the first of "sqp" from a result, where that is not as near as it looks.
         most : iterations of "sqp", if the options do not say how many.
-        leave : of "sqp", whether variables (n,) near the optimum are enough.
+        watch, path : as of `solve_sqp`, of the interior-point method.
         """
         left, y, z = None if self.stop.asked else self.left, None, None
         if isinstance(start, SolverResult):
@@ -173,7 +181,8 @@ class Budget:
             callback=self._told,
             multipliers=y,
             bound_multipliers=z,
-            leave=leave,
+            watch=watch if self.interior else None,
+            path=path,
         )
 
 

@@ -1,22 +1,20 @@
-"""From a program's solution to one that is right between its rows too, round by round."""
+"""From a program's solution to one that is right between its nodes too, round by round."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impactopt.bodies.robot_bodies import Pair
 from impactopt.errors import InputError
 from impactopt.planning.contact_replay import AGREED, REFUTED, ContactReplay, PlannedContact, checked
-from impactopt.planning.keeping_apart import Margins, rows_near
+from impactopt.planning.keeping_apart import Margins, solved_apart
 from impactopt.planning.models import planned_contact
 from impactopt.planning.multistart import Budget, carried, one_after_the_other, touching, with_effort_of
-from impactopt.planning.too_near import Violated, missing_rows, rows_to_add
+from impactopt.planning.too_near import Violated, bodies_too_near
 from impactopt.planning.verdict import second_look
 from impactopt.solvers.program import SolverResult, Status
 from impactopt.transcription.apart import ApartRow, Held
@@ -33,11 +31,10 @@ from impactopt.transcription.start import carried_over, first_iterate
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
-_LOST = 0.08  # [m] in each other: a way out from there may lead nowhere
-_BARRIER = 1e-4  # where rows between bodies are new, which the solution before breaks
-_BARRIER_DEEP = 1e-3  # and breaks by far, or a finer contact does
+_BARRIER = 1e-4  # where constraints between bodies are new, which the solution before breaks
+_BARRIER_DEEP = 1e-3  # of a finer contact, where the one before is far off
 _STUCK = (Status.INFEASIBLE, Status.FAILED)
-_NODE_ROUNDS, _DEEP_ROUNDS = 3, 7  # at most: with a finer mesh, from the start again
+_NODE_ROUNDS = 3  # with a finer mesh, at most
 _ROUNDS, _MOST = 12, 40  # of all, and while bodies are in each other: each round brings them nearer to an end
 _ITERATIONS = 200  # from a solution, where there is another start: it goes on in a few, or hardly at all
 
@@ -52,15 +49,15 @@ class Round:
     why: str
     barrier: float | None = None
 
-    def solved(self, budget: Budget) -> SolverResult:
-        """The first result that is a solution, or the last one."""
+    def solved(self, budget: Budget, margins: Margins | None) -> tuple[Transcription, SolverResult]:
+        """The first result that is a solution, or the last one, and its program."""
         *others, last = self.starts
         for start in others:
             most = _ITERATIONS if isinstance(start, SolverResult) else None
-            new = budget.run(self.program.program, start, self.barrier, most)
+            t, new = solved_apart(budget, margins, self.program, start, self.barrier, most)
             if new.status.usable or new.status is Status.INTERRUPTED or budget.left == 0:
-                return new
-        return budget.run(self.program.program, last, self.barrier)
+                return t, new
+        return solved_apart(budget, margins, self.program, last, self.barrier)
 
 
 def start_of(finer: Transcription, t: Transcription, x0: Array) -> Array:
@@ -72,19 +69,18 @@ def more_of(nodes: int, elements: Elements | None, rows: int) -> str:
     """What is more in a program, in words."""
     words = [f"{nodes} more node{'s' if nodes > 1 else ''}"] if nodes else []
     words += [f"{sum(map(len, elements))} contact elements"] if elements is not None else []
-    words += [f"{rows} more rows between bodies"] if rows else []
-    return ", ".join(words)
+    words += [f"{rows} constraint{'s' if rows > 1 else ''} between bodies with more margin"] if rows else []
+    return ", ".join(words) or "constraints between bodies"
 
 
 class Refining:
-    """The way from a program's solution to one that is right between its rows too.
+    """The way from a program's solution to one that is right between its nodes too.
 
-    A program has rows between the bodies that come near at its start, and nodes and elements where its mesh
-    has them. Where its solution brings other bodies into each other, leaves its limits between nodes, or has
-    a contact that is too coarse, it gets more of them there and is solved again: from where it is; or, where
-    limbs are through each other, from the start.
+    Where a solution brings bodies into each other between nodes, leaves its limits there, or has a contact
+    that is too coarse, its program gets more nodes, elements or margins there and is solved again, from where
+    it is.
 
-    mesh : whether it may get finer; False: rows are added, and only while bodies are in each other.
+    mesh : whether it may get finer; False: it does where bodies are in each other only.
     """
 
     def __init__(
@@ -101,7 +97,6 @@ class Refining:
         self._known: tuple[Transcription, Array, ContactError | None] | None = None
         self._contact: tuple[Transcription, Array, PlannedContact] | None = None
         self._near: tuple[Transcription, Array, Violated | None] | None = None
-        self._tried: frozenset[Pair] = frozenset()  # pairs that were deep in each other, and had a way out
         self._refined = 0  # rounds with a finer mesh
         self._apart: tuple[Transcription, SolverResult] | None = None  # the last whose bodies are not
         self.blocked = False  # whether it ended with bodies in each other: another start may not
@@ -153,15 +148,12 @@ class Refining:
 
     def first(self, t: Transcription, start: Array | SolverResult) -> tuple[Transcription, SolverResult]:
         """The program with its first rows between bodies, and its result."""
-        if self.margins is not None:
-            warm = isinstance(start, SolverResult)
-            x0 = start.x if isinstance(start, SolverResult) else start
-            t = t.with_apart(self.given_rows if warm and self.given_rows else rows_near(t, x0, self.margins))
+        warm = isinstance(start, SolverResult)
+        if warm and self.given_rows:
+            t = t.with_apart(self.given_rows)
         if isinstance(start, SolverResult) and len(start.multipliers) != t.program.m:
-            start = start.x  # of a program with other rows
-        # bodies deep in each other ask for another program, long before this one is solved to its end
-        leave = None if isinstance(start, SolverResult) else partial(self._is_deep, t)
-        result = self.budget.run(t.program, start, leave=leave)
+            start = start.x  # of a program with other constraints
+        t, result = solved_apart(self.budget, self.margins, t, start)
         if self.margins is None:
             result = self._looked_at(t, result, start.x if isinstance(start, SolverResult) else start)
         return t, result
@@ -171,15 +163,8 @@ class Refining:
         if self.margins is None:
             return None
         if self._near is None or self._near[0] is not t or self._near[1] is not x:
-            self._near = t, x, rows_to_add(t, x, self.margins)
+            self._near = t, x, bodies_too_near(t, x, self.margins)
         return self._near[2]
-
-    def _is_deep(self, t: Transcription, x: Array) -> bool:
-        """Whether bodies are deep in each other."""
-        with contextlib.suppress(InputError):
-            violated = self._violated(t, x)
-            return violated is not None and bool(violated.deep)
-        return False
 
     def _looked_at(self, t: Transcription, result: SolverResult, x0: Array) -> SolverResult:
         """A result without a verdict with that of another solver, from the same start."""
@@ -229,23 +214,23 @@ class Refining:
         round.
         """
         found: list[tuple[Transcription, str, SolverResult]] = []
-        self._tried, self._apart = frozenset(), None
+        self._apart = None
         self._refined = 0 if self.mesh else _NODE_ROUNDS
         while result.status.usable and self.budget.left != 0:
             if self.margins is None and len(found) == _NODE_ROUNDS:
                 break
-            following = self._next(t, result, x0, len(found))
+            following = self._next(t, result, x0)
             most = _MOST if not self._is_apart(result) else _ROUNDS if self.mesh else 0
             if following is None or len(found) >= most:
                 break
             if self.report is not None:
                 self.report(following.why)
-            new = following.solved(self.budget)
+            finer, new = following.solved(self.budget, self.margins)
             if not new.status.usable:
                 break
             if following.program.layout.n != len(x0):  # more nodes or elements: the start has them too
                 x0 = start_of(following.program, t, x0)
-            t, result = following.program, one_after_the_other(result, new)
+            t, result = finer, one_after_the_other(result, new)
             found.append((t, following.name, new))
         return t, result, found
 
@@ -260,7 +245,7 @@ class Refining:
         if self.margins is None or not result.status.usable or self._is_apart(result):
             return t, self.checked(t, result)
         with contextlib.suppress(InputError):
-            left = rows_to_add(t, result.x, self.margins, share=1.0)
+            left = bodies_too_near(t, result.x, self.margins, share=1.0)
             if left is not None and left.depth > 0:
                 if self._apart is not None:
                     before, clean = self._apart
@@ -270,7 +255,7 @@ class Refining:
                 return t, touching(result, left.depth, names, "solution")
         return t, self.checked(t, result)
 
-    def _next(self, t: Transcription, old: SolverResult, x0: Array, again: int) -> Round | None:
+    def _next(self, t: Transcription, old: SolverResult, x0: Array) -> Round | None:
         """What is to be solved next; None if the solution is right."""
         shares, violated = t.hit.shares, None
         elements: Elements | None = None
@@ -280,8 +265,6 @@ class Refining:
                 violated = self._violated(t, old.x)
                 if violated is None or violated.depth <= 0:
                     self._apart = t, old
-        if violated is not None and violated.deep and again < _DEEP_ROUNDS:
-            return self._apart_again(t, old, x0, violated)
         needed = nodes = t.nodes if violated is None else violated.nodes
         if self._refined < _NODE_ROUNDS:
             with contextlib.suppress(InputError):
@@ -310,8 +293,6 @@ class Refining:
             functions = block_functions(t.problem, t.coordinates, self.report, finer_elements)
             finer = Transcription(t.problem, t.coordinates, functions, nodes, finer_elements, shares)
         if self.margins is not None:
-            if nodes != t.nodes:
-                rows = {**missing_rows(finer, carried(finer, t, old).x, self.margins), **rows}
             finer = finer.with_apart(rows)
         # an optimum whose contact was missed is none of the finer program, nor near one
         missed = false or (error is not None and error.missed)
@@ -321,7 +302,9 @@ class Refining:
             starts = (*starts, old.x, x0)
         # a contact that is far off breaks the finer program's rows by far
         far = elements is not None and error is not None and abs(error.pct) > AGREED
-        name = more_of(nodes.total - t.nodes.total, elements, len(rows) - len(t.apart_rows))
+        name = more_of(
+            nodes.total - t.nodes.total, elements, len(violated.rows) if violated is not None else 0
+        )
         return Round(
             program=finer,
             starts=starts,
@@ -329,19 +312,3 @@ class Refining:
             name=name,
             why=f"the plan is not what it says between nodes: {name}, and on from there",
         )
-
-    def _apart_again(self, t: Transcription, old: SolverResult, x0: Array, violated: Violated) -> Round:
-        """On with rows between bodies that are deep in each other: from where they are, if that may lead out
-        on the side they came in, and has not failed to, else from the start.
-        """
-        program = t.with_apart({**t.apart_rows, **violated.rows})
-        words = f"bodies are {1e3 * violated.depth:.0f} mm in each other"
-        round_of = partial(Round, program=program, name="rows between bodies")
-        warm = carried(program, t, old)
-        if violated.depth > _LOST or violated.deep & self._tried:
-            self._tried = frozenset()
-            why = f"{words}: from the start again, with rows between them"
-            return round_of(starts=(x0, warm, old.x), why=why, barrier=_BARRIER_DEEP)
-        self._tried |= violated.deep
-        why = f"{words}: on with rows between them"
-        return round_of(starts=(warm, x0, old.x), why=why, barrier=_BARRIER_DEEP)

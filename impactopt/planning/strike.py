@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,7 +16,7 @@ from impactopt.errors import InputError, check_array, did_you_mean
 from impactopt.planning.chosen_gains import roomy, settled
 from impactopt.planning.contact_replay import checked
 from impactopt.planning.gears import gear_caution
-from impactopt.planning.keeping_apart import FAR, NEAR, Margins, Rows, Spots, rows_near, spots_of
+from impactopt.planning.keeping_apart import Margins, solved_apart
 from impactopt.planning.models import carried_start, climbed, planned_contact
 from impactopt.planning.multistart import (
     Budget,
@@ -27,17 +27,15 @@ from impactopt.planning.multistart import (
     one_after_the_other,
     solve_from,
     touching,
-    with_effort_of,
 )
 from impactopt.planning.on_demand import kept_on_demand, rows_on_demand, with_rows
 from impactopt.planning.side_by_side import best_side_by_side, check_workers
 from impactopt.planning.solution import Solved, blow_numbers, versions
-from impactopt.planning.too_near import missing_rows
+from impactopt.planning.too_near import deepest
 from impactopt.planning.verdict import with_reason
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import GearLoad
 from impactopt.solvers.program import Callback, SolverResult, Status
-from impactopt.transcription.apart import ApartRow, Held
 from impactopt.transcription.mesh import contact_elements
 from impactopt.transcription.planned_strike import PlannedStrike
 from impactopt.transcription.start import strike_iterate
@@ -45,17 +43,10 @@ from impactopt.transcription.strike import ShootingStrike, StrikeTranscription
 from impactopt.transcription.transcription import block_functions
 
 Array = NDArray[np.float64]
-ROUNDS = 10  # of more rows between bodies
-AGAIN = 3  # from the start, with all rows that are known by then
+ROUNDS = 10  # of freezes that come when they are to
 # first barriers: of an arm's start, which ends sooner and more surely from there (humanoids do not); and of a
-# solve that goes on with rows which its start breaks, as bodies are in each other there, or only too near
-BARRIER_ARM, BARRIER_DEEP, BARRIER_NEAR = 0.03, 1e-2, 1e-3
-# where bodies were in each other they are to be apart first: the optimum of those rows is seldom the last
-ROUGHLY = {"kkt_tolerance": 1e-2, "complementarity_tolerance": 1e-3}
-ROUGHLY_LEARNED = {
-    "kkt_tolerance": 0.1,
-    "violation_tolerance": 1e-3,
-}  # of quasi-Newton steps, which end slowly
+# solve that goes on with other rows
+BARRIER_ARM, BARRIER_ON = 0.03, 1e-2
 _STUCK = (Status.FAILED, Status.INFEASIBLE, Status.ITERATION_LIMIT)
 Work = Callable[[StrikeTranscription, Array | SolverResult], tuple[StrikeTranscription, SolverResult]]
 METHODS = {"collocation": StrikeTranscription, "shooting": ShootingStrike}
@@ -242,111 +233,37 @@ def _of_shooting(solver: str, options: Mapping[str, Any] | None) -> dict[str, An
 
 
 def clear_strike(
-    budget: Budget,
-    margins: Margins | None,
-    t: StrikeTranscription,
-    start: Array | SolverResult,
-    known: dict[ApartRow, Held] | None = None,
+    budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
-    """A strike whose bodies keep apart: with rows between those that come near, more of them where they do
-    not, and on from there; its result has the effort of all.
+    """A strike whose bodies keep apart; its result has the effort of all.
 
     start : variables (n,); or a result of this program but for other rows, such as those on demand: then it
         goes on from there, and begins anew only where that leads nowhere.
     """
     x0 = start.x if isinstance(start, SolverResult) else start
     goes_on = isinstance(start, SolverResult) and len(start.multipliers) == t.program.m
-    if _interior(budget) and not t.coordinates.soles:
+    if budget.interior and not t.coordinates.soles:
         budget = replace(budget, options={"barrier": BARRIER_ARM, **(budget.options or {})})
-    if margins is None:
-        return _settled(budget, t, budget.run(t.program, start if goes_on else x0, BARRIER_DEEP))
-    known, before = {} if known is None else known, list[SolverResult]()
-    # few rows are sooner met, and cost less; where they lead nowhere, all at once
-    for within in (None, NEAR, FAR) if goes_on and not known else (NEAR, FAR):
-        if within is None:
-            found, result = _round_by_round(budget, margins, t, start, known)
-        else:
-            first = t.with_apart({**rows_near(t, x0, margins, within), **known})
-            found, result = _round_by_round(budget, margins, first, x0, known)
-        result = one_after_the_other(before.pop(), result) if before else result
-        if result.status not in _STUCK or budget.left == 0:
-            break
-        before.append(result)
+    found, result = solved_apart(budget, margins, t, start if goes_on else x0, BARRIER_ON)
+    found, result = _settled(budget, margins, found, result)
+    if goes_on and result.status in _STUCK and budget.left != 0:
+        before = result
+        found, result = _settled(budget, margins, *solved_apart(budget, margins, t.with_apart({}), x0))
+        result = one_after_the_other(before, result)
     return found, result
-
-
-def _round_by_round(
-    budget: Budget, margins: Margins, t: StrikeTranscription, start: Array | SolverResult, known: Rows
-) -> tuple[StrikeTranscription, SolverResult]:
-    """A program with its first rows between bodies, and then with those that its solutions lack, which
-    ``known`` gets too.
-
-    The interior-point method and quasi-Newton steps go a part of the way only, as long as there will be more
-    rows.
-    """
-    partly = _interior(budget) or _learns(budget)
-    first = (_roughly(budget) if partly else budget).run(t.program, start, BARRIER_DEEP)
-    t, result = _settled(budget, t, first)
-    exact = None if partly else (t, result)  # the last one that is solved to its end; others lead there
-    for again in reversed(range(ROUNDS)):
-        rough = exact is None or result is not exact[1]
-        if not result.status.usable or (budget.left == 0 and not rough):
-            break
-        spots = spots_of(t, result.x)
-        more = missing_rows(t, result.x, margins, all_along=True, spots=spots)
-        if not more and not rough:
-            break
-        deep = bool(more) and _depth(spots, margins, more) > 0
-        known |= more
-        finer = t.with_apart({**t.apart_rows, **more}) if more else t
-        roughly = partly and deep and again > 0
-        solving = _roughly(budget) if roughly else budget
-        new = solving.run(finer.program, carried(finer, t, result), BARRIER_DEEP if deep else BARRIER_NEAR)
-        if partly and new.status in _STUCK and budget.left != 0:  # from there, but without multipliers
-            roughly, new = False, one_after_the_other(new, budget.run(finer.program, result.x))
-        steps, t, result = new.iterations, finer, one_after_the_other(result, new)
-        if new.status is Status.INTERRUPTED:
-            break
-        if not new.status.usable:  # what is too near stays so
-            return (t, result) if exact is None else (exact[0], with_effort_of(exact[1], result))
-        if not roughly:
-            exact = t, result
-            if not steps:
-                break  # new rows are met, as they are rounded: the next ones would be the same
-    return t, result
-
-
-def _interior(budget: Budget) -> bool:
-    """Whether the solver is the interior-point method."""
-    return budget.solver == "sqp" and (budget.options or {}).get("qp_solver", "interior") == "interior"
-
-
-def _learns(budget: Budget) -> bool:
-    """Whether steps are quasi-Newton's, as by shooting."""
-    return (budget.options or {}).get("hessian") == "bfgs"
 
 
 def _clean_strike(
     budget: Budget, margins: Margins | None, t: StrikeTranscription, start: Array | SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """As `clear_strike`; what still has bodies in each other is no solution."""
-    free, known, before = t, dict[ApartRow, Held](), list[SolverResult]()
-    for _ in range(AGAIN):
-        t, result = clear_strike(budget, margins, free, start, known)
-        result = one_after_the_other(before.pop(), result) if before else result
-        if margins is None or not result.status.usable:
-            return t, result
-        spots = spots_of(t, result.x)
-        left = missing_rows(t, result.x, margins, all_along=True, spots=spots)
-        depth = _depth(spots, margins, left)
-        if depth <= 0:
-            return t, result
-        known |= left
-        before.append(result)
-        if budget.left == 0:
-            break
-    assert margins is not None
-    names = (" and ".join(margins.bodies.names(row[1:3])) for row in left)
+    t, result = clear_strike(budget, margins, t, start)
+    if margins is None or not result.status.usable:
+        return t, result
+    depth, pairs = deepest(t, result.x, margins)
+    if depth <= 0:
+        return t, result
+    names = (" and ".join(margins.bodies.names(pair)) for pair in pairs)
     return t, touching(result, depth, names, "strike")
 
 
@@ -358,20 +275,8 @@ def _bounded_strike(
     return kept_on_demand(found, result, (t, start), work, lambda *_: (), report)
 
 
-def _roughly(budget: Budget) -> Budget:
-    """The same, content with what is nearly solved."""
-    given, rough = budget.options or {}, ROUGHLY_LEARNED if _learns(budget) else ROUGHLY
-    return replace(budget, options={**given, **{k: max(v, given.get(k, 0.0)) for k, v in rough.items()}})
-
-
-def _depth(spots: Spots, margins: Margins, rows: Iterable[ApartRow]) -> float:
-    """[m] that any two of these bodies are in each other."""
-    places = ((spots.names.index(row.place), (row.joint, row.other)) for row in rows)
-    return max((-margins.bodies.exact(spots.at, k, pair) for k, pair in places), default=0.0)
-
-
 def _settled(
-    budget: Budget, t: StrikeTranscription, result: SolverResult
+    budget: Budget, margins: Margins | None, t: StrikeTranscription, result: SolverResult
 ) -> tuple[StrikeTranscription, SolverResult]:
     """A strike whose freezes on the way come when they are to, by the time that its contact takes."""
     for _ in range(ROUNDS):
@@ -382,7 +287,7 @@ def _settled(
         functions = block_functions(t.problem, t.coordinates, None, elements)
         finer = StrikeTranscription(t.problem, t.coordinates, functions, elements, shares)
         finer = finer.with_apart(t.apart_rows)
-        new = budget.run(finer.program, carried(finer, t, result).x)
+        finer, new = solved_apart(budget, margins, finer, carried(finer, t, result).x)
         if not new.status.usable:
             break
         t, result = finer, one_after_the_other(result, new)

@@ -1,39 +1,31 @@
-"""Rows that keep bodies apart: spheres of the robot out of its other links, and of the bodies of the world.
+"""Constraints that keep bodies apart: one for a pair of convex pieces at a place, their smooth distance.
 
-The function of such a row knows no robot: it is a chain of turns about z axes with fixed placements between,
-which are its parameters. Chains are filled up to a few lengths, so that a handful of compiled functions
-serves all pairs of all robots.
+The distance is `impactopt.bodies.separation`'s; here is what it is a function of. Between two links that is a
+chain of turns about z axes with fixed placements between, which are its parameters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import scipy.sparse as sp
 
-from impactopt.bodies.fit import PLANES
-from impactopt.codegen.cache import FunctionGroup
+from impactopt.bodies.separation import Separations
 from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import KeepOut, SelfCollision
 from impactopt.robots.robot import Robot
 from impactopt.transcription.batched import Block
-from impactopt.transcription.blocks import BlockExpression, make_block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.layout import Affine, Array, stack
-from impactopt.transcription.rows import Place, Row, millimetres
-from impactopt.transcription.simd import in_lanes
-from impactopt.transcription.structured import derivative_functions
+from impactopt.transcription.rows import Index, Place, Row, millimetres
 
-LENGTHS = (4, 8, 12, 16, 20)  # of chains, in joints
-ROUND = 4e-3  # [m] over which two planes pass into each other
 TOO_NEAR = millimetres("too near")
 
 
@@ -53,13 +45,8 @@ class Chain:
     places: tuple[Any, ...]
     base: bool = False
 
-    @cached_property
-    def length(self) -> int:
-        """To which it is filled up."""
-        return next((n for n in LENGTHS if n >= len(self.columns)), len(self.columns))
-
     def numbers(self, before: Any = None) -> Array:
-        """The chain's part of a row's parameters; ``before``: a placement in front of all (pin.SE3)."""
+        """The chain's part of a constraint's parameters; ``before``: a placement in front (pin.SE3)."""
         if before is None:
             return self._numbers
         out = self._numbers.copy()
@@ -68,13 +55,12 @@ class Chain:
 
     @cached_property
     def _numbers(self) -> Array:
-        """Thousands of rows have the same."""
-        more = self.length - len(self.columns)
-        places = [*self.places, *[pin.SE3.Identity()] * more]
-        return np.concatenate([*map(_placement, places), self.turns, np.ones(more)])
+        """Thousands of constraints have the same."""
+        return np.concatenate([*map(_placement, self.places), self.turns])
 
-    def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Array, Array, Array]:
-        """z of a row's function, sums of coordinates: slots, coordinates (y, then legs), factors, (k,) each.
+    def pattern(self, c: StanceCoordinates, rotation: Array | None = None) -> tuple[Index, Index, Array]:
+        """z of a constraint's function, sums of coordinates: slots, coordinates (y, then legs) and factors,
+        (k,) each.
 
         rotation : axes, as columns, of the box that the chain ends at.
         """
@@ -86,7 +72,7 @@ class Chain:
                 slots += [i] * 3
                 coordinates += [0, 1, 2]
                 factors += [float(rotation[j, i]) for j in range(3)]
-        return np.array(slots), np.array(coordinates), np.array(factors)
+        return np.array(slots, dtype=np.intp), np.array(coordinates, dtype=np.intp), np.array(factors)
 
 
 def _placement(m: Any) -> Array:
@@ -170,75 +156,75 @@ def _turned(direction: Array) -> Any:
 # ---- functions
 
 
-def _chained(n: int, points: list[Any]) -> tuple[list[Any], list[Any], list[Any]]:
-    """z and p of a chain of n joints, and where it takes points (SX)."""
-    shift, angle = ca.SX.sym("t", 3), ca.SX.sym("q", n)
-    places = ca.SX.sym("places", 12 * (n + 1))
-    turns = ca.SX.sym("turns", n)
-    found = []
-    for x in points:
-        at = _moved(places, n, x)
-        for k in reversed(range(n)):
-            cosine, sine = ca.cos(turns[k] * angle[k]), ca.sin(turns[k] * angle[k])
-            at = ca.vertcat(
-                cosine * at[0] - sine * at[1],
-                sine * at[0] + cosine * at[1],
-                at[2] + (1 - turns[k]) * angle[k],
-            )
-            at = _moved(places, k, at)
-        found.append(shift + at)
-    return [shift, angle], [places, turns], found
+class SeparationPart:
+    """Values (``what`` = 0), gradients (1) or Hessians (2) of a block, as `BatchedFunction`."""
+
+    def __init__(self, of: Separations, what: int, width: int) -> None:
+        self._of, self._what, self._width = of, what, width
+        self.inputs = [np.zeros(0), of.numbers]
+        self.write_to(np.zeros(self.size))
+
+    @property
+    def size(self) -> int:
+        """Numbers that a call writes."""
+        return self._of.count * self._width
+
+    def write_to(self, numbers: Array) -> None:
+        """From now on calls write to these (size,)."""
+        self.output = numbers.reshape(self._of.count, self._width)
+
+    def __call__(self, z: Array, multipliers: Array | None = None) -> Array:
+        """Rows are instances: z (count, n_z) -> (count, numbers of each), overwritten by the next call."""
+        self._of.write(self._what, z, self.output, multipliers)
+        return self.output
 
 
-def _moved(places: Any, k: int, x: Any) -> Any:
-    rows = [places[12 * k + 3 * r : 12 * k + 3 * r + 3] for r in range(3)]
-    return ca.vertcat(*[ca.dot(row, x) for row in rows]) + places[12 * k + 9 : 12 * k + 12]
+@dataclass
+class SeparationBlock(Block):
+    """Distances of pairs of pieces, with derivatives by `Separations`."""
+
+    of: Separations
+
+    @classmethod
+    def of_separations(cls, name: str, of: Separations, lift: Affine) -> SeparationBlock:
+        """With z of all as one expression."""
+        size = of.joints + 3
+        everything = np.arange(size)
+        columns, rows = np.triu_indices(size)  # of a lower triangle, column by column
+        parts: list[Any] = [
+            SeparationPart(of, what, width) for what, width in enumerate((1, size, len(rows)))
+        ]
+        return cls(
+            name=name,
+            value=parts[0],
+            jacobian=parts[1],
+            hessian=parts[2],
+            n_in=size,
+            n_out=1,
+            count=of.count,
+            lift=lift,
+            jac_pattern=(np.zeros_like(everything), everything),
+            hess_pattern=(rows, columns),
+            of=of,
+        )
+
+    def take_parameters(self, parameters: Array) -> None:
+        self.of.numbers[...] = parameters
+        self.of.forget()
+
+    def copy(self) -> Block:
+        made = SeparationBlock.of_separations(self.name, self.of.copy(), self.lift)
+        return replace(made, jac_pattern=self.jac_pattern, hess_pattern=self.hess_pattern)
 
 
-def apart(n: int) -> BlockExpression:
-    """A sphere and planes about a body, n joints apart.
-
-    z = shift (3), joints (n);  p = the chain's; the sphere's centre (3) in its frame; normals (3 a plane) and
-    offsets of the planes in theirs; R, radius and margin.  out = max_i (n_i . x - h_i) - R [m], rounded where
-    planes meet: above it by at most `ROUND` / 2 for each time that their number can be halved.
-    """
-    a, reach = ca.SX.sym("a", 3), ca.SX.sym("R")
-    normals, offsets = ca.SX.sym("n", 3 * PLANES), ca.SX.sym("h", PLANES)
-    z, p, (found,) = _chained(n, [a])
-    at = ca.SX.sym("at", 3)
-    far = [ca.dot(normals[3 * k : 3 * k + 3], at) - offsets[k] for k in range(PLANES)]
-    while len(far) > 1:
-        far = [_larger(one, two) for one, two in zip(far[::2], far[1::2], strict=True)]
-    return make_block(z, [*p, a, normals, offsets, reach], {"gap": far[0] - reach}, [(at, found)])
-
-
-def _larger(a: Any, b: Any) -> Any:
-    """The larger of two lengths, rounded."""
-    return (a + b + ca.sqrt((a - b) ** 2 + ROUND**2)) / 2
-
-
-def apart_groups() -> list[FunctionGroup]:
-    """What is compiled for all rows: the same for every robot."""
-    out: list[FunctionGroup] = []
-    for n in LENGTHS:
-        name = f"apart{n}"
-
-        def functions(name: str = name, n: int = n) -> list[Any]:
-            b = apart(n)
-            return in_lanes(derivative_functions(name, b.z, b.p, b.out, b.through), b.lanes)
-
-        out.append(FunctionGroup(name=name, recipe=(name,), build=functions))
-    return out
-
-
-# ---- rows
+# ---- constraints
 
 
 class ApartRow(NamedTuple):
-    """What one row keeps apart at one place: its name.
+    """What one constraint keeps apart at one place: its name.
 
-    place : of the program.  joint : of the link, a sphere of which is kept out.  other : joint of the other
-    link; or -1 - the index of a body of the world.  number : of rows for the same two there.
+    place : of the program.  joint : of the link.  other : joint of the other link; or -1 - the index of a
+    body of the world.  number : of the two pieces among those of these two bodies.
     """
 
     place: str
@@ -248,73 +234,84 @@ class ApartRow(NamedTuple):
 
 
 class Held(NamedTuple):
-    """How a row keeps them apart.
+    """How a constraint keeps them apart.
 
-    centre (3) [m] : of the sphere, in the joint's frame.  reach [m] : its radius and the margin.
-    facing (4) : normal and offset [m] of a plane, in the other's frame, in place of that of its planes that
-    is most like it; None: those.  travel [m] : of the target, if the other moves with it.
+    way (3) : direction from the other to the one in the other's frame, near which they are apart.
+    reach [m] : how far.  travel [m] : of the target, if the other moves with it.
     """
 
-    centre: tuple[float, ...]
+    way: tuple[float, ...]
     reach: float
-    facing: tuple[float, ...] | None = None
     travel: float = 0.0
 
 
 def add_apart_rows(
     b: Builder, spots: Sequence[tuple[Place, list[Affine]]], rows: Mapping[ApartRow, Held]
-) -> None:
-    """Blocks and rows for these.  spots : places of a program, with coordinates and legs."""
+) -> list[ApartRow]:
+    """Blocks and rows for these, and their names in the order of the program's rows.
+
+    spots : places of a program, with coordinates and legs.
+    """
     if not rows:
-        return
-    bodies, links = b.problem.bodies, b.problem.bodies.links
+        return []
+    bodies, shapes = b.problem.bodies, b.problem.bodies.shapes
     spot_of = {place.name: k for k, (place, _) in enumerate(spots)}
     width = b.ny + b.nl
     everywhere = stack([part for _, slots in spots for part in slots])
     coordinates, constants = everywhere.matrix(b.layout.n), everywhere.const
-    chains: dict[tuple[int, int], tuple[Chain, Any]] = {}
-    names: dict[tuple[int, int], str] = {}
-    groups: dict[str, _Group] = {}
+    known: dict[tuple[int, int], _Known] = {}
+    groups: dict[int, _Group] = {}
     for row, held in rows.items():
         body = bodies.world[-1 - row.other] if row.other < 0 else None
-        if (row.joint, row.other) not in chains:
+        pair = row.joint, row.other
+        if pair not in known:
             chain = _chain(b.robot, row.joint, max(row.other, 0))
             pattern = chain.pattern(b.coordinates, None if body is None else body.rotation)
-            chains[row.joint, row.other] = chain, pattern
-            names[row.joint, row.other] = " and ".join(bodies.names((row.joint, row.other)))
-        chain, pattern = chains[row.joint, row.other]
+            known[pair] = _Known(chain, pattern, " and ".join(bodies.names(pair)))
+        chain, pattern, name = known[pair]
         before = None
         if body is not None:
             shift = held.travel * bodies.normal * body.moves
             before = pin.SE3(body.rotation, body.place + shift).inverse()
-        planes = (links.planes[row.other] if body is None else body.planes).with_facing(held.facing)
-        name = f"apart{chain.length}"
-        if name not in groups:
-            groups[name] = _Group(chain.length + 3)
-        group = groups[name]
-        group.rows.append(row)
+        n = shapes.index[row.joint, row.other, row.number]
+        group = groups.setdefault(len(chain.columns), _Group())
+        group.names.append(row)
+        group.pairs.append(n)
+        group.ways.append(held.way)
         group.patterns.append(pattern)
         group.spots.append(spot_of[row.place])
-        group.numbers.append(np.concatenate([chain.numbers(before), held.centre, planes, [held.reach]]))
-    for name, group in groups.items():
+        group.numbers.append(np.append(chain.numbers(before), held.reach + shapes.radius[n]))
+        term = (SelfCollision if row.other >= 0 else KeepOut).name
+        # pieces of the same two bodies have names of their own, as multipliers go by them
+        piece = f"{name} {row.number + 1}" if row.number else name
+        group.origins.append(Row(term, spots[spot_of[row.place]][0], piece, TOO_NEAR, whole=name))
+    for length, group in groups.items():
+        size, count = length + 3, len(group.pairs)
         counts = [len(slots) for slots, _, _ in group.patterns]
         slots, columns, factors = (np.concatenate([p[k] for p in group.patterns]) for k in range(3))
-        instance = np.repeat(np.arange(len(counts)), counts)
+        instance = np.repeat(np.arange(count), counts)
         at = np.repeat(group.spots, counts) * width + columns
-        shape = len(counts) * group.size, len(constants)
-        chosen = sp.csr_array((factors, (instance * group.size + slots, at)), shape=shape)
+        chosen = sp.csr_array((factors, (instance * size + slots, at)), shape=(count * size, len(constants)))
+        of = Separations(
+            shapes, length, np.array(group.pairs), np.array(group.numbers), np.array(group.ways, dtype=float)
+        )
         lift = Affine.of_matrix(chosen @ coordinates, chosen @ constants)
-        first = b.add_lifted(name, lift, len(counts), np.array(group.numbers))
-        origins = [
-            Row(
-                (SelfCollision if row.other >= 0 else KeepOut).name,
-                spots[spot][0],
-                names[row.joint, row.other],
-                TOO_NEAR,
-            )
-            for row, spot in zip(group.rows, group.spots, strict=True)
-        ]
-        b.rows.add_each(origins, outputs=first + np.arange(len(counts)), lower=0.0)
+        first = b.append(SeparationBlock.of_separations(f"apart{length}", of, lift))
+        b.rows.add_each(group.origins, outputs=first + np.arange(count), lower=0.0)
+    return [name for group in groups.values() for name in group.names]
+
+
+def coupled(matrix: Any, spots: Sequence[tuple[Place, list[Affine]]]) -> sp.csc_array:
+    """A matrix (n, n) with room, as zeros, for what the coordinates and legs of any place couple."""
+    own = sp.coo_array(matrix)
+    rows, columns, values = [own.coords[0]], [own.coords[1]], [own.data]
+    for _, slots in spots:
+        touched = np.unique(stack(slots).cols)
+        rows.append(np.repeat(touched, len(touched)))
+        columns.append(np.tile(touched, len(touched)))
+        values.append(np.zeros(len(touched) ** 2))
+    at = np.concatenate(rows), np.concatenate(columns)
+    return sp.csc_array(sp.coo_array((np.concatenate(values), at), shape=matrix.shape))
 
 
 def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[ApartRow, Held]) -> None:
@@ -324,7 +321,7 @@ def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[Ap
     seen = dict.fromkeys(of_name, 0)
     for row, held in rows.items():
         chain = _chain(problem.robot, row.joint, max(row.other, 0))
-        name = f"apart{chain.length}"
+        name = f"apart{len(chain.columns)}"
         if row.other < 0:
             placed = chain.places[0]
             body, normal = problem.bodies.world[-1 - row.other], problem.bodies.normal
@@ -335,12 +332,24 @@ def move_apart(problem: ImpactProblem, blocks: Sequence[Block], rows: Mapping[Ap
         block.take_parameters(numbers[name])
 
 
+class _Known(NamedTuple):
+    """What all constraints of two bodies share."""
+
+    chain: Chain
+    pattern: tuple[Index, Index, Array]
+    name: str
+
+
 @dataclass(frozen=True)
 class _Group:
-    """Rows of one function of z (size,), with how that comes from the coordinates at each one's spot."""
+    """Constraints whose chains have as many joints, with how z comes from the coordinates at each one's
+    spot.
+    """
 
-    size: int
-    rows: list[ApartRow] = field(default_factory=list)
-    patterns: list[tuple[Array, Array, Array]] = field(default_factory=list)
+    names: list[ApartRow] = field(default_factory=list)
+    pairs: list[int] = field(default_factory=list)
+    ways: list[tuple[float, ...]] = field(default_factory=list)
+    origins: list[Row] = field(default_factory=list)
+    patterns: list[tuple[Index, Index, Array]] = field(default_factory=list)
     spots: list[int] = field(default_factory=list)
     numbers: list[Array] = field(default_factory=list)

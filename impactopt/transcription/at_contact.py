@@ -15,7 +15,7 @@ from impactopt.problem.objectives.peak_force import TYPICAL as PEAK_SCALE
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.solvers.program import Determined
-from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, move_apart
+from impactopt.transcription.apart import ApartRow, Held, add_apart_rows, coupled, move_apart
 from impactopt.transcription.batched import Block
 from impactopt.transcription.builder import Builder
 from impactopt.transcription.collision import Collision
@@ -54,7 +54,7 @@ class ContactProgram(ABC):
     problem, coordinates, robot, functions, y0, legs0 : the builder's.
     angular_momentum : after contact, a group of three, if an objective asks for it.
     objectives : the problem's that it knows, with their quantities.
-    apart_rows : rows between bodies.
+    apart_rows : constraints between bodies, in the order of their rows, which are the last.
     """
 
     def __init__(self, builder: Builder, hit: Hit) -> None:
@@ -218,6 +218,8 @@ class ContactProgram(ABC):
     def program(self) -> StructuredProgram:
         """All of it, for a solver."""
         objective, quadratic, linear = self._worth
+        if self.apart_rows:  # all that such constraints may couple: solvers' structures serve any of them
+            quadratic = coupled(quadratic, self._body_spots())
         return StructuredProgram(
             self.layout,
             self.blocks,
@@ -234,9 +236,14 @@ class ContactProgram(ABC):
         """The same program with just these rows between bodies."""
         other = copy.copy(self)
         other.__dict__.pop("program", None)
-        other.builder, other.apart_rows = self._bare.copy(), dict(rows)
-        add_apart_rows(other.builder, [*self.swing_spots(), *self.follow_spots()], other.apart_rows)
+        other.builder = self._bare.copy()
+        order = add_apart_rows(other.builder, self._body_spots(), rows)
+        other.apart_rows = {name: rows[name] for name in order}
         return other
+
+    def _body_spots(self) -> list[tuple[Place, list[Affine]]]:
+        """Places with coordinates and legs, where bodies are kept apart."""
+        return [*self.swing_spots(), *self.follow_spots()]
 
     def move_to(self, problem: ImpactProblem, *, anew: bool = True) -> None:
         """Take the numbers of a problem with another point, law or target, and leave the rest as it is built.

@@ -13,7 +13,7 @@ from impactopt.kinematics.coordinates import StanceCoordinates
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription import blocks as symbolic
 from impactopt.transcription.batched import Block
-from impactopt.transcription.layout import Affine, Array, Group, Layout
+from impactopt.transcription.layout import Array, Group, Layout
 from impactopt.transcription.limits import Limits
 from impactopt.transcription.rows import Index, Measure, Place, Rows
 
@@ -66,14 +66,12 @@ class Builder:
 
     def add_block(self, name: str, instances: list[Any], parameters: Array) -> int:
         """Append a block; the index of its first output."""
-        at = sum(b.count * b.n_out for b in self.blocks)
-        self.blocks.append(Block.make(name, self.functions, instances, parameters))
-        return at
+        return self.append(Block.make(name, self.functions, instances, parameters))
 
-    def add_lifted(self, name: str, lift: Affine, count: int, parameters: Array) -> int:
-        """As :meth:`add_block`, of all instances' z as one expression."""
+    def append(self, block: Block) -> int:
+        """Append a block that is made; the index of its first output."""
         at = sum(b.count * b.n_out for b in self.blocks)
-        self.blocks.append(Block.of_lift(name, self.functions, lift, count, parameters))
+        self.blocks.append(block)
         return at
 
     def lift(

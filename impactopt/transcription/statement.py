@@ -25,10 +25,7 @@ def statement_of(t: Transcription) -> str:
         components = tuple(row.component for row in found)
         rows.append([term, place, lists.setdefault(components, len(lists))])
     collisions = [c for c in t.hit.collisions if isinstance(c, Collision)]
-    held: list[dict[str, Any]] = [
-        {"place": row.place, "joint": row.joint, "other": row.other, **kept._asdict()}
-        for row, kept in t.apart_rows.items()
-    ]
+    held: list[dict[str, Any]] = [{**row._asdict(), **kept._asdict()} for row, kept in t.apart_rows.items()]
     return json.dumps(
         {
             "groups": [[g.name, g.count, g.size] for g in t.layout.groups.values()],

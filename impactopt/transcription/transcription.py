@@ -20,7 +20,6 @@ from impactopt.kinematics.statics import static_wrenches
 from impactopt.kinematics.support import support_polygon
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import Determined
-from impactopt.transcription.apart import apart_groups
 from impactopt.transcription.at_contact import BodyState, ContactProgram
 from impactopt.transcription.balance import add_balance
 from impactopt.transcription.builder import Builder
@@ -93,7 +92,7 @@ def block_functions(
         groups.append(
             FunctionGroup(name=f"{robot.name}-{name}", recipe=(name, *recipe, *block.key), build=functions)
         )
-    return cached_groups([*groups, *apart_groups()], report=report)
+    return cached_groups(groups, report=report)
 
 
 class Transcription(ContactProgram):

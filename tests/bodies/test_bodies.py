@@ -149,18 +149,6 @@ def test_planes_about_a_box_are_its_faces_where_they_are_next() -> None:
     assert planes.out < 0.01
 
 
-def test_a_known_plane_takes_the_place_of_the_one_most_like_it() -> None:
-    body = WorldBody(name="box", half=np.full(3, 0.1), place=np.zeros(3), rotation=np.eye(3))
-    plain, facing = body.planes.with_facing(None), body.planes.with_facing((0.0, 0.6, 0.8, 0.25))
-    assert plain.shape == facing.shape == (4 * PLANES,)
-    changed = np.flatnonzero((plain != facing)[: 3 * PLANES].reshape(-1, 3).any(axis=1))
-    assert len(changed) <= 1
-    k = int((body.planes.normal @ [0.0, 0.6, 0.8]).argmax())
-    np.testing.assert_array_equal(facing[3 * k : 3 * k + 3], [0.0, 0.6, 0.8])
-    assert facing[3 * PLANES + k] == 0.25
-    assert np.array_equal(body.planes.with_facing(None), plain), "it stays as it was"
-
-
 def test_points_on_a_surface_are_on_it_and_near_each_other() -> None:
     body = np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
     hull = ConvexHull(body)

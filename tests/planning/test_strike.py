@@ -399,16 +399,16 @@ def test_a_motion_is_solved_from_several_starts(
     json.dumps(told)
 
 
-def test_a_start_whose_bodies_are_in_each_other_goes_before_no_clean_one(
+def test_no_start_ends_with_bodies_in_each_other(
     arm_transcription: Transcription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of these three hits harder, with the elbow in the target."""
+    """Where one of these three would hit harder with the elbow in the target."""
     t = arm_transcription
     monkeypatch.setattr("impactopt.planning.planner.block_functions", lambda *_: t.functions)
     problem = dataclasses.replace(t.problem, point=t.problem.point + np.array([0.0, 0.0, 0.01]))
     found = solve(problem, starts=3)
     assert found.status is Status.SOLVED and found.clearance()["contacts_besides"] == []
-    assert any(not a.status.usable and a.objective < found.result.objective for a in found.attempts)
+    assert all(a.status.usable for a in found.attempts)
 
 
 def test_a_solution_starts_its_neighbour(

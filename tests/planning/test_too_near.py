@@ -1,4 +1,4 @@
-"""Rounds against bodies that are too near: each adds a row that its solution violates, or a node."""
+"""Rounds against bodies that are too near between places: each adds a node, or asks a place for more."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 from impactopt import Obstacle, load_problem, solve
-from impactopt.planning.keeping_apart import Margins, spots_of
+from impactopt.planning.keeping_apart import Margins, Watch, spots_of
 from impactopt.planning.multistart import Budget
 from impactopt.planning.rounds import Refining, Round
 from impactopt.planning.solution import Solution
-from impactopt.planning.too_near import missing_rows, rows_to_add
+from impactopt.planning.too_near import bodies_too_near
 from impactopt.problem.problem import ImpactProblem
 from impactopt.solvers.program import SolverResult, Status, max_violation
 from impactopt.transcription.start import carried_over
@@ -54,7 +54,7 @@ def violation(t: Transcription, x: Array) -> float:
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 0.65])
-def test_every_look_finds_a_row_that_is_violated_or_a_node(free: Solution, share: float) -> None:
+def test_every_look_finds_what_is_violated_there_or_a_node(free: Solution, share: float) -> None:
     """Pegs in the hammer's way, between any two nodes of the swing: near ones, and such as it passes by with
     centimetres to spare at both.
     """
@@ -63,16 +63,16 @@ def test_every_look_finds_a_row_that_is_violated_or_a_node(free: Solution, share
         x, _, z = hammer(free, first + share * (last - first))
         problem = with_peg(free.problem, x, z)
         margins, t = Margins(problem), program_of(free, problem)
-        violated = rows_to_add(t, free.result.x, margins)
+        violated = bodies_too_near(t, free.result.x, margins)
         assert violated is not None and violated.depth > 0
-        more = t.with_apart({**t.apart_rows, **violated.rows})
         if violated.nodes == t.nodes:
-            assert violation(more, free.result.x) > 1e-3
+            rows = {**Watch(t, margins, free.result.x).rows(), **violated.rows}
+            assert violation(t.with_apart(rows), free.result.x) > 1e-3
         else:
             functions = block_functions(problem, problem.coordinates)
             finer = Transcription(problem, problem.coordinates, functions, violated.nodes)
             there, _, _ = carried_over(finer, t, free.result.x, np.zeros(t.program.m), np.zeros(t.layout.n))
-            rows = missing_rows(finer, there, margins)
+            rows = Watch(finer, margins, there).rows()
             known = set(spots_of(t, free.result.x).names)
             assert any(row.place not in known for row in rows)
             assert violation(finer.with_apart(rows), there) > 1e-3
@@ -88,16 +88,18 @@ def test_rounds_end_with_bodies_that_are_apart(free: Solution, monkeypatch: pyte
     x, _, z = hammer(free, (nodes[10] + nodes[11]) / 2)
     problem, began, solved = with_peg(free.problem, x, z), list[float](), Round.solved
 
-    def watched(self: Round, budget: Budget) -> SolverResult:
+    def watched(self: Round, budget: Budget, margins: Margins) -> tuple[Transcription, SolverResult]:
         start = self.starts[0]
-        began.append(violation(self.program, start.x if isinstance(start, SolverResult) else start))
-        return solved(self, budget)
+        x = start.x if isinstance(start, SolverResult) else start
+        rows = {**Watch(self.program, margins, x).rows(), **self.program.apart_rows}
+        began.append(violation(self.program.with_apart(rows), x))
+        return solved(self, budget, margins)
 
     monkeypatch.setattr(Round, "solved", watched)
     solution = solve(problem)
     assert solution.status is Status.SOLVED and solution.nodes.total > 0
     assert solution.clearance()["clearance_mm"] > 0 and not solution.clearance()["contacts_besides"]
-    assert len(began) > 1 and min(began) > 1e-3
+    assert began and min(began) > 1e-3
 
 
 def refining(problem: ImpactProblem, **options: int) -> Refining:

@@ -53,19 +53,49 @@ def test_bent_steps_lead_to_the_same_optimum(seed):
     np.testing.assert_allclose(result.x, np.maximum(wanted, 0.0), atol=1e-4)
 
 
-def test_a_run_may_be_left_near_its_optimum():
-    """Where whoever started it says so: it is asked with points ever nearer to the optimum."""
+class Watching:
+    """Has a run left at its iterate of a number, and halves all its steps."""
+
+    def __init__(self, at: int) -> None:
+        self.at, self.asked, self.path = at, [], None
+
+    def lacks(self, x):
+        self.asked.append(x.copy())
+        return len(self.asked) == self.at + 1
+
+    def leave(self, path):
+        self.path = path
+
+    def limit(self, x, step, most):
+        return 0.5 * most
+
+
+def test_a_run_that_is_left_goes_on_as_it_would_have():
+    """With its slacks, multipliers and barrier: what two bounds of one variable share is all that is lost."""
     wanted = np.array([-1.0, 0.5, 2.0, 5.0])
-    asked = []
-    whole = solve_sqp(projection(wanted), np.ones(4), leave=lambda x: bool(asked.append(x)))
-    assert whole.status is Status.SOLVED
-    off = [float(np.abs(x - np.maximum(wanted, 0.0)).max()) for x in asked]
-    assert len(asked) > 1 and off == sorted(off, reverse=True)
-    left = solve_sqp(projection(wanted), np.ones(4), leave=lambda _: True)
-    assert left.status is Status.ACCEPTABLE
-    assert left.iterations < whole.iterations
-    np.testing.assert_array_equal(left.x, asked[0])
-    np.testing.assert_allclose(left.x, np.maximum(wanted, 0.0), atol=0.05)
+    program, start, whole = projection(wanted), np.ones(4), Watching(-1)
+    solved = solve_sqp(program, start, watch=whole)
+    assert solved.status is Status.SOLVED
+    lengths = np.abs(np.diff(whole.asked[:3], axis=0)).max(axis=1)
+    assert lengths[0] <= 0.5 * np.abs(wanted - 1.0).max(), "steps are as short as who watches wants them"
+    first = Watching(3)
+    left = solve_sqp(program, start, watch=first)
+    assert left.status is Status.ACCEPTABLE and left.iterations == 3
+    np.testing.assert_array_equal(left.x, whole.asked[3])
+    on = Watching(-1)
+    again = solve_sqp(
+        program,
+        left.x,
+        multipliers=left.multipliers,
+        bound_multipliers=left.bound_multipliers,
+        watch=on,
+        path=first.path,
+    )
+    assert again.status is Status.SOLVED
+    np.testing.assert_array_equal(on.asked[0], left.x)
+    np.testing.assert_allclose(on.asked[1], whole.asked[4], atol=0.02)
+    assert left.iterations + again.iterations <= solved.iterations + 1
+    np.testing.assert_allclose(again.x, solved.x, atol=1e-6)
 
 
 def test_rows_far_off_are_not_bent():

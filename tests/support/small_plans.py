@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from impactopt.robots.robot import Robot
 from impactopt.simulation import Scene, Simulation, scene_of, simulate_pinocchio
 from impactopt.solvers.ipopt import solve_ipopt
 from impactopt.solvers.program import SolverResult
-from impactopt.transcription.apart import LENGTHS, apart
 from impactopt.transcription.blocks import BlockExpression, builders
 from impactopt.transcription.extra_blocks import extra_blocks, own_blocks
 from impactopt.transcription.plan import Plan, Trajectory
@@ -77,7 +75,7 @@ def transcribed(problem: ImpactProblem) -> Transcription:
     """The problem's program; all blocks are built, those of every model of the collision."""
     c = problem.coordinates
     edges = len(support_polygon(problem.robot, c))
-    found: dict[str, Callable[[], BlockExpression]] = {f"apart{n}": partial(apart, n) for n in LENGTHS}
+    found: dict[str, Callable[[], BlockExpression]] = {}
     if problem.frozen is not None:
         return Transcription(
             problem, c, _functions(found | own_blocks(problem, c, edges)) | _extra_functions(problem)

@@ -17,37 +17,39 @@ from support.small_robots import arm, biped, table
 
 from impactopt import KeepOut, Obstacle, SelfCollision, load_problem, solve
 from impactopt.bodies.clearance import Places
-from impactopt.bodies.fit import PLANES, Planes
-from impactopt.bodies.robot_bodies import bodies_of
+from impactopt.bodies.separation import THIN
 from impactopt.kinematics.coordinates import StanceCoordinates
-from impactopt.planning.keeping_apart import BEAD, Margins, rounded_most, rows_near, spots_of
+from impactopt.planning.keeping_apart import Margins, Watch, solved_apart, spots_of
+from impactopt.planning.multistart import Budget
 from impactopt.planning.solution import Solution
-from impactopt.planning.too_near import missing_rows, rows_to_add
+from impactopt.planning.too_near import bodies_too_near, deepest
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.terms import Term
 from impactopt.robots.presets import g1, standin, talos
 from impactopt.robots.robot import Robot
 from impactopt.solvers.program import Status
-from impactopt.transcription.apart import LENGTHS, ROUND, ApartRow, Chain, Held, apart, chain_between
+from impactopt.transcription.apart import ApartRow, Chain, chain_between
 from impactopt.transcription.plan import Plan
 from impactopt.transcription.start import first_iterate
-from impactopt.transcription.structured import derivative_functions
 from impactopt.transcription.transcription import Transcription, block_functions
 
 Array = NDArray[np.float64]
 APART = (SelfCollision(), KeepOut())
-LEVELS = int(np.log2(PLANES))  # at which two of what is left of the planes pass into each other
-ROUNDED = LEVELS * ROUND / 2  # [m] at most
-BY_LENGTH: dict[int, Any] = {}
 
 
-def gap(chain: Chain, z: Array, p: Any) -> float:
-    """A row's value [m]."""
-    n = chain.length
-    if n not in BY_LENGTH:
-        b = apart(n)
-        BY_LENGTH[n] = derivative_functions(f"apart{n}", b.z, b.p, b.out, b.through)[0]
-    return float(BY_LENGTH[n](z, np.concatenate([np.ravel(x) for x in p])))
+def taken(chain: Chain, z: Array, numbers: Array, x: Array) -> Array:
+    """Where a chain takes a point (3,), from its last frame to its first."""
+    n = len(chain.columns)
+    places, turns = numbers[: 12 * (n + 1)].reshape(-1, 12), numbers[12 * (n + 1) :]
+
+    def placed(place: Array, x: Array) -> Array:
+        return place[:9].reshape(3, 3) @ x + place[9:]
+
+    x = placed(places[n], x)
+    for k in reversed(range(n)):
+        x = pin.utils.rotate("z", z[3 + k]) @ x if turns[k] else x + np.array([0.0, 0.0, z[3 + k]])
+        x = placed(places[k], x)
+    return np.asarray(x + z[:3])
 
 
 # ---- chains
@@ -71,7 +73,7 @@ class Posed:
         return cls(robot, c, both, data)
 
     def z(self, chain: Chain, rotation: Array | None) -> Array:
-        out = np.zeros(3 + chain.length)
+        out = np.zeros(3 + len(chain.columns))
         slots, columns, factors = chain.pattern(self.c, rotation)
         np.add.at(out, slots, factors * self.both[columns])
         return out
@@ -91,17 +93,11 @@ ROBOTS: dict[str, tuple[Callable[[], Robot], str, tuple[str, ...]]] = {
 }
 
 
-def along(direction: Array) -> Array:
-    """A row's planes, all of which say how far a point is along a direction (3,)."""
-    return np.concatenate([np.tile(direction, PLANES), np.zeros(PLANES)])
-
-
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_chain_takes_a_point_to_where_pinocchio_does(name: str) -> None:
     """From a link to another's frame, and to that of a body of the world; also from and to the base."""
     make, posture, soles = ROBOTS[name]
     robot, rng = make(), np.random.default_rng(0)
-    directions = np.eye(3)
     for seed in range(3):
         posed = Posed.at_random(robot, posture, soles, seed)
         pairs = [(posed.joint(rng), posed.joint(rng)) for _ in range(6)]
@@ -110,14 +106,13 @@ def test_a_chain_takes_a_point_to_where_pinocchio_does(name: str) -> None:
         for one, other in (*((a, b) for a, b in pairs if a != b), *worlds):
             centre, body = rng.uniform(-0.3, 0.3, 3), pin.SE3.Random()
             chain = chain_between(robot.model, one, other)
-            assert chain.length in LENGTHS and chain.base == (robot.floating and other == 0)
+            assert chain.base == (robot.floating and other == 0)
             if other:
                 z, before, frame = posed.z(chain, None), None, posed.data.oMi[other]
             else:
                 z, before, frame = posed.z(chain, body.rotation), body.inverse(), body
             there = frame.actInv(posed.data.oMi[one].act(centre))
-            found = [gap(chain, z, (chain.numbers(before), centre, along(d), 0.1)) for d in directions]
-            np.testing.assert_allclose(np.array(found) + 0.1 - ROUNDED, there, atol=1e-9)
+            np.testing.assert_allclose(taken(chain, z, chain.numbers(before), centre), there, atol=1e-9)
 
 
 def test_only_the_joints_between_two_links_are_in_their_chain() -> None:
@@ -133,32 +128,6 @@ def test_only_the_joints_between_two_links_are_in_their_chain() -> None:
     slots, coordinates, _ = chain.pattern(c)
     assert sorted(slots) == list(range(3, 3 + len(columns)))
     assert sum(k >= c.ny for k in coordinates) == 4, "the leg's are not free"
-
-
-@pytest.mark.parametrize("name", ["arm", "biped", "talos"])
-def test_a_row_says_what_planes_and_sphere_do(name: str) -> None:
-    """But for where planes meet, where it is more by what they are rounded by."""
-    make, posture, soles = ROBOTS[name]
-    robot, rng = make(), np.random.default_rng(1)
-    bodies = bodies_of(robot)
-    seen = 0.0
-    for seed in range(20):
-        posed = Posed.at_random(robot, posture, soles, seed)
-        sphere = int(rng.integers(len(bodies.joint)))
-        one, other = int(bodies.joint[sphere]), int(rng.choice(bodies.joints))
-        if one == other:
-            continue
-        chain, planes = chain_between(robot.model, one, other), bodies.planes[other]
-        reach = float(bodies.radius[sphere]) + 0.01
-        numbers = (chain.numbers(), bodies.centre[sphere], planes.with_facing(None), reach)
-        value = gap(chain, posed.z(chain, None), numbers)
-        there = posed.data.oMi[other].actInv(posed.data.oMi[one].act(bodies.centre[sphere]))
-        far = planes.normal @ there - planes.offset
-        assert value == pytest.approx(rounded_most(far) - reach, abs=1e-12)
-        more = value - (float(far.max()) - reach)
-        assert -1e-12 <= more <= ROUNDED
-        seen = max(seen, more)
-    assert seen > 0
 
 
 # ---- programs
@@ -177,7 +146,7 @@ def programs(
     for name, shared in (("arm", arm_transcription), ("biped", biped_transcription)):
         bare = changed(shared)
         x, rng = first_iterate(bare), np.random.default_rng(0)
-        rows = rows_near(bare, x, margins_of(bare), 0.2)
+        rows = Watch(bare, margins_of(bare), x).rows(0.2)
         t = bare.with_apart(rows)
         out[name] = t, x + 0.02 * rng.standard_normal(t.program.n)
     return out
@@ -186,30 +155,45 @@ def programs(
 @pytest.mark.parametrize("name", ["arm", "biped"])
 def test_slopes_of_programs_with_such_rows_agree_with_differences(programs: Any, name: str) -> None:
     t, x = programs[name]
-    held = [h.facing is not None for h in t.apart_rows.values()]
-    assert len(held) > 20 and any(held) and not all(held)
+    assert len(t.apart_rows) > 20 and any(row.other < 0 for row in t.apart_rows)
+    assert name == "arm" or any(row.other >= 0 for row in t.apart_rows)
     check_derivatives(t.program, x)
 
 
 @pytest.mark.parametrize("name", ["arm", "biped"])
-def test_rows_say_how_far_spheres_and_planes_are_apart_at_their_places(programs: Any, name: str) -> None:
+def test_constraints_say_how_far_bodies_are_apart_at_their_places(programs: Any, name: str) -> None:
+    """By coal, whose distance theirs is less by what is rounded; where bodies are in each other, at most."""
     t, x = programs[name]
     names = [t.program.row_name(i) for i in range(t.program.m)]
     g, spots, bodies = t.program.constraints(x), spots_of(t, x), t.problem.bodies
-    looked = 0
     for row, held in t.apart_rows.items():
         k = spots.names.index(row.place)
-        expected = value_of(bodies, spots.at, k, row, held)
+        one, two = pieces(bodies, row)
+        at = [coal.Transform3s(*bodies.placement(spots.at, k, body)) for body in (row.joint, row.other)]
+        if row.other < 0:  # they know where the target was when they were made
+            body = bodies.world[-1 - row.other]
+            shift = body.place + held.travel * bodies.normal * body.moves
+            at[1] = coal.Transform3s(body.rotation, shift)
+        apart = coal.distance(one, at[0], two, at[1], coal.DistanceRequest(), coal.DistanceResult())
         what = " and ".join(bodies.names((row.joint, row.other)))
         term = SelfCollision.name if row.other >= 0 else KeepOut.name
-        of_row = [i for i, text in enumerate(names) if text == f"{term}, {row.place}, {what}"]
-        (i,) = of_row
-        assert -1e-9 <= g[i] - expected <= ROUNDED, names[i]
+        (i,) = [i for i, text in enumerate(names) if text == f"{term}, {row.place}, {what}"]
+        most = THIN + 1e-6
+        assert g[i] + held.reach <= apart + most, names[i]
+        if apart > 1e-3:
+            assert g[i] + held.reach >= apart - 10e-3, names[i]
         assert t.program.g_lower[i] == 0 and t.program.g_upper[i] == np.inf
-        looked += 1
         told, by = t.program.describe_violation(i, x, 0.012)
         assert told.startswith(term) and told.endswith(what) and by == "12 mm too near"
-    assert looked == len(t.apart_rows) == t.program.m - len(without(t).program.origins)
+    assert len(t.apart_rows) == t.program.m - len(without(t).program.origins)
+
+
+def pieces(bodies: Any, row: ApartRow) -> tuple[Any, Any]:
+    """As coal has them."""
+    if row.other < 0:
+        return bodies.links.of_joint[row.joint][row.number].shape, bodies.world[-1 - row.other].shape
+    one, two = bodies.pairs[row.joint, row.other][row.number]
+    return one.shape, two.shape
 
 
 def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
@@ -217,7 +201,7 @@ def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
 ) -> None:
     t = changed(arm_transcription)
     x = first_iterate(t)
-    more = t.with_apart(rows_near(t, x, margins_of(t), 0.2))
+    more = t.with_apart(Watch(t, margins_of(t), x).rows(0.2))
     assert more.program.m > t.program.m
     for program in (more.program, t.program):
         check_derivatives(program, x + 0.01)
@@ -225,42 +209,6 @@ def test_a_program_stays_as_it_is_when_one_with_more_rows_is_made_of_it(
 
 def without(t: Transcription) -> Transcription:
     return t.with_apart({})
-
-
-def value_of(bodies: Any, at: Places, k: int, row: ApartRow, held: Held) -> float:
-    """max n . x - h less reach [m], by Pinocchio's placements."""
-    turn, place = bodies.placement(at, k, row.joint)
-    centre = turn @ np.array(held.centre) + place
-    planes: Planes = bodies.links.planes[row.other] if row.other >= 0 else bodies.world[-1 - row.other].planes
-    turn, place = bodies.placement(at, k, row.other)
-    if row.other < 0:  # rows know where the target was when they were made
-        body = bodies.world[-1 - row.other]
-        place = body.place + held.travel * bodies.normal * body.moves
-    there = (centre - place) @ turn
-    known = planes.with_facing(held.facing)
-    normal, offset = known[: 3 * PLANES].reshape(-1, 3), known[3 * PLANES :]
-    return float((normal @ there - offset).max()) - held.reach
-
-
-@pytest.mark.parametrize("name", ["arm", "biped"])
-def test_a_row_that_knows_the_hulls_is_their_distance_where_it_was_made(
-    name: str, request: pytest.FixtureRequest
-) -> None:
-    """Less the margin; not where the two are in each other, of which other planes tell too."""
-    t: Transcription = request.getfixturevalue(f"{name}_transcription")
-    x, margins = first_iterate(t), margins_of(t)
-    spots, looked = spots_of(t, x), 0
-    for row, held in rows_near(t, x, margins, 0.2).items():
-        pair, k = margins.bodies.known(row.joint, row.other), spots.names.index(row.place)
-        apart = margins.bodies.exact(spots.at, k, pair)
-        value = value_of(margins.bodies, spots.at, k, row, held)
-        if held.facing is not None and apart > 0:
-            assert held.reach == pytest.approx(BEAD + margins.of(pair))
-            assert value == pytest.approx(apart - margins.of(pair), abs=1e-6)
-            looked += 1
-        elif apart > 0:
-            assert value <= apart - margins.of(pair) + 2e-3
-    assert looked > 3
 
 
 def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: Transcription) -> None:
@@ -274,8 +222,8 @@ def test_margins_are_less_where_bodies_are_near_at_the_start(arm_transcription: 
         assert margins.of((j, -1 - w)) <= KeepOut().margin
 
 
-def test_rows_of_spheres_are_met_at_the_start(biped_transcription: Transcription) -> None:
-    """Its back stands 2 mm before a wall, and the spheres of the trunk stick out by centimetres."""
+def test_constraints_are_met_at_the_start(biped_transcription: Transcription) -> None:
+    """Its back stands 2 mm before a wall, which is less than rounding takes."""
     free = biped_transcription.problem
     root = free.robot.model.getJointId("root")
     at = Places.of(free.robot, free.start_posture[None], np.zeros(1), np.zeros(1, dtype=np.intp))
@@ -284,10 +232,13 @@ def test_rows_of_spheres_are_met_at_the_start(biped_transcription: Transcription
     t = changed(biped_transcription, obstacles=(wall,))
     margins, pair = margins_of(t), (root, -1 - [body.name for body in t.problem.world].index("wall"))
     assert 0 < margins.bodies.exact(at, 0, pair) < 3e-3
-    spheres = {r: h for r, h in rows_near(t, first_iterate(t), margins).items() if h.facing is None}
-    assert any(row[1:3] == pair for row in spheres)
-    for row, held in spheres.items():
-        assert value_of(margins.bodies, at, 0, row, held) > 0, row
+    x = first_iterate(t)
+    rows = Watch(t, margins, x).rows()
+    assert any(row[1:3] == pair for row in rows)
+    shapes = margins.bodies.shapes
+    gaps = shapes.look(margins.bodies.placed(at), 1.0, np.zeros((1, len(shapes), 3)), margins.wanted).gaps[0]
+    for row, held in rows.items():
+        assert gaps[shapes.index[row[1:]]] > held.reach, row
 
 
 def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transcription) -> None:
@@ -301,7 +252,7 @@ def test_only_what_is_switched_off_is_not_kept_apart(biped_transcription: Transc
     ):
         problem = dataclasses.replace(biped_transcription.problem, terms=terms)
         assert problem.keeps_apart == (own or world)
-        rows = rows_near(biped_transcription, x, Margins(problem), 1.0)
+        rows = Watch(biped_transcription, Margins(problem), x).rows(1.0)
         assert any(row.other < 0 for row in rows) == world
         assert any(row.other >= 0 for row in rows) == own
 
@@ -382,20 +333,33 @@ def program_of(solution: Solution, problem: ImpactProblem) -> Transcription:
     return Transcription(problem, c, block_functions(problem, c), solution.nodes).with_apart(solution.apart)
 
 
-def test_rows_are_added_where_a_solution_touches_something(free: Solution, barred: Solution) -> None:
+def test_a_solution_that_touches_something_is_told_and_mended(free: Solution, barred: Solution) -> None:
     problem, x = barred.problem, free.result.x
     margins, t = Margins(problem), program_of(free, problem)
-    violated = rows_to_add(t, x, margins)
+    violated = bodies_too_near(t, x, margins)
     assert violated is not None and 0.02 < violated.depth < 0.1
     bar = -1 - [body.name for body in problem.bodies.world].index("bar")
-    assert {row.other for row in violated.rows} == {bar}
-    spots = {row.place for row in violated.rows}
-    assert spots <= set(spots_of(t, x).names)
-    here = missing_rows(t, x, margins)
-    assert here and {row.other for row in here} == {bar} and {row.place for row in here} <= spots
-    assert all(held.facing is not None for held in here.values())
-    # what has them already is asked for more, by rows of their own
-    again = missing_rows(t.with_apart(here), x, margins)
-    assert {row[:3] for row in again} == {row[:3] for row in here}
-    assert {row.number for row in again} == {row.number + 1 for row in here}
-    assert rows_to_add(program_of(barred, problem), barred.result.x, margins) is None
+    assert {other for _, other in violated.pairs} == {bar}
+    assert bodies_too_near(program_of(barred, problem), barred.result.x, margins) is None
+    depth, pairs = deepest(t, x, margins)
+    assert 0 < depth <= violated.depth + 1e-9 and {other for _, other in pairs} == {bar}
+    budget = Budget(solver="sqp", options=None, time_limit=None, callback=None)
+    mended, result = solved_apart(budget, margins, t, free.result)
+    assert result.status is Status.SOLVED and deepest(mended, result.x, margins)[0] <= 0
+
+
+def test_constraints_enter_before_bodies_can_touch(free: Solution, barred: Solution) -> None:
+    """From a start that is nowhere near the bar, at an iterate at which bodies are apart."""
+    problem = barred.problem
+    margins, t = Margins(problem), program_of(free, problem).with_apart({})
+    x = first_iterate(t)
+    watch = Watch(t, margins, x)
+    bar = -1 - [body.name for body in problem.bodies.world].index("bar")
+    step = free.result.x - x  # into the bar
+    part = watch.limit(x, step, 1.0)
+    assert 0 < part < 1
+    there = x + part * step
+    assert watch.lacks(there)
+    assert deepest(t, there, margins)[0] <= 0 < deepest(t, free.result.x, margins)[0]
+    rows = watch.rows()
+    assert bar in {row.other for row in rows} and not watch.lacks(there)

@@ -12,7 +12,7 @@ from support.small_plans import arm_problem, biped_problem, transcribed
 from impactopt import load_problem, optimize_strike
 from impactopt.collision import SDC
 from impactopt.errors import InputError
-from impactopt.planning.keeping_apart import Margins, rows_near
+from impactopt.planning.keeping_apart import Margins, Watch
 from impactopt.problem.objectives import Penetration
 from impactopt.problem.problem import ImpactProblem
 from impactopt.transcription.start import carried_over, strike_iterate
@@ -46,7 +46,7 @@ def test_slopes_agree_with_differences(robot: str) -> None:
 def test_a_result_starts_a_program_with_more_rows_between_bodies() -> None:
     t = of(load_problem("arm_planar"))
     x = strike_iterate(t)
-    rows = rows_near(t, x, Margins(t.problem), 1.0)
+    rows = Watch(t, Margins(t.problem), x).rows(1.0)
     finer, multipliers = t.with_apart(rows), np.arange(1.0, t.program.m + 1)
     new, y, _ = carried_over(finer, t, x, multipliers, np.zeros(len(x)))
     assert rows

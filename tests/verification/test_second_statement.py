@@ -14,6 +14,7 @@ from support.small_plans import Planned, arm_problem, changed, transcribed
 
 from impactopt.contact import FreeMass
 from impactopt.files.problem_file import load_problem
+from impactopt.planning.keeping_apart import Margins, Watch
 from impactopt.problem.objectives import Effort
 from impactopt.problem.problem import ImpactProblem
 from impactopt.problem.scenario import Scenario
@@ -82,6 +83,13 @@ def check_rows(t: Transcription) -> None:
 
 def test_of_a_robot_on_two_soles(biped_transcription: Transcription) -> None:
     check_rows(biped_transcription)
+
+
+def test_of_bodies_that_are_kept_apart(biped_transcription: Transcription) -> None:
+    t = changed(biped_transcription)
+    rows = Watch(t, Margins(dataclasses.replace(t.problem, terms=())), first_iterate(t)).rows(0.15)
+    assert len(rows) > 100
+    check_rows(t.with_apart(rows))
 
 
 def test_with_scenarios() -> None:

@@ -23,20 +23,31 @@ class Bounded:
     """
 
     def __init__(
-        self, values: Vector, lower: Vector, upper: Vector, *, push: float, multipliers: Vector, mu: float
+        self,
+        values: Vector,
+        lower: Vector,
+        upper: Vector,
+        *,
+        push: float,
+        multipliers: Vector,
+        mu: float,
+        kept: bool = False,
     ):
         """values : moved inside by `push`, relative to the bound and to the room between both (section 3.6).
 
         multipliers (k,) : positive at the upper bound, negative at the lower; each gets mu / distance at
-        least.
+        least.  kept : only where it has none.
         """
         # 1 where there is a bound, else 0; and the bound, else 0
         self._has_lower, self._has_upper = np.isfinite(lower).astype(float), np.isfinite(upper).astype(float)
         self._lower = np.where(self._has_lower > 0, lower, 0.0)
         self._upper = np.where(self._has_upper > 0, upper, 0.0)
         self._take(self._inside(values, push))
-        self.below = self._has_lower * np.maximum(-multipliers, mu / self._to_lower)
-        self.above = self._has_upper * np.maximum(multipliers, mu / self._to_upper)
+        low, high = mu / self._to_lower, mu / self._to_upper
+        if kept:
+            low, high = np.where(multipliers < 0, 0.0, low), np.where(multipliers > 0, 0.0, high)
+        self.below = self._has_lower * np.maximum(-multipliers, low)
+        self.above = self._has_upper * np.maximum(multipliers, high)
 
     def _take(self, values: Vector) -> None:
         self.values = values

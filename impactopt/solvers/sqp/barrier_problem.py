@@ -21,6 +21,7 @@ from impactopt.solvers.sqp.linesearch import SearchStart
 from impactopt.solvers.sqp.newton import acquire, release
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.point import Point, TimedProgram
+from impactopt.solvers.sqp.run import Path
 
 _FASTER = 0.2  # mu becomes min(0.2 mu, mu^power) (eq. 7)
 # the barrier problem is solved to so many mu (kappa_epsilon); then mu falls with this power: gently and
@@ -31,6 +32,8 @@ _CLOSE_ELASTIC, _POWER_ELASTIC = 10.0, 1.5
 _FINE, _FINEST = 0.6, 0.3  # times the tolerance: a mu that is small enough, and the least
 _PROXIMAL = 1.0  # times mu: weight of a step's own length, so that what nothing decides does not wander
 _LEFT = 0.1  # times mu: what a step may leave of the equations for it
+_PUSH = 1e-9  # into bounds, of an iterate that was left
+_NEW = 1e-3  # the least distance to its bound of a new row's slack
 _LARGE = 100.0  # mean multiplier from which on residuals are scaled (s_max)
 
 
@@ -77,12 +80,18 @@ class BarrierProblem:
         z: Vector,
         *,
         warm: bool,
+        path: Path | None = None,
         determined: Sequence[Determined],
     ):
-        """point : moved inside its bounds.  y (m,), z (n,) : multipliers to start from, if it is ``warm``."""
+        """point : moved inside its bounds.  y (m,), z (n,) : multipliers to start from, if it is ``warm``.
+
+        path : where they were left.
+        """
         self.program, self.options, self.warm = program, options, warm
+        self._at_once = warm and path is None and options.barrier_warm < _HIGH
         self.sigma = 1.0
         self.mu = options.barrier_warm if warm else options.barrier
+        self.mu = self.mu if path is None else path.barrier
         self.elastic: Elastic | None = None
         p, x = program, point.x
         moves = p.x_upper - p.x_lower > 1e-12
@@ -98,12 +107,13 @@ class BarrierProblem:
         self._condenser = c = self.newton.condenser
         lower = np.concatenate([p.g_lower, p.x_lower[c.bounded]])
         upper = np.concatenate([p.g_upper, p.x_upper[c.bounded]])
-        self._gone = lower[c.eliminated]
+        self._gone, everywhere = lower[c.eliminated], lower
         lower, upper = lower[c.rows], upper[c.rows]
         self._unequal, self._level = np.flatnonzero(lower < upper), lower[c.equal]
-        push = options.push
+        push = options.push if path is None else _PUSH
         free = np.where(moves, p.x_lower, -np.inf)[c.free], np.where(moves, p.x_upper, np.inf)[c.free]
-        self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu)
+        kept = path is not None
+        self.x = Bounded(x[c.free], *free, push=push, multipliers=z[c.free], mu=self.mu, kept=kept)
         x = x.copy()
         x[c.free] = self.x.values
         self.point = point = point if np.array_equal(x, point.x) else p.point(x)
@@ -112,13 +122,19 @@ class BarrierProblem:
         self.gone_y = multipliers[c.eliminated]
         self.row_multipliers, self.bound_multipliers = y, z
         rows = self._unequal
+        slacks = self._all(point)
+        if path is not None:
+            left = np.concatenate([path.rows, path.bounds[c.bounded]])
+            least = np.where(np.isfinite(everywhere), everywhere, -np.inf) + _NEW
+            slacks = np.where(np.isnan(left), np.maximum(slacks, least), left)
         self.s = Bounded(
-            self._all(point)[c.rows][rows],
+            slacks[c.rows][rows],
             lower[rows],
             upper[rows],
             push=push,
             multipliers=self.y[rows],
             mu=self.mu,
+            kept=kept,
         )
         if not warm:
             for values in (self.x, self.s):
@@ -127,6 +143,14 @@ class BarrierProblem:
     def release(self) -> None:
         """Give the Newton system's structure back, for the next program that has it."""
         release(self.newton)
+
+    def path(self) -> Path:
+        """Where this is, for a solve that goes on from there."""
+        c, slacks, n = self._condenser, self._all(self.point), self.point.x.copy()
+        slacks[c.rows[self._unequal]] = self.s.values
+        m = self.program.m
+        n[c.bounded] = slacks[m:]
+        return Path(self.mu, slacks[:m], n)
 
     def _all(self, point: Point) -> Vector:
         """Values of the program's rows, and of the bounded eliminated variables."""
@@ -180,7 +204,7 @@ class BarrierProblem:
         """Let mu fall as far as the iterate is good enough for; whether it has."""
         tolerance, hard, before = self.options.complementarity_tolerance, self.elastic is None, self.mu
         close, power = (_CLOSE, _POWER) if hard else (_CLOSE_ELASTIC, _POWER_ELASTIC)
-        if hard and self.warm and self.options.barrier_warm < _HIGH:
+        if hard and self._at_once:
             close = _CLOSE_WARM
         while self.mu > _FINE * tolerance and self.error(self.mu, residual) <= close * self.mu:
             self.mu = max(_FINEST * tolerance, min(_FASTER * self.mu, self.mu**power))

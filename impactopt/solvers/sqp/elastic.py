@@ -12,6 +12,8 @@ import numpy as np
 from impactopt.solvers.program import Vector
 from impactopt.solvers.sqp.barrier import longest
 
+_LEAST = 1e-14  # of the price: no multiplier is nearer to it
+
 
 class Elastic:
     """Excess p and lack n of all rows (k,), eliminated from the Newton system.
@@ -46,13 +48,18 @@ class Elastic:
 
     def compliance(self, y: Vector, mu: float) -> tuple[Vector, Vector]:
         """How far a row gives way per unit of multiplier, and the offset that goes with it."""
-        zp, zn = self.price - y, self.price + y
+        zp, zn = self._below_price(y)
         give = self._p / zp + self._n / zn
         return give, give * y - (mu / zp - self._p) + (mu / zn - self._n)
 
+    def _below_price(self, y: Vector) -> tuple[Vector, Vector]:
+        """How far multipliers are below the price, and above its opposite: more than rounding."""
+        least = _LEAST * self.price
+        return np.maximum(self.price - y, least), np.maximum(self.price + y, least)
+
     def step(self, new: Vector, y: Vector, mu: float) -> None:
         """Find the steps of p and n for new multipliers."""
-        dy, zp, zn = new - y, self.price - y, self.price + y
+        dy, (zp, zn) = new - y, self._below_price(y)
         self._dp = (mu - self._p * zp + self._p * dy) / zp
         self._dn = (mu - self._n * zn - self._n * dy) / zn
 

@@ -26,7 +26,6 @@ from impactopt.solvers.sqp.run import Run, Task
 from impactopt.solvers.sqp.search import LineSearch
 
 _ABSURD = 1e12  # multipliers beyond this come from rows that have none
-_NEAR = 5e-4  # barriers below this are near the end
 _RESTARTS = 2  # where nothing is progress any more
 
 
@@ -36,8 +35,8 @@ class InteriorRun(Run):
     def __init__(self, task: Task):
         super().__init__(task)
         self._determined: Sequence[Determined] = getattr(task.program, "determined", ())
-        self._search, self._phase = LineSearch(), ElasticPhase(self.options)
-        self._leave = task.leave
+        self._search, self._phase = LineSearch(task.watch), ElasticPhase(self.options)
+        self._watch, self._path = task.watch, task.path
 
     def iterate(self) -> Status:
         self.point = self.program.point(self.point.x)
@@ -83,9 +82,10 @@ class InteriorRun(Run):
             self.y,
             self.z,
             warm=self._warm,
+            path=self._path,
             determined=self._determined,
         )
-        self.point = self._problem.point
+        self.point, self._path = self._problem.point, None
         self._phase.begin()
         self._search.forget()
 
@@ -109,6 +109,8 @@ class InteriorRun(Run):
             error = problem.error(0.0, residual)
             if self.report.iteration(self.point, problem.kkt, note):
                 return Status.INTERRUPTED
+            if self._lacks():
+                return Status.ACCEPTABLE
             if error <= self.options.kkt_tolerance or phase.restored(problem):
                 verdict = phase.verdict(problem)
                 if verdict is not None:
@@ -123,14 +125,20 @@ class InteriorRun(Run):
                 return Status.TIME_LIMIT
             if problem.lower_barrier(residual):
                 self._search.forget()
-                near = problem.mu < _NEAR and problem.elastic is None
-                if near and self._leave is not None and self._leave(self.point.x):
-                    return Status.ACCEPTABLE
             found = self._advance(residual)
             if isinstance(found, Status):
                 return found
             note = found
         return Status.ITERATION_LIMIT
+
+    def _lacks(self) -> bool:
+        """Whether the program lacks constraints at the iterate."""
+        if self._watch is None or self._problem.elastic is not None:
+            return False
+        if not self._watch.lacks(self.point.x):
+            return False
+        self._watch.leave(self._problem.path())
+        return True
 
     def _advance(self, residual: Vector) -> str | Status:
         """Move to the next point; what to note about it, or why there is none."""

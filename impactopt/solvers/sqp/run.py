@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from impactopt.solvers.program import Callback, NonlinearProgram, Status, Vector
 from impactopt.solvers.sqp.options import SQPOptions
@@ -12,11 +12,37 @@ from impactopt.solvers.sqp.point import TimedProgram
 from impactopt.solvers.sqp.report import Report
 
 
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Where a solve was left: its barrier, and the slacks of rows (m,) and of variables' bounds (n,), what
+    has none its own value. NaN: of a row that is new.
+    """
+
+    barrier: float
+    rows: Vector
+    bounds: Vector
+
+
+class Watch(Protocol):
+    """One who knows more of a program than it says: constraints that it will need, once iterates come near
+    to what they forbid.
+    """
+
+    def lacks(self, x: Vector) -> bool:
+        """Whether an iterate (n,) asks for constraints that the program has not."""
+
+    def leave(self, path: Path) -> None:
+        """Where the solve is left for that."""
+
+    def limit(self, x: Vector, step: Vector, most: float) -> float:
+        """The part of a step (n,) from an iterate (n,), ``most`` at most, that may be taken."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
     """What a run is to do: from x (n,), with a guess of the multipliers, y (m,) of rows, z (n,) of bounds.
 
-    leave : as of `solve_sqp`.
+    watch, path : as of `solve_sqp`.
     """
 
     program: NonlinearProgram
@@ -25,7 +51,8 @@ class Task:
     x: Vector
     y: Vector
     z: Vector
-    leave: Callable[[Vector], bool] | None
+    watch: Watch | None = None
+    path: Path | None = None
 
 
 class Run(ABC):

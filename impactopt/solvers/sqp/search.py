@@ -10,6 +10,7 @@ from typing import NamedTuple
 from impactopt.solvers.program import Vector
 from impactopt.solvers.sqp.barrier_problem import BarrierProblem, Step, Trial
 from impactopt.solvers.sqp.linesearch import Filter, SearchStart
+from impactopt.solvers.sqp.run import Watch
 
 _CORRECTIONS = 4  # second-order corrections a step, at most
 _WORSE = 0.99  # a correction that leaves more than this part of the violation ends them
@@ -31,7 +32,9 @@ class Found(NamedTuple):
 class LineSearch:
     """The filter, and how long steps have been short."""
 
-    def __init__(self) -> None:
+    def __init__(self, watch: Watch | None = None) -> None:
+        """watch : who says how far a step may go."""
+        self._watch = watch
         self._filter: Filter | None = None
         self._crawled = 0  # iterations of short steps
 
@@ -42,11 +45,13 @@ class LineSearch:
     def find(self, problem: BarrierProblem, step: Step, residual: Vector) -> Found | None:
         """The part of a step that is progress; None where there is none, or has hardly been any for long."""
         longest = problem.longest(step)
+        most = self._most(problem, step, longest)
+        longest = min(longest, most)
         at = problem.progress(step, residual)
         if self._filter is None:
             self._filter = Filter.around(at.theta)
         among = self._filter
-        found = _bent(problem, among, step, at, longest) or _searched(
+        found = _bent(problem, among, step, at, longest, most) or _searched(
             problem, among, step, at, longest, residual
         )
         crawls = found is None or found.length < _CRAWL
@@ -57,9 +62,14 @@ class LineSearch:
         among.remember(at, found.length, found.trial.phi)
         return found
 
+    def _most(self, problem: BarrierProblem, step: Step, longest: float) -> float:
+        """The part of a step that who watches lets it take, bent or not."""
+        most = max(longest, problem.x.longest(step.free, problem.keep))
+        return most if self._watch is None else self._watch.limit(problem.point.x, step.d, most)
+
 
 def _bent(
-    problem: BarrierProblem, among: Filter, step: Step, at: SearchStart, longest: float
+    problem: BarrierProblem, among: Filter, step: Step, at: SearchStart, longest: float, most: float
 ) -> Found | None:
     """The step as far as the bounds of variables let it, where it is slacks that stop it: each of them
     stops by itself short of its own bound, and what its row is then off by is the next step's to mend.
@@ -69,7 +79,7 @@ def _bent(
     """
     if problem.elastic is not None or problem.point.max_violation > _BENT:
         return None
-    length = problem.x.longest(step.free, problem.keep)
+    length = min(most, problem.x.longest(step.free, problem.keep))
     if length <= _LONGER * longest:
         return None
     slack = problem.s.short_of_bounds(problem.s.values + length * step.slack, _SHORT)

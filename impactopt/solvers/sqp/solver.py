@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 
 from impactopt.errors import check_array
-from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, Vector, check_program
+from impactopt.solvers.program import Callback, NonlinearProgram, SolverResult, Status, check_program
 from impactopt.solvers.sqp.interior import InteriorRun
 from impactopt.solvers.sqp.options import SQPOptions
 from impactopt.solvers.sqp.reduced import ReducedRun
-from impactopt.solvers.sqp.run import Run, Task
+from impactopt.solvers.sqp.run import Path, Run, Task, Watch
 from impactopt.solvers.sqp.sl1qp import Sl1QPRun
 from impactopt.solvers.threads import threads
 
@@ -25,7 +23,8 @@ def solve_sqp(
     callback: Callback | None = None,
     multipliers: npt.ArrayLike | None = None,
     bound_multipliers: npt.ArrayLike | None = None,
-    leave: Callable[[Vector], bool] | None = None,
+    watch: Watch | None = None,
+    path: Path | None = None,
 ) -> SolverResult:
     """Solve a nonlinear program by sequential quadratic programming.
 
@@ -36,8 +35,9 @@ def solve_sqp(
     options : see `SQPOptions`.
     callback : progress, once an iteration; True or KeyboardInterrupt stops with the best iterate.
     multipliers, bound_multipliers : guess of the multipliers (m,), (n,), from a similar program.
-    leave : asked with the iterate (n,), each time that the interior-point method lets its barrier fall near
-        the end: whether it is as good as the optimum for what it is for. Then the status is `ACCEPTABLE`.
+    watch : of the interior-point method; asked at every iterate whether the program lacks constraints there,
+        which ends the solve with the status `ACCEPTABLE`, and before every step how far it may go.
+    path : where a solve was left that x0 and the multipliers are of: it goes on as that would have.
 
     Returns
     -------
@@ -56,7 +56,16 @@ def solve_sqp(
     )
     x0 = np.clip(x0, program.x_lower, program.x_upper)
     options = options or SQPOptions()
-    task = Task(program=program, options=options, callback=callback, x=x0, y=y, z=z, leave=leave)
+    task = Task(
+        program=program,
+        options=options,
+        callback=callback,
+        x=x0,
+        y=y,
+        z=z,
+        watch=watch,
+        path=path,
+    )
     interior = options.qp_solver == "interior"
     determined = getattr(program, "determined", ())
     reduced = ReducedRun(task, determined) if determined and not interior else None

@@ -1,0 +1,1 @@
+"""C code, compiled when it is first needed."""

@@ -1,0 +1,346 @@
+/* Signed distances of convex bodies by their rounded support functions; bodies/separation.py says what they are,
+ * bodies/separation_numpy.py does the same without a compiler. */
+#include <math.h>
+#include <stdint.h>
+
+#define EXPORT __attribute__((visibility("default")))
+#define MOST_JOINTS 64
+#define FAR_DOWN 36.0 /* exponents below the largest that count for nothing */
+
+/* of one direction: rounded support, mean and covariance of the points that carry it */
+typedef struct { double h, mean[3], cov[6]; } Support;
+
+/* Vertices stand in blocks of EIGHT: their x, their y, their z; the last block is filled up with copies. */
+#define EIGHT 8
+#define BLOCK (3 * EIGHT)
+#define COORDINATE(p, i, k) (p)[BLOCK * ((i) / EIGHT) + EIGHT * (k) + (i) % EIGHT]
+
+/* The largest of n vertices' heights in direction u; all of them in far. */
+static inline double heights(int64_t n, const double *restrict p, const double *u, double *restrict far) {
+    double most[EIGHT], top;
+    const double x = u[0], y = u[1], z = u[2];
+    for (int j = 0; j < EIGHT; ++j) most[j] = -1e300;
+    for (int64_t i = 0; i < n; i += EIGHT, p += BLOCK, far += EIGHT)
+        for (int j = 0; j < EIGHT; ++j) {
+            const double f = p[j] * x + p[EIGHT + j] * y + p[2 * EIGHT + j] * z;
+            far[j] = f;
+            most[j] = f > most[j] ? f : most[j];
+        }
+    top = most[0];
+    for (int j = 1; j < EIGHT; ++j) top = most[j] > top ? most[j] : top;
+    return top;
+}
+
+/* of n vertices in direction u; sharp: 1 / rounding */
+static void support(int64_t n, const double *restrict p, const double *u, double sharp, double *restrict far,
+                    Support *out) {
+    const double most = heights(n, p, u, far), least = most - FAR_DOWN / sharp;
+    double sum = 0.0, m0 = 0, m1 = 0, m2 = 0, c[6] = {0};
+    int64_t top = 0;
+    while (top < n - 1 && far[top] != most) ++top;
+    const double ox = COORDINATE(p, top, 0), oy = COORDINATE(p, top, 1), oz = COORDINATE(p, top, 2);
+    for (int64_t i = 0; i < n; ++i) {
+        if (far[i] < least) continue;
+        double e = exp(sharp * (far[i] - most));
+        double x = COORDINATE(p, i, 0) - ox, y = COORDINATE(p, i, 1) - oy, z = COORDINATE(p, i, 2) - oz;
+        sum += e; m0 += e * x; m1 += e * y; m2 += e * z;
+        c[0] += e * x * x; c[1] += e * x * y; c[2] += e * x * z;
+        c[3] += e * y * y; c[4] += e * y * z; c[5] += e * z * z;
+    }
+    m0 /= sum; m1 /= sum; m2 /= sum;
+    out->h = most + log(sum) / sharp;
+    out->mean[0] = ox + m0; out->mean[1] = oy + m1; out->mean[2] = oz + m2;
+    out->cov[0] = c[0] / sum - m0 * m0; out->cov[1] = c[1] / sum - m0 * m1; out->cov[2] = c[2] / sum - m0 * m2;
+    out->cov[3] = c[3] / sum - m1 * m1; out->cov[4] = c[4] / sum - m1 * m2; out->cov[5] = c[5] / sum - m2 * m2;
+}
+
+static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+static inline void cross(const double *a, const double *b, double *c) {
+    c[0] = a[1] * b[2] - a[2] * b[1]; c[1] = a[2] * b[0] - a[0] * b[2]; c[2] = a[0] * b[1] - a[1] * b[0];
+}
+static inline void times(const double *R, const double *x, double *y) {
+    for (int i = 0; i < 3; ++i) y[i] = R[3 * i] * x[0] + R[3 * i + 1] * x[1] + R[3 * i + 2] * x[2];
+}
+static inline void times_t(const double *R, const double *x, double *y) {
+    for (int i = 0; i < 3; ++i) y[i] = R[i] * x[0] + R[3 + i] * x[1] + R[6 + i] * x[2];
+}
+static inline void symmetric(const double *c, const double *x, double *y) {
+    y[0] = c[0] * x[0] + c[1] * x[1] + c[2] * x[2];
+    y[1] = c[1] * x[0] + c[3] * x[1] + c[4] * x[2];
+    y[2] = c[2] * x[0] + c[4] * x[1] + c[5] * x[2];
+}
+
+/* both bodies in one direction u from the second to the first, in the second's frame */
+typedef struct {
+    double s, w[3], point[3], cov_one[6], cov[6]; /* separation, its slope, the first's point, covariances */
+    double basis[6], bend[3], slope[2];           /* tangents; -Hessian on them (xx, xy, yy), slope on them */
+    double u[3];
+} Side; /* SIDE numbers */
+
+static void side(const double *R, const double *t, int64_t n1, const double *p1, int64_t n2, const double *p2,
+                 const double *u, double sharp, double *far, Side *out) {
+    Support a, b;
+    double down[3] = {-u[0], -u[1], -u[2]}, local[3], first[3], half[9];
+    times_t(R, down, local);
+    support(n1, p1, local, sharp, far, &a);
+    support(n2, p2, u, sharp, far, &b);
+    times(R, a.mean, first);
+    for (int i = 0; i < 3; ++i) out->point[i] = first[i] + t[i];
+    out->s = dot(u, t) - a.h - b.h;
+    for (int i = 0; i < 3; ++i) out->w[i] = out->point[i] - b.mean[i];
+    /* R cov R' */
+    const double full[9] = {a.cov[0], a.cov[1], a.cov[2], a.cov[1], a.cov[3], a.cov[4], a.cov[2], a.cov[4], a.cov[5]};
+    for (int i = 0; i < 3; ++i) for (int j = 0; j < 3; ++j)
+        half[3 * i + j] = R[3 * i] * full[j] + R[3 * i + 1] * full[3 + j] + R[3 * i + 2] * full[6 + j];
+    int k = 0;
+    for (int i = 0; i < 3; ++i) for (int j = i; j < 3; ++j, ++k) {
+        out->cov_one[k] = half[3 * i] * R[3 * j] + half[3 * i + 1] * R[3 * j + 1] + half[3 * i + 2] * R[3 * j + 2];
+        out->cov[k] = out->cov_one[k] + b.cov[k];
+    }
+    double *x = out->basis, *y = out->basis + 3, turned[3];
+    int least = fabs(u[0]) < fabs(u[1]) ? (fabs(u[0]) < fabs(u[2]) ? 0 : 2) : (fabs(u[1]) < fabs(u[2]) ? 1 : 2);
+    double e[3] = {0, 0, 0}; e[least] = 1.0;
+    cross(u, e, x);
+    double length = sqrt(dot(x, x));
+    for (int i = 0; i < 3; ++i) x[i] /= length;
+    cross(u, x, y);
+    const double along = dot(u, out->w);
+    symmetric(out->cov, x, turned);
+    out->bend[0] = sharp * dot(turned, x) + along; out->bend[1] = sharp * dot(turned, y);
+    symmetric(out->cov, y, turned);
+    out->bend[2] = sharp * dot(turned, y) + along;
+    out->slope[0] = dot(x, out->w); out->slope[1] = dot(y, out->w);
+}
+
+/* make bend positive definite: its inverse (xx, xy, yy) */
+static void inverse(const double *bend, double floor, double *out) {
+    double mean = 0.5 * (bend[0] + bend[2]), diff = 0.5 * (bend[0] - bend[2]);
+    double radius = sqrt(diff * diff + bend[1] * bend[1]), low = mean - radius, more = low < floor ? floor - low : 0.0;
+    double a = bend[0] + more, c = bend[2] + more, b = bend[1], d = a * c - b * b;
+    out[0] = c / d; out[1] = -b / d; out[2] = a / d;
+}
+
+/* Where a stationary direction is no maximum, as bodies are in each other: a step along the way that it curves up.
+ * Returns whether there is one. */
+static int off_saddle(const Side *at, double *step) {
+    double mean = 0.5 * (at->bend[0] + at->bend[2]), diff = 0.5 * (at->bend[0] - at->bend[2]);
+    double radius = sqrt(diff * diff + at->bend[1] * at->bend[1]), low = mean - radius;
+    if (low > -1e-9) return 0;
+    double a = at->bend[1], b = low - at->bend[0];
+    if (fabs(a) + fabs(b) < 1e-14) { a = 1.0; b = 0.0; }
+    double length = sqrt(a * a + b * b), way = a * at->slope[0] + b * at->slope[1] < 0.0 ? -0.1 : 0.1;
+    step[0] = way * a / length; step[1] = way * b / length;
+    return 1;
+}
+
+/* The largest separation near direction u (3), which moves there: Newton's method on the sphere. */
+static void separate(const double *R, const double *t, int64_t n1, const double *p1, int64_t n2, const double *p2,
+                    double *u, double sharp, double *far, Side *at) {
+    side(R, t, n1, p1, n2, p2, u, sharp, far, at);
+    for (int taken = 0; taken < 100; ++taken) {
+        double inv[3], step[2], next[3];
+        inverse(at->bend, 1e-4, inv);
+        step[0] = inv[0] * at->slope[0] + inv[1] * at->slope[1];
+        step[1] = inv[1] * at->slope[0] + inv[2] * at->slope[1];
+        double size = sqrt(step[0] * step[0] + step[1] * step[1]), gain = step[0] * at->slope[0] + step[1] * at->slope[1];
+        if (size < 1e-9 && off_saddle(at, step)) { size = 0.1; gain = 0.0; }
+        if (size < 1e-11) break;
+        double part = size > 0.5 ? 0.5 / size : 1.0;
+        Side found;
+        int moved = 0;
+        for (int tries = 0; tries < 30; ++tries, part *= 0.4) {
+            for (int i = 0; i < 3; ++i) next[i] = u[i] + part * (at->basis[i] * step[0] + at->basis[3 + i] * step[1]);
+            double length = sqrt(dot(next, next));
+            for (int i = 0; i < 3; ++i) next[i] /= length;
+            side(R, t, n1, p1, n2, p2, next, sharp, far, &found);
+            if (found.s >= at->s + 1e-4 * part * gain || size < 1e-5) { moved = 1; break; }
+        }
+        if (!moved) break;
+        for (int i = 0; i < 3; ++i) u[i] = next[i];
+        *at = found;
+        if (part * size < 1e-7 && !off_saddle(at, step)) break;
+    }
+}
+
+/* The chain's frames: rotation R (9), translation t (3) of the end; axes and origins (n, 3) of joints. */
+static void chain(int64_t n, const double *z, const double *p, double *R, double *t, double *axis, double *origin) {
+    const double *turns = p + 12 * (n + 1);
+    for (int i = 0; i < 9; ++i) R[i] = p[i];
+    for (int i = 0; i < 3; ++i) t[i] = p[9 + i] + z[i];
+    for (int64_t k = 0; k < n; ++k) {
+        const double *next = p + 12 * (k + 1), q = z[3 + k];
+        double turned[9], shift[3];
+        for (int i = 0; i < 3; ++i) { axis[3 * k + i] = R[3 * i + 2]; origin[3 * k + i] = t[i]; }
+        if (turns[k] > 0.5) {
+            double c = cos(q), s = sin(q);
+            for (int i = 0; i < 3; ++i) {
+                double a = R[3 * i], b = R[3 * i + 1];
+                R[3 * i] = c * a + s * b; R[3 * i + 1] = c * b - s * a;
+            }
+        } else for (int i = 0; i < 3; ++i) t[i] += q * R[3 * i + 2];
+        times(R, next + 9, shift);
+        for (int i = 0; i < 3; ++i) t[i] += shift[i];
+        for (int i = 0; i < 3; ++i) for (int j = 0; j < 3; ++j)
+            turned[3 * i + j] = R[3 * i] * next[j] + R[3 * i + 1] * next[3 + j] + R[3 * i + 2] * next[6 + j];
+        for (int i = 0; i < 9; ++i) R[i] = turned[i];
+    }
+}
+
+/* Separations less reach of count pairs, whose chains have n joints.
+ * z (count, n + 3); p (count, 13 n + 13): chain, then reach.  hulls (count, 4): first point and number of points of
+ * both, firsts multiples of EIGHT; points: blocks.  u (count, 3): directions to begin at, moved where derivatives are asked for.
+ * known (count, SIDE), seen (count, n + 3): what was found last, and at which z.  far: room for the largest hull.
+ * what 0: values (count,); 1: gradients (count, n + 3); 2: lam times Hessians, lower triangles by columns. */
+EXPORT void separation(int64_t count, int64_t n, const double *z, const double *p, const int64_t *hulls,
+                          const double *points, double sharp, double *u, double *known, double *seen, double *far, int64_t what, const double *lam,
+                          double *out) {
+    const int64_t size = n + 3, width = 13 * n + 13;
+    for (int64_t row = 0; row < count; ++row) {
+        double R[9], t[3], axis[3 * MOST_JOINTS], origin[3 * MOST_JOINTS];
+        const double *mine = p + row * width, *turns = mine + 12 * (n + 1);
+        const int64_t *h = hulls + 4 * row;
+        double way[3], *last = seen + row * size;
+        Side *kept = (Side *)known + row, at;
+        int same = 1;
+        for (int64_t i = 0; i < size; ++i) same &= last[i] == z[row * size + i];
+        if (!same || what) chain(n, z + row * size, mine, R, t, axis, origin);
+        if (!same) {
+            for (int i = 0; i < 3; ++i) way[i] = u[3 * row + i];
+            separate(R, t, h[1], points + 3 * h[0], h[3], points + 3 * h[2], way, sharp, far, &at);
+            for (int i = 0; i < 3; ++i) at.u[i] = way[i];
+            *kept = at;
+            for (int64_t i = 0; i < size; ++i) last[i] = z[row * size + i];
+        } else {
+            at = *kept;
+            for (int i = 0; i < 3; ++i) way[i] = at.u[i];
+        }
+        if (what) for (int i = 0; i < 3; ++i) u[3 * row + i] = way[i];
+        if (what == 0) { out[row] = at.s - mine[13 * n + 12]; continue; }
+        double arm[3 * MOST_JOINTS];
+        for (int64_t k = 0; k < n; ++k) {
+            double from[3] = {at.point[0] - origin[3 * k], at.point[1] - origin[3 * k + 1], at.point[2] - origin[3 * k + 2]};
+            if (turns[k] > 0.5) cross(axis + 3 * k, from, arm + 3 * k);
+            else for (int i = 0; i < 3; ++i) arm[3 * k + i] = axis[3 * k + i];
+        }
+        if (what == 1) {
+            double *g = out + row * size;
+            for (int i = 0; i < 3; ++i) g[i] = way[i];
+            for (int64_t k = 0; k < n; ++k) g[3 + k] = dot(way, arm + 3 * k);
+            continue;
+        }
+        const double by = lam[row];
+        double *H = out + row * size * (size + 1) / 2;
+        if (by == 0.0) { for (int64_t i = 0; i < size * (size + 1) / 2; ++i) H[i] = 0.0; continue; }
+        /* what a variable turns the direction by: cross (2,) of slopes; f = u x axis, C f */
+        double f[3 * MOST_JOINTS], Cf[3 * MOST_JOINTS], mixed[2 * (MOST_JOINTS + 3)], spread[2 * (MOST_JOINTS + 3)], inv[3];
+        inverse(at.bend, 1e-4, inv);
+        for (int i = 0; i < 3; ++i) { mixed[2 * i] = at.basis[i]; mixed[2 * i + 1] = at.basis[3 + i]; }
+        for (int64_t k = 0; k < n; ++k) {
+            double m[3];
+            if (turns[k] > 0.5) { cross(way, axis + 3 * k, f + 3 * k); symmetric(at.cov_one, f + 3 * k, Cf + 3 * k); }
+            else for (int i = 0; i < 3; ++i) f[3 * k + i] = Cf[3 * k + i] = 0.0;
+            for (int i = 0; i < 3; ++i) m[i] = arm[3 * k + i] - sharp * Cf[3 * k + i];
+            mixed[2 * (3 + k)] = dot(at.basis, m); mixed[2 * (3 + k) + 1] = dot(at.basis + 3, m);
+        }
+        for (int64_t k = 0; k < size; ++k) {
+            spread[2 * k] = inv[0] * mixed[2 * k] + inv[1] * mixed[2 * k + 1];
+            spread[2 * k + 1] = inv[1] * mixed[2 * k] + inv[2] * mixed[2 * k + 1];
+        }
+        for (int64_t i = 0; i < size; ++i) for (int64_t k = i; k < size; ++k) {
+            double v = spread[2 * i] * mixed[2 * k] + spread[2 * i + 1] * mixed[2 * k + 1];
+            if (i >= 3) /* u . (axis_i x arm_k) - sharp f_i C f_k */
+                v += dot(f + 3 * (i - 3), arm + 3 * (k - 3)) - sharp * dot(f + 3 * (i - 3), Cf + 3 * (k - 3));
+            *H++ = by * v;
+        }
+    }
+}
+
+/* ---- which pairs are near: places of joints (K, J, 12) and of the world's bodies (K, W, 12), rotation by rows, translation.
+ * pairs (P, 2): joint, and joint or -1 - the world's body.  balls (P, 8): centre and radius of both; of the world's: half
+ * sides and radius.  hulls (P, 4).  extra (P,): inflation of the second.  present (K, W).
+ * ways (K, P, 3): directions, which move; zero: none known.  gaps (K, P): lower bounds of separations, or the separations
+ * where those are below within.  Returns the number of pairs below `within`, in near (2 each), at most `most`. */
+static void relative(const double *a, const double *b, double *R) {
+    double d[3] = {a[9] - b[9], a[10] - b[10], a[11] - b[11]};
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) R[3 * i + j] = b[i] * a[j] + b[3 + i] * a[3 + j] + b[6 + i] * a[6 + j];
+        R[9 + i] = b[i] * d[0] + b[3 + i] * d[1] + b[6 + i] * d[2];
+    }
+}
+EXPORT int64_t look(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints, const double *world,
+                    const int64_t *pairs, const double *balls, const int64_t *hulls, const double *extra,
+                    const uint8_t *present, const uint8_t *wanted, const double *points, double sharp, double within, double *ways,
+                    double *gaps, double *far, int64_t most, int64_t *near) {
+    int64_t found = 0;
+    for (int64_t k = 0; k < K; ++k) for (int64_t i = 0; i < P; ++i) {
+        double *u = ways + 3 * (k * P + i), *gap = gaps + k * P + i;
+        *gap = 1e3;
+        if (!wanted[i]) continue;
+        int64_t other = pairs[2 * i + 1];
+        if (other < 0 && !present[k * W - 1 - other]) continue;
+        const double *a = joints + 12 * (k * J + pairs[2 * i]);
+        const double *b = other < 0 ? world + 12 * (k * W - 1 - other) : joints + 12 * (k * J + other);
+        const double *ball = balls + 8 * i;
+        double c[3], rel[3], x[3], R[12], bound;
+        times(a, ball, c);
+        for (int j = 0; j < 3; ++j) c[j] += a[9 + j];
+        if (other >= 0) {
+            double e[3]; times(b, ball + 4, e);
+            for (int j = 0; j < 3; ++j) rel[j] = c[j] - e[j] - b[9 + j];
+            bound = sqrt(dot(rel, rel)) - ball[3] - ball[7];
+        } else {
+            for (int j = 0; j < 3; ++j) rel[j] = c[j] - b[9 + j];
+            times_t(b, rel, x);
+            double out[3], most_in = -1e300, sum = 0.0;
+            for (int j = 0; j < 3; ++j) {
+                double d = fabs(x[j]) - ball[4 + j];
+                if (d > most_in) most_in = d;
+                out[j] = d > 0 ? d : 0.0; sum += out[j] * out[j];
+            }
+            bound = (most_in > 0 ? sqrt(sum) : most_in) - ball[3] - ball[7];
+            for (int j = 0; j < 3; ++j) rel[j] = sum > 0 ? (x[j] > 0 ? out[j] : -out[j]) : (fabs(x[j]) - ball[4 + j] == most_in ? (x[j] > 0 ? 1.0 : -1.0) : 0.0);
+        }
+        *gap = bound;
+        if (bound > within) continue;
+        relative(a, b, R);
+        if (u[0] == 0.0 && u[1] == 0.0 && u[2] == 0.0) {
+            if (other >= 0) { for (int j = 0; j < 3; ++j) x[j] = rel[j]; times_t(b, x, rel); }
+            double length = sqrt(dot(rel, rel)) + 1e-300;
+            for (int j = 0; j < 3; ++j) u[j] = rel[j] / length;
+        }
+        const int64_t *h = hulls + 4 * i;
+        double down[3] = {-u[0], -u[1], -u[2]}, local[3];
+        times_t(R, down, local);
+        double rough = dot(u, R + 9) - heights(h[1], points + 3 * h[0], local, far) - heights(h[3], points + 3 * h[2], u, far) - extra[i];
+        rough -= 10.0 / sharp;
+        if (rough > within) { *gap = rough; continue; }
+        Side at;
+        separate(R, R + 9, h[1], points + 3 * h[0], h[3], points + 3 * h[2], u, sharp, far, &at);
+        *gap = at.s - extra[i];
+        if (*gap < within && found < most) { near[2 * found] = k; near[2 * found + 1] = i; ++found; }
+    }
+    return found;
+}
+/* Whether bodies may have met on the way between two sets of places: for pairs that are apart at both, by how far the
+ * first's ball moves as the second sees it.  Returns the number of pairs that may have, in met (2 each). */
+EXPORT int64_t may_meet(int64_t K, int64_t J, int64_t W, int64_t P, const double *joints0, const double *world0,
+                        const double *joints1, const double *world1, const int64_t *pairs, const double *balls,
+                        const uint8_t *wanted, const double *gaps0, const double *gaps1, int64_t most, int64_t *met) {
+    int64_t found = 0;
+    for (int64_t k = 0; k < K; ++k) for (int64_t i = 0; i < P; ++i) {
+        double g = gaps0[k * P + i] + gaps1[k * P + i];
+        if (!wanted[i] || gaps0[k * P + i] <= 0.0 || gaps1[k * P + i] <= 0.0 || g > 5.0) continue;
+        int64_t other = pairs[2 * i + 1];
+        double R0[12], R1[12], x0[3], x1[3];
+        const double *ball = balls + 8 * i;
+        relative(joints0 + 12 * (k * J + pairs[2 * i]), other < 0 ? world0 + 12 * (k * W - 1 - other) : joints0 + 12 * (k * J + other), R0);
+        relative(joints1 + 12 * (k * J + pairs[2 * i]), other < 0 ? world1 + 12 * (k * W - 1 - other) : joints1 + 12 * (k * J + other), R1);
+        times(R0, ball, x0); times(R1, ball, x1);
+        double d = 0.0, trace = 0.0;
+        for (int j = 0; j < 3; ++j) { double e = x1[j] + R1[9 + j] - x0[j] - R0[9 + j]; d += e * e; }
+        for (int j = 0; j < 9; ++j) trace += R0[j] * R1[j];
+        double cosine = fmax(-1.0, fmin(1.0, 0.5 * (trace - 1.0)));
+        if (sqrt(d) + acos(cosine) * ball[3] >= g && found < most) { met[2 * found] = k; met[2 * found + 1] = i; ++found; }
+    }
+    return found;
+}

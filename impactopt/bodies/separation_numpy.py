@@ -1,0 +1,266 @@
+"""What native/separation.c does, without a compiler: the same numbers, a hundred times as slowly."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ROUNDING", "look", "may_meet", "write"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+ROUNDING = 1e-3  # [m] of supports
+_SHARP = 1 / ROUNDING
+_FLOOR = 1e-4  # least curvature of a separation along its direction's tangents
+_LONGEST, _STEPS, _TRIES = 0.5, 100, 30  # [rad] a step, and how many of them
+
+
+class _Support(NamedTuple):
+    """Of m bodies in directions: rounded supports (m,), mean (m, 3) and covariance (m, 3, 3) of the points
+    that carry them.
+    """
+
+    height: Array
+    mean: Array
+    spread: Array
+
+
+class _Side(NamedTuple):
+    """Of m pairs in directions u from the second to the first, in the second's frame; see the C code."""
+
+    separation: Array
+    slope: Array  # w (m, 3)
+    point: Array
+    spread_one: Array
+    tangents: Array  # (m, 2, 3)
+    bend: Array  # (m, 2, 2)
+
+
+def _gathered(points: Array, hulls: Index) -> tuple[Array, NDArray[np.bool_]]:
+    """Vertices (m, most, 3) of hulls (m, 2), and which of them are there."""
+    most = int(hulls[:, 1].max(initial=1))
+    at = hulls[:, :1] + np.minimum(np.arange(most), hulls[:, 1:] - 1)
+    return points[at], np.arange(most) < hulls[:, 1:]
+
+
+def _support(vertices: Array, there: NDArray[np.bool_], u: Array) -> _Support:
+    sharp = _SHARP
+    height = np.where(there, np.einsum("mki,mi->mk", vertices, u), -np.inf)
+    most = height.max(axis=1)
+    weight = np.exp(sharp * (height - most[:, None]))
+    total = weight.sum(axis=1)
+    weight /= total[:, None]
+    mean = np.einsum("mk,mki->mi", weight, vertices)
+    off = vertices - mean[:, None]
+    return _Support(most + np.log(total) / sharp, mean, np.einsum("mk,mki,mkj->mij", weight, off, off))
+
+
+class _Pairs:
+    """m pairs of bodies at their places: rotation (m, 3, 3), translation (m, 3) of the first as the second
+    sees it.
+    """
+
+    def __init__(self, points: Array, hulls: Index, rotation: Array, translation: Array) -> None:
+        self.one, self.two = _gathered(points, hulls[:, :2]), _gathered(points, hulls[:, 2:])
+        self.rotation, self.translation = rotation, translation
+
+    def only(self, chosen: NDArray[np.bool_]) -> _Pairs:
+        out = object.__new__(_Pairs)
+        out.one = self.one[0][chosen], self.one[1][chosen]
+        out.two = self.two[0][chosen], self.two[1][chosen]
+        out.rotation, out.translation = self.rotation[chosen], self.translation[chosen]
+        return out
+
+    def side(self, u: Array) -> _Side:
+        turn = self.rotation
+        a = _support(*self.one, -np.einsum("mji,mj->mi", turn, u))
+        b = _support(*self.two, u)
+        point = np.einsum("mij,mj->mi", turn, a.mean) + self.translation
+        one = turn @ a.spread @ turn.transpose(0, 2, 1)
+        away = np.eye(3)[np.abs(u).argmin(axis=1)]
+        x = np.cross(u, away)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        tangents = np.stack([x, np.cross(u, x)], axis=1)
+        slope = point - b.mean
+        along = np.einsum("mi,mi->m", u, slope)
+        bend = _SHARP * tangents @ (one + b.spread) @ tangents.transpose(0, 2, 1)
+        bend += along[:, None, None] * np.eye(2)
+        separation = np.einsum("mi,mi->m", u, self.translation) - a.height - b.height
+        return _Side(separation, slope, point, one, tangents, bend)
+
+    def separate(self, u: Array) -> tuple[Array, _Side]:
+        """The largest separations near directions u (m, 3), and these directions there."""
+        u, at = u.copy(), self.side(u)
+        going = np.ones(len(u), dtype=bool)
+        for _ in range(_STEPS):
+            step2, gain = self._step(at)
+            size = np.linalg.norm(step2, axis=1)
+            # no maximum, as bodies are in each other: along the way that it curves up
+            curved, axes = np.linalg.eigh(at.bend)
+            saddle = going & (size < 1e-9) & (curved[:, 0] < -1e-9)
+            up = axes[saddle, :, 0]
+            slope2 = np.einsum("mki,mi->mk", at.tangents[saddle], at.slope[saddle])
+            step2[saddle] = 0.1 * up * np.where((up * slope2).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+            size[saddle], gain[saddle] = 0.1, 0.0
+            going &= size >= 1e-11
+            if not going.any():
+                break
+            part = np.minimum(1.0, _LONGEST / np.maximum(size, 1e-300))
+            waiting = going.copy()
+            for _ in range(_TRIES):
+                n = np.flatnonzero(waiting)
+                if not len(n):
+                    break
+                found_u = u[n] + part[n, None] * np.einsum("mki,mk->mi", at.tangents[n], step2[n])
+                found_u /= np.linalg.norm(found_u, axis=1, keepdims=True)
+                found = self.only(_mask(n, len(u))).side(found_u)
+                fine = (found.separation >= at.separation[n] + 1e-4 * part[n] * gain[n]) | (size[n] < 1e-5)
+                u[n[fine]] = found_u[fine]
+                for mine, its in zip(at, found, strict=True):
+                    mine[n[fine]] = its[fine]
+                waiting[n[fine]] = False
+                part[n[~fine]] *= 0.4
+            low = np.linalg.eigvalsh(at.bend)[:, 0]
+            going &= ~waiting & ((part * size >= 1e-7) | (low < -1e-9))
+        return u, at
+
+    @staticmethod
+    def _step(at: _Side) -> tuple[Array, Array]:
+        slope2 = np.einsum("mki,mi->mk", at.tangents, at.slope)
+        step2 = np.einsum("mkl,ml->mk", _inverse(at.bend), slope2)
+        return step2, np.einsum("mk,mk->m", step2, slope2)
+
+
+def _mask(numbers: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
+    out = np.zeros(size, dtype=bool)
+    out[numbers] = True
+    return out
+
+
+def _inverse(bend: Array) -> Array:
+    """Of bend made positive definite."""
+    least = np.linalg.eigvalsh(bend)[:, 0]
+    return np.linalg.inv(bend + np.maximum(_FLOOR - least, 0.0)[:, None, None] * np.eye(2))
+
+
+# ---------------------------------------------------------------- chains
+def _chain(n: int, z: Array, numbers: Array) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Rotation (m, 3, 3) and translation (m, 3) of the end; axes and origins (m, n, 3) of joints; which of
+    them turn (m, n).
+    """
+    m = len(z)
+    places = numbers[:, : 12 * (n + 1)].reshape(m, n + 1, 12)
+    turns = numbers[:, 12 * (n + 1) : 13 * n + 12] > 0.5
+    turn, shift = places[:, 0, :9].reshape(m, 3, 3).copy(), places[:, 0, 9:] + z[:, :3]
+    axis, origin = np.zeros((m, n, 3)), np.zeros((m, n, 3))
+    for k in range(n):
+        axis[:, k], origin[:, k] = turn[:, :, 2], shift
+        angle, along = np.where(turns[:, k], z[:, 3 + k], 0.0), np.where(turns[:, k], 0.0, z[:, 3 + k])
+        c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        shift = shift + along[:, None] * turn[:, :, 2]
+        turn = np.stack(
+            [c * turn[:, :, 0] + s * turn[:, :, 1], c * turn[:, :, 1] - s * turn[:, :, 0], turn[:, :, 2]],
+            axis=2,
+        )
+        shift = shift + np.einsum("mij,mj->mi", turn, places[:, k + 1, 9:])
+        turn = turn @ places[:, k + 1, :9].reshape(m, 3, 3)
+    return turn, shift, axis, origin, turns
+
+
+def write(
+    of: Any, points: Array, hulls: Index, what: int, z: Array, out: Array, factors: Array | None
+) -> None:
+    """As `Separations.write`."""
+    n = of.joints
+    turn, shift, axis, origin, turns = _chain(n, z, of.numbers)
+    u, at = _Pairs(points, hulls, turn, shift).separate(of.ways)
+    if what:
+        of.ways[...] = u
+    if what == 0:
+        out[...] = (at.separation - of.numbers[:, -1]).reshape(out.shape)
+        return
+    arm = np.where(turns[:, :, None], np.cross(axis, at.point[:, None] - origin), axis)
+    if what == 1:
+        out[...] = np.concatenate([u, np.einsum("mi,mki->mk", u, arm)], axis=1).reshape(out.shape)
+        return
+    turning = np.where(turns[:, :, None], np.cross(u[:, None], axis), 0.0)
+    spread = np.einsum("mij,mkj->mki", at.spread_one, turning)
+    moved = np.concatenate([np.broadcast_to(np.eye(3), (len(z), 3, 3)), arm - _SHARP * spread], axis=1)
+    mixed = np.einsum("mki,mli->mkl", moved, at.tangents)
+    found = mixed @ _inverse(at.bend) @ mixed.transpose(0, 2, 1)
+    own = np.einsum("mki,mli->mkl", turning, arm) - _SHARP * np.einsum("mki,mli->mkl", turning, spread)
+    columns, rows = np.triu_indices(n + 3)  # lower triangle, column by column
+    inner = columns >= 3
+    values = found[:, rows, columns]
+    values[:, inner] += own[:, columns[inner] - 3, rows[inner] - 3]
+    assert factors is not None
+    out[...] = (values * factors.reshape(-1, 1)).reshape(out.shape)
+
+
+# ---------------------------------------------------------------- all pairs
+def _relative(one: Array, two: Array) -> tuple[Array, Array]:
+    """Rotations (m, 3, 3) and translations (m, 3) of the first (m, 12) as the second sees it."""
+    a, b = (x[:, :9].reshape(-1, 3, 3) for x in (one, two))
+    return b.transpose(0, 2, 1) @ a, np.einsum("mji,mj->mi", b, one[:, 9:] - two[:, 9:])
+
+
+def _of_pairs(shapes: Any, at: Any, spot: Index, pair: Index) -> tuple[Array, Array]:
+    one, other = shapes.pairs[pair].T
+    first = at.joints[spot, one]
+    second = at.joints[spot, np.maximum(other, 0)].copy()
+    world = other < 0
+    second[world] = at.world[spot[world], -1 - other[world]]
+    return _relative(first, second)
+
+
+def look(
+    shapes: Any, at: Any, within: float, ways: Array, wanted: NDArray[np.bool_], gaps: Array
+) -> tuple[Index, Index]:
+    """As `Shapes.look`: writes gaps and ways, returns what is near."""
+    spot, pair = (a.ravel() for a in np.indices(gaps.shape))
+    other = shapes.pairs[pair, 1]
+    there = wanted[pair] & (
+        (other >= 0) | (at.present[spot, np.maximum(-1 - other, 0)] > 0 if at.present.size else True)
+    )
+    gaps[...] = 1e3
+    spot, pair = spot[there], pair[there]
+    turn, shift = _of_pairs(shapes, at, spot, pair)
+    balls, world = shapes._balls[pair], shapes.pairs[pair, 1] < 0
+    x = np.einsum("mij,mj->mi", turn, balls[:, :3]) + shift - np.where(world[:, None], 0.0, balls[:, 4:7])
+    out = np.abs(x) - balls[:, 4:7]
+    outside, deepest = np.maximum(out, 0.0), out.max(axis=1)
+    box = np.where(deepest > 0, np.linalg.norm(outside, axis=1), deepest)
+    bound = np.where(world, box, np.linalg.norm(x, axis=1)) - balls[:, 3] - balls[:, 7]
+    face = np.where(outside.any(axis=1)[:, None], outside, np.eye(3)[out.argmax(axis=1)]) * np.where(
+        x > 0, 1.0, -1.0
+    )
+    u = np.where(world[:, None], face, x)
+    u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300)
+    gaps[spot, pair] = bound
+    close = bound <= within
+    spot, pair, turn, shift, u = spot[close], pair[close], turn[close], shift[close], u[close]
+    known = ways[spot, pair]
+    u = np.where(np.any(known != 0, axis=1)[:, None], known, u)
+    if len(u):
+        u, found = _Pairs(shapes.points, shapes.hulls[pair], turn, shift).separate(u)
+        gaps[spot, pair] = found.separation - shapes.radius[pair]
+        ways[spot, pair] = u
+    near = gaps[spot, pair] < within
+    return spot[near], pair[near]
+
+
+def may_meet(
+    shapes: Any, one: tuple[Any, Any], two: tuple[Any, Any], wanted: NDArray[np.bool_]
+) -> tuple[Index, Index]:
+    """As `Shapes.may_meet`."""
+    before, after = one[1].gaps, two[1].gaps
+    spot, pair = np.nonzero(wanted & (before > 0) & (after > 0) & (before + after <= 5.0))
+    (turn0, shift0), (turn1, shift1) = (_of_pairs(shapes, p[0], spot, pair) for p in (one, two))
+    centre, radius = shapes._balls[pair, :3], shapes._balls[pair, 3]
+    moved = np.einsum("mij,mj->mi", turn1 - turn0, centre) + shift1 - shift0
+    cosine = (np.einsum("mij,mij->m", turn0, turn1) - 1) / 2
+    far = np.linalg.norm(moved, axis=1) + np.arccos(np.clip(cosine, -1.0, 1.0)) * radius
+    met = far >= before[spot, pair] + after[spot, pair]
+    return spot[met], pair[met]

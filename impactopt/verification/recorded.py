@@ -121,7 +121,7 @@ def _reference(p: Program, v: Variables, arrays: Arrays, prefix: str, last: Way)
         worst.note(f"{prefix} rates", _gap(a["v"][k], qd), where)
         worst.note(f"{prefix} accelerations", _gap(a["a"][k], qdd, max(1.0, np.abs(qdd).max())), where)
         demand = a["torque"][k] / r.torque_limit
-        if phase == 1 and time <= start + blow:
+        if phase == 1 and time <= start + blow + 1e-9:  # its last instant is rounded otherwise
             worst.note(f"{prefix} torque", _gap(demand, ff), where)
         else:
             for what, off in _balanced(p, q, tau, a["torque"][k], a["ground"][k]):

@@ -51,9 +51,11 @@ def test_the_summary_has_the_keys_that_readers_rely_on(record: Record) -> None:
     keys = ["status", "solver", "iterations", "solve_seconds", "build_seconds", "max_violation", "impulse_Ns"]
     keys += ["peak_force_N", "contact_ms", "hand_speed_m_s"]
     keys += ["simulated.impulse_Ns", "simulated.impulse_error_pct"]
-    keys += ["simulated.sole_force_N", "simulated.sole_slip_mm"]
+    keys += ["simulated.sole_slip_mm"]
     for key in ("zmp_margin_m", "torque_ratio"):
         keys += [f"{where}{key}.{phase}" for where in ("", "simulated.") for phase in phases]
+    for key in ("sole_cop_margin_mm", "sole_force_N"):
+        keys += [f"simulated.{key}.{sole}.{phase}" for sole in ("left", "right") for phase in phases]
     assert set(keys) <= set(numbers(record.summary))
     assert record.summary["simulated"]["impulse_error_pct"] == pytest.approx(1.0)
     assert record.summary["simulated"]["torque_ratio"]["collision"] == pytest.approx(0.9)

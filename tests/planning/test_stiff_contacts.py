@@ -7,6 +7,7 @@ import pytest
 
 from impactopt import optimize_strike, solve
 from impactopt.contact import Board, FreeMass, KelvinVoigt, Nail, SpringDamper
+from impactopt.errors import NotSolvedWarning
 from impactopt.files.problem_file import load_problem
 from impactopt.planning.contact_replay import AGREED, PlannedContact, checked
 from impactopt.planning.multistart import VIOLATED, Budget
@@ -74,7 +75,8 @@ def test_a_contact_too_soft_for_its_nail_is_named(stiffness: float) -> None:
     """`hit point, 48 mm away` alone would not say so; nor would a time of 15 ms a phase, which is not all."""
     problem = with_stiffness("arm_planar", stiffness, ratio=False)
     for contact_duration in ((0.0, 0.015), problem.contact_duration):
-        solution = solve(dataclasses.replace(problem, contact_duration=contact_duration))
+        with pytest.warns(NotSolvedWarning, match="a soft contact"):
+            solution = solve(dataclasses.replace(problem, contact_duration=contact_duration))
         assert solution.status is Status.INFEASIBLE
         assert solution.result.message.startswith(
             "Infeasible: a soft contact. stiffness of the contact: 1e+05 N/m"
@@ -85,7 +87,8 @@ def test_a_contact_too_soft_for_its_nail_is_named(stiffness: float) -> None:
 
 def test_a_time_far_too_short_for_its_contact_is_named() -> None:
     """Shorter than the least that a phase is given where no shortest time is asked for."""
-    solution = solve(dataclasses.replace(load_problem("arm_planar"), contact_duration=(0.0, 5e-5)))
+    with pytest.warns(NotSolvedWarning, match="Infeasible: time"):
+        solution = solve(dataclasses.replace(load_problem("arm_planar"), contact_duration=(0.0, 5e-5)))
     assert solution.status is Status.INFEASIBLE
     assert solution.result.message.startswith("Infeasible: time. each phase of contact: ")
     assert "for 5e-05 s ([collision] duration_s)" in solution.result.message
@@ -93,7 +96,8 @@ def test_a_time_far_too_short_for_its_contact_is_named() -> None:
 
 def test_a_board_that_takes_more_than_one_contact_is_named() -> None:
     """The hammer is off again long before the board has bent as far as it takes to break."""
-    solution = solve(with_stiffness("chop_arm", 1e7, ratio=False))
+    with pytest.warns(NotSolvedWarning, match="a stiff contact"):
+        solution = solve(with_stiffness("chop_arm", 1e7, ratio=False))
     assert solution.status is Status.INFEASIBLE
     assert solution.result.message.startswith("Infeasible: a stiff contact. stiffness of the contact: ")
     assert "one contact is not enough" in solution.result.message

@@ -40,7 +40,7 @@ def still(robot: Robot) -> tuple[Any, Scene]:
     """A robot that stands, as a reference with all that a trajectory has."""
     given, where, _ = standing(robot)
     rest = {"a": np.zeros_like(given.v), "contact_start": 0.5, "contact_end": 0.6}
-    return SimpleNamespace(**vars(given), **rest), where
+    return SimpleNamespace(**(vars(given) | rest)), where
 
 
 def stand(world: Perturbation | None = None, settings: ControllerSettings | None = None) -> Simulation:

@@ -182,8 +182,8 @@ def test_a_result_that_says_nothing_of_its_program(record: Record, tmp_path: Pat
 
 def test_what_is_not_known_is_said(record: Record, tmp_path: Path) -> None:
     """A model that is frozen is not computed here, so nothing is called right that was not looked at."""
-    text = ARM.read_text("utf-8").replace("[collision]", '[collision]\nmodel = "sdc"\nfreezes = 1')
+    text = ARM.read_text("utf-8") + '\n[collision]\nmodel = "sdc"\nfreezes = 1\n'
     save_record(dataclasses.replace(record, problem=text), tmp_path)
     found = verified(tmp_path, code=1)
-    assert found["kkt"] is None and "not known to verify" in found["reason"]
+    assert found["kkt"] is None and "not known to verify: the model 'sdc'" in found["reason"]
     assert load_record(tmp_path).problem == text

@@ -16,6 +16,8 @@ from impactopt.contact import ContactLaw, Target
 
 __all__ = ["JointSpaceModel", "shape_of"]
 
+_SOON = 1e-9  # [s] in which a target gains the speed that its acceleration is told by
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointSpaceModel:
@@ -176,8 +178,25 @@ class JointSpaceModel:
         """(compressing, in contact), 0 or 1. Contact is over when, in restitution, no force is left."""
         rate = self.rate(y, data)
         force = self.law.branch(self.part(y, "penetration"), rate, False, self.law_numbers(data))
-        compressing = rate > 0
+        at_rest = ca.logic_and(rate == 0, self.part(y, "time") == 0)
+        compressing = ca.logic_or(rate > 0, ca.logic_and(at_rest, self._closing(y, data) > 0))
         return compressing, ca.logic_or(compressing, force > 0)
+
+    def _closing(self, y: Any, data: dict[str, Any]) -> Any:
+        """Acceleration [m/s2] at which hand and target approach at a freeze's begin, where they neither
+        approach nor part: it decides what their speeds leave open."""
+        u = data["velocity_before"] if self.refrozen else ca.DM.zeros(self.n, 1)
+        force = self.law.force(self.part(y, "penetration"), 0.0, self.law_numbers(data))
+        hand = -data["m"] * force
+        if self.n:
+            tau = self.saturate(self.with_feedforward(self.servo(y, u, data), data), data)
+            hand += ca.mtimes(data["s"].T, tau - self.friction(u, data) if self.effects.friction else tau)
+        if "e" in data:
+            hand += data["e"]
+        state, numbers = self.target_state(y), self.target_numbers(data)
+        rates = self.target.derivative(state, force, numbers)
+        soon = [x + _SOON * slope for x, slope in zip(state, rates, strict=True)]
+        return hand - (self.target.velocity(soon, numbers) - self.target.velocity(state, numbers)) / _SOON
 
     def running(self, y: Any, data: dict[str, Any]) -> Any:
         """Whether there is still something to integrate, 0 or 1: in contact, and before the end."""

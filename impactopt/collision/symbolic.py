@@ -70,7 +70,8 @@ class SymbolicModel(SteppedModel):
         is left out.
         If an input is NaN, or what holds the robot cannot be told apart at q, all outputs are NaN,
         `separated` too. So are they if the contact has not ended at the horizon, unless `separated` or
-        `duration` are among them, which tell it: then they are what happened so far.
+        `duration` are among them, which tell it: then they are what happened so far. An optimizer whose
+        initial guess may be such a contact needs `separated` among the outputs.
 
         CasADi can differentiate it with respect to all inputs (jacobian, forward, reverse), and twice by
         differences. The code for this is compiled when it is first evaluated. A single scalar output has an
@@ -134,7 +135,8 @@ class SymbolicModel(SteppedModel):
         """A compiled ca.Function with the inputs of `function`, to a scalar output and its gradients.
 
         Returns (value, d/dq (nv), d/dv (nv)): q's gradient is in the basis of v, as `pin.integrate` moves q.
-        With freezes on the way it comes from differences, 4 nv collisions.
+        With freezes on the way it comes from differences, 4 nv collisions. If the contact has not ended at
+        the horizon, all are of what happened so far; `function` gives `separated`.
         """
         self._check_outputs((output,), 1)
         numbers = [name for name in SCALARS if name != "step_error"]
@@ -160,7 +162,8 @@ class SymbolicModel(SteppedModel):
         dense; `by` may have "feedforward", too. Rows are the entries column by column, one instant after the
         other. The Jacobian by q is in the basis of v, as `pin.integrate` moves q. The instants of a history
         are fixed in time, except that of separation, which moves with it, and those after it, which repeat
-        it. A horizon that is not much longer than the contact keeps the Jacobians small.
+        it. A horizon that is not much longer than the contact keeps the Jacobians small. If the contact has
+        not ended there, all are of what happened so far, as `separated` says if it is among the outputs.
 
         Raises
         ------

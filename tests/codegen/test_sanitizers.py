@@ -71,7 +71,7 @@ BOARD = Board(mass=0.5, stiffness=2e4, breaking_force=60.0)
 PROGRAMS: dict[str, tuple[dict[str, Any], Callable[[SDC], Any]]] = {
     "implicit steps": (
         {"target": Nail(mass=0.2, resistance=80.0)},
-        lambda one: native_collision(one, ("impulse", "force", "torque", "configuration")),
+        lambda one: native_collision(one, ("impulse", "force", "torque", "configuration", "separated")),
     ),
     "bent law, freezes": (
         {"law": HUNT, "freezes": 2, "target": BOARD},

@@ -139,7 +139,8 @@ def test_a_bipeds_gradient_is_that_of_exact_collisions():
 def test_a_standins_gradient_is_that_of_differences():
     model = implicit("standin")
     values = situation("standin", model)
-    assert_slopes(stepped(model, ("impulse",), values), ("impulse",), model, values, rel=1e-8)
+    so_far = stepped(model, ("impulse", "separated"), values)  # its servo pushes on to the horizon
+    assert_slopes(so_far, ("impulse",), model, values, rel=1e-8)
 
 
 def test_a_stiff_servos_gradient_is_that_of_differences():

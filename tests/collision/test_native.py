@@ -140,7 +140,7 @@ def test_a_biped_in_c_is_the_graph(options):
 
 def test_a_held_hand_in_c_is_the_graph():
     model = sdc("standin", stance=BothSoles(hands=("left_hand",)))
-    outputs = ("hand_wrench", "zmp", "impulse")
+    outputs = ("hand_wrench", "zmp", "impulse", "separated")
     assert_same(model, situation("standin", model), outputs, every=5)
 
 

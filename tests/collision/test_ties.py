@@ -3,7 +3,7 @@
 On a slider, whose speed and force are exact in floating point: what is equal is equal to the last bit.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -134,6 +134,21 @@ def test_a_hand_that_rests_against_the_target(kind):
     np.testing.assert_allclose(pushed, beside, rtol=SAME)
     for push in (0.0, -64.0):
         assert outcome(model, speed=0.0, push=push)[0] == 0.0
+
+
+@pytest.mark.usefixtures("in_python")
+@pytest.mark.parametrize("friction", [None, JointFriction(coulomb=8.0, transition=1.0)])
+@pytest.mark.parametrize("target", [FreeMass(mass=1.0), Nail(mass=0.05, resistance=40.0)])
+@pytest.mark.parametrize("push", [64.0, 0.0, -64.0])
+def test_a_hand_that_rests_in_steps_of_one_length(target, friction, push):
+    """Those of C, those of the graph, which takes their place without a compiler, and implicit ones."""
+    model = model_of(SDC, target, friction=friction)
+    fixed = replace(model, method="rk4", step=2.5e-5)
+    at, settings = ([0.0], [0.0], [push]), fixed.settings.values()
+    graph = float(fixed.graph(("impulse",))(*at, *settings))
+    assert outcome(fixed, speed=0.0, push=push)[0] == pytest.approx(graph, rel=1e-9)
+    assert graph == pytest.approx(outcome(model, speed=0.0, push=push)[0], rel=1e-4)
+    assert (graph > 0.1) == (push > 0)
 
 
 @pytest.mark.parametrize("kind", [SDC, FullDynamics, MujocoDynamics])

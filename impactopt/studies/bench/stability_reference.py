@@ -185,10 +185,14 @@ def by_scipy(
 
     over.terminal, over.direction = True, -1  # type: ignore[attr-defined]
     start = np.zeros(2 + k + 2 * n)
-    if not speed > 0:
+    pace = rate(0.0, start)
+    if pace == 0:  # neither approaches nor parts: the next derivative decides
+        soon = 1e-9
+        pace = rate(soon, start + soon * flow(0.0, start)) / soon * model.horizon
+    if not pace > 0:
         return Expected(impulse=0.0, duration=0.0, separated=True)
     size = np.full(start.size, 1e-9)
-    size[0], size[1] = 1e-9 * speed * 1e-3, 1e-9 * speed / max(m, 1e-9)
+    size[0], size[1] = 1e-9 * pace * 1e-3, 1e-9 * pace / max(m, 1e-9)
     way = solve_ivp(
         flow, (0.0, model.horizon), start, method=method, rtol=rtol, atol=np.minimum(size, 1e-9) * 1e-3,
         events=over, max_step=model.horizon / 50, first_step=min(1e-9, model.step_length * 1e-3),

@@ -131,8 +131,11 @@ class Modes:
         first = Phase(compressing=True, saturated=none, sliding=none)
         saturated = self._side(self.demand @ z, self._limit())
         sliding = self._side(self.joint_velocity @ z, self._band())
-        compressing = bool(self.rate(first) @ z > 0)
-        return z, Phase(compressing=compressing, saturated=saturated, sliding=sliding)
+        first = replace(first, saturated=saturated, sliding=sliding)
+        rate = self.rate(first)
+        # what neither approaches nor parts is decided by the next derivative
+        compressing = rate @ z > 0 or (rate @ z == 0 and rate @ self.matrix(first) @ z > 0)
+        return z, replace(first, compressing=bool(compressing))
 
     def fastest(self) -> float:
         """[1/s] the largest rate of any mode, with no joint saturated and friction in its band."""

@@ -14,9 +14,7 @@ from impactopt.robots.robot import Robot
 __all__ = ["StrikerFace", "striker_face"]
 
 Array = NDArray[np.float64]
-CONE = (
-    np.pi / 3
-)  # [rad] about the face's normal: corners that lie ahead in none of these directions never lead
+CONE = np.pi / 3  # [rad] about the face's normal: corners that lead in none of these directions never do
 DIRECTIONS = 400
 MERGED = 0.004  # [m] corners nearer to each other than this count as one
 FLAT = 0.9  # cosine: facets turned less belong to the face that the striking point lies on
@@ -72,14 +70,8 @@ def _leading(points: Array, normal: Array) -> Array:
     directions = height[:, None] * normal + wide[:, None] * (
         np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
     )
-    chosen = list[Array]()
+    farthest, chosen = set((points @ directions.T).argmax(axis=0).tolist()), list[Array]()
     for index in np.argsort(-(points @ normal)):
-        if index in _farthest(points, directions) and all(
-            np.linalg.norm(points[index] - c) > MERGED for c in chosen
-        ):
+        if index in farthest and all(np.linalg.norm(points[index] - c) > MERGED for c in chosen):
             chosen.append(points[index])
     return np.array(chosen)
-
-
-def _farthest(points: Array, directions: Array) -> set[int]:
-    return set((points @ directions.T).argmax(axis=0).tolist())

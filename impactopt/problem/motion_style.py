@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from impactopt.robots.robot import Robot
 
-__all__ = ["STYLES", "MotionPrices", "idle_joints"]
+__all__ = ["STYLES", "MotionPrices", "idle_joints", "joints_to"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,23 +33,27 @@ class MotionPrices:
         return replace(self, **{name: factor * value for name, value in vars(self).items()})
 
 
-# Chosen on `punch`, `nailing` and `punch_g1` (docs/howto/style.md has the table): jerk takes out reversals
-# and peaks, idle speed the travel of limbs that bring nothing, speed the detours of all others.
+# Chosen on `punch` (docs/howto/natural.md has the figures): jerk takes out reversals and peaks, idle speed
+# the travel of limbs that bring nothing, speed the detours of all others.
 STYLES: dict[str, MotionPrices] = {
     "natural": MotionPrices(jerk=7e-7, speed=7.5e-3, idle_speed=3e-2, end=2.0),
     "strongest": MotionPrices(),
 }
 
 
+def joints_to(robot: Robot, frames: Iterable[str]) -> set[int]:
+    """Joints of the model that move one of these frames, and 0, the world."""
+    model = robot.model
+    joints = (model.frames[model.getFrameId(name)].parentJoint for name in frames)
+    return {int(j) for joint in joints for j in model.supports[joint]}
+
+
 def idle_joints(robot: Robot, frames: Iterable[str]) -> NDArray[np.bool_]:
     """Mask (n,) of the joints that move none of these frames: those of idle arms, and of the head."""
     model = robot.model
-    carrying = {
-        int(j) for name in frames for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
-    }
     first = model.nv - robot.n
     idle = np.ones(robot.n, dtype=bool)
-    for j in carrying:
+    for j in joints_to(robot, frames):
         column = int(model.joints[j].idx_v) - first if j else -1
         if column >= 0:
             idle[column] = False

@@ -11,7 +11,7 @@ from scipy.signal import find_peaks
 
 from impactopt.bodies.clearance import Places
 from impactopt.problem.problem import ImpactProblem
-from impactopt.transcription.limits import GRAVITY
+from impactopt.robots.sole_margins import weight_of
 from impactopt.transcription.plan import Plan, Trajectory
 
 __all__ = ["first_touch", "ground_force_share", "motion_measures"]
@@ -79,7 +79,7 @@ def ground_force_share(problem: ImpactProblem, normal: Array) -> list[float] | N
     """Least and largest of normal forces (k,) [N] of the ground, over the weight; None on a fixed base."""
     if not problem.robot.floating or not len(normal):
         return None
-    weight = GRAVITY * sum(body.mass for body in problem.robot.model.inertias)
+    weight = weight_of(problem.robot)
     return [float(normal.min() / weight), float(normal.max() / weight)]
 
 

@@ -56,7 +56,7 @@ class FirstTouch(Term):
 
     def add_rows(self, program: Any) -> None:
         p, spots = program.problem, late_spots(program)
-        for name, (striker, point) in zip(NAMES, p.contacts, strict=False):
+        for number, (name, (striker, _)) in enumerate(zip(NAMES, p.contacts, strict=False)):
             face = striker_face(p.robot, striker)
             if face is None:
                 continue
@@ -64,9 +64,9 @@ class FirstTouch(Term):
             moved = np.append(np.ones(len(face.corners)), 0.0)  # a direction has no place
             each = [ways, moved[:, None]]
 
-            def numbers(b: Any, each: Any = each, count: int = len(spots)) -> Array:
-                rows = np.hstack([np.tile(b.problem.normal, (len(each[0]), 1)), *each])
-                return np.tile(rows, (count, 1))
+            def numbers(b: Any, each: Any = each, number: int = number) -> Array:
+                plane = np.append(b.problem.normal, b.problem.contacts[number][1])
+                return np.tile(np.hstack([np.tile(plane, (len(each[0]), 1)), *each]), (len(spots), 1))
 
             slots = [[slots[0]] for _, slots in spots for _ in ways]
             at = program.add_block(name, slots, numbers(program.builder))
@@ -80,7 +80,7 @@ class FirstTouch(Term):
                     place=place,
                     components=[f"{striker}, corner {i}" for i in range(len(face.corners))],
                     outputs=outputs[:-1],
-                    upper=float(p.normal @ point) + self.depth,
+                    upper=self.depth,
                     measure=millimetres("beyond the target's plane"),
                     whole=striker,
                 )
@@ -102,13 +102,14 @@ def late_spots(program: Any) -> list[Any]:
 
 
 def ahead(c: StanceCoordinates, striker: str) -> BlockExpression:
-    """Coordinate along the normal of a point of the striking link, or cosine of a direction of it.
+    """Distance of a point of the striking link beyond the target's plane, or cosine of a direction of it.
 
-    z = y;  p = normal (3), point from the striking point on [m] or direction (3), 1 for a point and 0 for a
-    direction;  out = coordinate [m] or cosine.
+    z = y;  p = normal (3), hit point (3) [m], point from the striking point on [m] or direction (3), 1 for a
+    point and 0 for a direction;  out = distance [m] or cosine.
     """
-    y, normal, way, point = ca.SX.sym("y", c.ny), ca.SX.sym("n", 3), ca.SX.sym("d", 3), ca.SX.sym("point")
+    y, normal, hit = ca.SX.sym("y", c.ny), ca.SX.sym("n", 3), ca.SX.sym("hit", 3)
+    way, point = ca.SX.sym("d", 3), ca.SX.sym("point")
     still = ca.SX.zeros(c.ny)
     rotation, origin = c.rb_frame(f"striker:{striker}", c.upper_motion(y, still, still)[0])
-    out = ca.dot(normal, point * origin + ca.mtimes(rotation, way))
-    return make_block([y], [normal, way, point], {"along": out})
+    out = ca.dot(normal, point * (origin - hit) + ca.mtimes(rotation, way))
+    return make_block([y], [normal, hit, way, point], {"along": out})

@@ -9,6 +9,7 @@ from matplotlib.collections import PolyCollection
 from impactopt.bodies.solids import Solid, simplified
 from impactopt.bodies.surroundings import Part, surroundings_of
 from impactopt.files.output import Record
+from impactopt.problem.motion_style import joints_to
 from impactopt.problem.problem import ImpactProblem
 from impactopt.report.pictures.style import BLUE, ORANGE, VERMILION, Array, Picture, styled, title
 from impactopt.report.stage import bodies_drawn
@@ -98,16 +99,11 @@ def _chosen(track: Track) -> list[int]:
 
 def _solids(problem: ImpactProblem) -> list[Drawn]:
     """What the robot looks like: triangles of each joint, with their normals and colours."""
-    model = problem.robot.model
-    frames = [problem.robot.striker(name).model_frame for name in problem.strikers]
-    striking = {int(j) for f in frames for j in model.supports[model.frames[model.getFrameId(f)].parentJoint]}
-    standing = {
-        int(j)
-        for sole in problem.stance.soles(problem.robot)
-        for j in model.supports[model.frames[model.getFrameId(sole.frame)].parentJoint]
-    }
+    robot = problem.robot
+    striking = joints_to(robot, [robot.striker(name).model_frame for name in problem.strikers])
+    standing = joints_to(robot, [sole.frame for sole in problem.stance.soles(robot)])
     out = []
-    for body in bodies_drawn(problem.robot):
+    for body in bodies_drawn(robot):
         solid = simplified(body.solid, CELL) if len(body.solid.triangles) > 500 else body.solid
         corners = _corners(solid)
         own = _rgb(BLUE) if body.joint in striking - standing else np.asarray(body.colour[:3], dtype=float)

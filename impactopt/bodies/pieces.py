@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -36,12 +36,14 @@ class Piece:
 
     joint : index in the model of the joint that moves it; its frame is that of the numbers.
     vertices (k, 3) [m], triangles (m, 3) : of the hull, counter-clockwise seen from outside.
+    assumed : it is a box of the link's inertia, as no shape is known.
     """
 
     link: str
     joint: int
     vertices: Array
     triangles: NDArray[np.intp]
+    assumed: bool = False
 
     @cached_property
     def shape(self) -> Any:
@@ -131,7 +133,7 @@ def _from_inertia(robot: Robot) -> Iterator[Piece]:
         if inertia.mass > 1e-6:
             piece = _hull(model.names[j], j, inertia_box(inertia))
             if piece is not None:
-                yield piece
+                yield replace(piece, assumed=True)
 
 
 def inertia_box(inertia: Any) -> Solid:

@@ -110,8 +110,8 @@ class ImpactProblem:
     terms : constraints. Those of DEFAULT_TERMS that are not given take their defaults, and so does
         `GearLoad`, whose rows a program gets once a plan without them goes beyond it.
     objectives : their weighted sum is maximized.
-    style : "strongest"; or "natural", with prices on jerk, on the travel of joints, above all of idle ones,
-        and on ending away from the start posture (`impactopt.problem.motion_style`).
+    style : "natural", with prices on jerk, on the travel of joints, above all of idle ones, and on ending away
+        from the start posture (`impactopt.problem.motion_style`); or "strongest", with none.
     motion_price : largest share of the objective that prices on motion may take; those of the style are
         reduced until they take no more.  price_scale : factor on these; 1: a plan chooses it.
     smoothness : price of accelerations [N s per (rad/s^2)^2 s].  wrench_price : price of sole wrenches.
@@ -150,7 +150,7 @@ class ImpactProblem:
     ground: Ground | None = None
     terms: tuple[Term, ...] = ()
     objectives: tuple[Objective, ...] = DEFAULT_OBJECTIVES
-    style: str = "strongest"
+    style: str = "natural"
     motion_price: float = 0.1
     price_scale: float = 1.0
     smoothness: float = 1e-5
@@ -324,8 +324,10 @@ class ImpactProblem:
 
     @property
     def active_terms(self) -> tuple[Term, ...]:
-        """Its own terms that are not switched off."""
-        return tuple(term for term in self.terms if term.active)
+        """Its own terms, and those by default that bring constraints of their own; none that is off."""
+        mine = {type(term) for term in self.terms}
+        own = [t for t in DEFAULT_TERMS if type(t).add_rows is not Term.add_rows and type(t) not in mine]
+        return tuple(term for term in (*self.terms, *own) if term.active)
 
     @property
     def on_demand(self) -> tuple[Term, ...]:

@@ -247,6 +247,8 @@ class Tool:
             center=np.array(whole.lever),
             inertia=np.array(whole.inertia),
             head=end + head_length / 2 * bar,
+            bar=head_length * bar,
+            bar_width=head_width,
         )
 
     @property

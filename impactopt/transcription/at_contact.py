@@ -208,7 +208,7 @@ class ContactProgram(ABC):
         if self.builder.robot.hinges.any():
             add_hinges(self.builder, [(place, torque) for place, torque, _ in self._nodes()])
         for term in terms:
-            if type(term).add_rows is not Term.add_rows and term.active:  # those of others are there
+            if type(term).add_rows is not Term.add_rows:  # those of others are there
                 term.add_rows(self)
         self.objectives = quantities(self, objectives)
         self._worth = assemble(self.layout, self.objectives, self._prices())

@@ -69,7 +69,7 @@ class StrikeTranscription(ContactProgram):
             left = self.expected.state_after
             self.angular_momentum = add_balance(b, state, left, self.hit.scenarios)
         self._finish(
-            tuple(term for term in problem.terms if not term.whole_motion),
+            tuple(term for term in problem.active_terms if not term.whole_motion),
             tuple(o for o in problem.objectives if not o.whole_motion),
         )
 

@@ -136,7 +136,7 @@ class Transcription(ContactProgram):
             y, y1, T = self.follow.start
             left = [y, y1, self.follow.legs[0], T]
             self.angular_momentum = add_balance(b, contact.state, left, self.hit.scenarios)
-        self._finish(problem.terms, problem.objectives)
+        self._finish(problem.active_terms, problem.objectives)
 
     # ------------------------------------------------------------------ for terms and objectives
     @property

@@ -21,7 +21,7 @@ _UNSAID = About(what="", least=0)  # of fields that do not say what they are
 class Term(Described):
     """Base of all terms: ``name`` is what reports and messages call it, ``unit`` is that of its rows.
 
-    A term has :meth:`add_rows`, and :meth:`blocks` if its rows are not linear. The terms in DEFAULT_TERMS
+    A term has :meth:`add_rows`, and :meth:`blocks` if its rows are not linear. Most terms in DEFAULT_TERMS
     have neither: the transcription has their rows. The metadata of fields (`impactopt.contact.fields.about`)
     describes them, and they are checked by it; numbers without metadata must not be negative.
 
